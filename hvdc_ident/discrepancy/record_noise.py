@@ -48,7 +48,7 @@ class OutputNoise:
 
     model: its AR coefficients from row to row, () where it is white; error: the standard error of artanh of a single
     one. step: what values are rounded to, 0 for nothing. source: where it comes from, in words. rows: how many before an
-    event.
+    event. freedom: degrees of freedom of a standard deviation that is told by those; 0 for one that is not.
     """
 
     std: float | None
@@ -57,6 +57,7 @@ class OutputNoise:
     step: float
     source: str
     rows: int
+    freedom: int = 0
 
     @property
     def below(self) -> float:
@@ -165,6 +166,7 @@ def _lack(found: Likelihood, given: float) -> tuple[float, bool]:
 
 def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNoise:
     given, rows, step = quiet.given, quiet.rows, quiet.step
+    freedom = max(rows - 2 * len(quiet.records), 1)
     std = quiet.std if quiet.moves else 0.0
     if quiet.coarse and (given is None or given < quiet.rounded):
         # A level tells its own flicker only: none in the middle of a step, most at its edge. So all rows are asked.
@@ -183,7 +185,7 @@ def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNois
     if colour.tanh and found is not None:
         std = found.best_std(colour.tanh)
     if given is None:
-        return OutputNoise(std, model, colour.error, step, "the records before the event", rows)
+        return OutputNoise(std, model, colour.error, step, "the records before the event", rows, freedom)
     if colour.tanh and found is not None:
         lack, above = _lack(found, given)
         noisier = above and lack > SURE**2
@@ -193,7 +195,7 @@ def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNois
         noisier = std > given * (1.0 + SURE / np.sqrt(2.0 * independent))
     if noisier:
         return OutputNoise(
-            std, model, colour.error, step, "the records before the event, noisier than what was given", rows
+            std, model, colour.error, step, "the records before the event, noisier than what was given", rows, freedom
         )
     return OutputNoise(given, model, colour.error, step, GIVEN, rows)
 
@@ -296,9 +298,9 @@ def draws(
     """For each block (m, count) records of nothing but noise, weighted and whitened as the residuals are.
 
     fitted: the model's output at each block's rows, in its unit: rounding depends on it. A single AR coefficient is
-    drawn too, within its error, and so is the size of the noise below a quantiser: what is not known of the noise widens
-    what noise can do. Where the standard deviation is not given it goes with the coefficient, for the steps from row to
-    row are what is sure.
+    drawn too, within its error, and so is a standard deviation that rows before the event tell, and the size of the noise
+    below a quantiser: what is not known of the noise widens what noise can do. Where the standard deviation is not given it
+    goes with the coefficient, for the steps from row to row are what is sure.
     """
     times = {e.name: e.time for e in problem.fitted_experiments}
     outputs = list(dict.fromkeys(b.output for b in blocks))
@@ -313,6 +315,9 @@ def draws(
         e = _coloured(random.standard_normal((y.size, count)), model)
         if len(n.model) == 1 and n.source != GIVEN:
             e *= np.sqrt((1.0 - n.model[0] ** 2) / (1.0 - model[0] ** 2))
+        if n.freedom:
+            spread = np.random.default_rng([seed, 4, outputs.index(b.output)]).chisquare(n.freedom, count)
+            e *= np.sqrt(n.freedom / spread)
         if n.step:
             size = n.below * np.ones(count)
             if n.quantised is not None:

@@ -24,7 +24,7 @@ from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.record_noise import draws
-from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
+from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, of_held_out, unseen
 from hvdc_ident.discrepancy.refitted import left_by
 from hvdc_ident.discrepancy.scores import runs
 from hvdc_ident.discrepancy.signatures.response import Along
@@ -43,10 +43,10 @@ class Remainder:
     share: of the squared misfit beyond noise, fitted data; held_out: the same of the others, None where they showed no gap.
     beyond: by output the root mean square of what is beyond noise, in tolerances: those of the study, or a tenth of the noise or
     a hundredth of the output's range, whichever is larger. noise_units: root mean square of the fitted residual, in standard
-    deviations of the noise. held_out_p: the chance that noise is as loud as the held-out residual. record: the held-out
-    experiment of which most is left, record_units: so much, in noise units. p: the chance that noise alone makes a latent input
-    as likely anywhere; at: where it is likeliest, empty where it was not looked for. log_evidence: of the latent input there, in
-    nats.
+    deviations of the noise. held_out_p: the chance that noise is as loud as the held-out residual, with what is not known of it.
+    record: the held-out experiment of which most is left, record_units: so much, in noise units. p: the chance that noise alone
+    makes a latent input as likely anywhere; at: where it is likeliest, empty where it was not looked for. log_evidence: of the
+    latent input there, in nats.
     """
 
     share: float
@@ -100,8 +100,7 @@ def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float)
     held, held_p = None, 1.0
     if was is not None and now is not None and np.isfinite(was) and was**2 > floor:
         held = float(np.clip((now**2 - floor) / (was**2 - floor), 0.0, 1.0)) if np.isfinite(now) else 1.0
-        rows = unseen_rows(last) * last.effective / last.rows
-        held_p = float(chi2.sf(now**2 / floor * rows, rows)) if np.isfinite(now) else 0.0
+        held_p = _held_out_p(search, last, now**2 / floor)
     records = held_out_by_record(last)
     most = max(records, key=lambda n: records[n], default="")
     units = float(np.sqrt(last.chi2 / last.rows))
@@ -110,6 +109,26 @@ def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float)
         record=most, record_units=records.get(most, 0.0), beyond=_beyond(search.tolerance, last, floor),
     )  # fmt: skip
     return _tested(search, last, found)
+
+
+def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
+    """The chance that the mean square of noise in the held-out data reaches this one, with what is not known of the noise."""
+    others = of_held_out(last.problem)
+    if not np.isfinite(square):
+        return 0.0
+    if others is None:  # parts of the fitted records, which noise before the event has told of
+        rows = unseen_rows(last) * last.effective / last.rows
+        return float(chi2.sf(square * rows, rows))
+    held = Nominal(others, last.theta[: len(last.problem.free)], last.noise)
+    drawn = draws(others, held.blocks, held.noise, held.fitted(), _least_draws(search), search.seed + 6)
+    rows = sum(b.residual.size for b in held.blocks)
+    squares = sum(np.sum(d**2, axis=0) + b.spare * b.residual.size for d, b in zip(drawn, held.blocks, strict=True))
+    return float((1 + np.count_nonzero(squares / rows >= square)) / (1 + _least_draws(search)))
+
+
+def _least_draws(search: SearchContext) -> int:
+    """Records of noise from which a chance as small as the significance can be told."""
+    return math.ceil(1.0 / search.options.significance)
 
 
 def _beyond(tolerance: Mapping[str, float], last: Refit, floor: float) -> FrozenMap[float]:
@@ -142,8 +161,9 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     jobs = [_LatentJob(nominal, {n: p.only(s) for n, p in inner.items()}, s, None) for s in places]
     falls = list(mapped(search.executor, _fall, jobs))
     best = sorted(range(len(places)), key=lambda k: -falls[k])[:SHORTLIST]
-    count = math.ceil(1.0 / search.options.significance)  # the least p that is asked for
-    drawn = draws(nominal.problem, nominal.blocks, nominal.noise, nominal.fitted(), count, search.seed + 5)
+    drawn = draws(
+        nominal.problem, nominal.blocks, nominal.noise, nominal.fitted(), _least_draws(search), search.seed + 5
+    )
     noise = nominal.projected(np.vstack(drawn))
     jobs = [_LatentJob(nominal, {n: p.only(places[k]) for n, p in inner.items()}, places[k], noise) for k in best]
     table = np.array(list(mapped(search.executor, _log_evidence, jobs))).reshape(len(jobs), -1)

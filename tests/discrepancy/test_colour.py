@@ -126,6 +126,27 @@ def test_drawn_noise_keeps_its_steps_where_no_deviation_is_given() -> None:
     assert steps[1] > 1.5 * steps[0]
 
 
+def test_drawn_noise_is_as_uncertain_as_the_rows_that_tell_of_it() -> None:
+    """A standard deviation from 46 degrees of freedom is known to 1/sqrt(2 x 46), in every record of its output alike."""
+    from cases import FREE, experiments, model
+
+    from hvdc_ident.simulate import ModelSimulator
+
+    problem = Problem(ModelSimulator(model()), experiments(), FREE)
+    blocks = problem.blocks(problem.start, derivatives=False)
+    spread = {}
+    for freedom in (46, 0):
+        told = OutputNoise(1.0, (), 0.0, 0.0, "the records before the event", 50, freedom)
+        drawn = draws(problem, blocks, FrozenMap({"w": told, "torque": told}), [b.misfit for b in blocks], 400, 0)
+        loud = {
+            b.output: np.concatenate([d for d, own in zip(drawn, blocks, strict=True) if own.output == b.output])
+            for b in blocks
+        }
+        spread[freedom] = float(np.std(np.log(np.sqrt(np.mean(loud["w"] ** 2, axis=0)))))
+    assert spread[46] == pytest.approx(1.0 / np.sqrt(92.0), rel=0.15)
+    assert spread[0] < 0.3 * spread[46]
+
+
 def test_a_ripple_that_all_records_share_is_no_noise() -> None:
     noise = list(process(0.9, (50, 3), 11).T)
     ripple = 0.8 * np.where(np.arange(50) % 3 == 0, 1.0, -0.5)

@@ -87,6 +87,20 @@ def test_of_noise_alone_a_latent_input_is_as_likely_as_chance_has_it() -> None:
     assert set(SIGMA) == set(model().outputs)
 
 
+def test_held_out_noise_may_be_as_loud_as_the_rows_before_the_event_let_it() -> None:
+    """7 % more than the noise is much for 600 rows of known noise, and nothing where few rows have told of it."""
+    right = plain(experiments())
+    assert right.holdout is not None
+    louder = replace(right, holdout=1.07)
+    sure, unsure = (
+        replace(louder, noise=FrozenMap({o: replace(n, freedom=freedom) for o, n in louder.noise.items()}))
+        for freedom in (0, 40)
+    )
+    first = replace(right, holdout=3.0)
+    assert remainder_of(SEARCH, first, sure, 1.0).held_out_p < 0.02
+    assert remainder_of(SEARCH, first, unsure, 1.0).held_out_p > 0.05
+
+
 def test_the_interval_of_a_finding_leaves_out_places_where_the_size_is_another(monkeypatch: pytest.MonkeyPatch) -> None:
     """A coupling on the other side of a difference has the other sign: no interval from one to the other."""
     spans = {"wm": (-0.035, -0.025), "err": (0.025, 0.035), "torque": (-0.036, -0.026)}
