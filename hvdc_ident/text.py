@@ -79,6 +79,12 @@ def listed(names: Iterable[str]) -> str:
     return f"{', '.join(most)} and {last}" if most else last
 
 
+def one_of(names: Sequence[str], most: int = 4) -> str:
+    """Return the names as "A or B", and of more than `most` the first and the number of the others: "A or B or one of 3 more"."""
+    shown = list(names[:most]) + ([f"one of {len(names) - most} more"] if len(names) > most else [])
+    return " or ".join(shown)
+
+
 def with_study(text: str, study: str, *options: str) -> str:
     """Return the text with every "hvdc-ident COMMAND STUDY" in it made a command to paste, with this study and these options."""
     typed = shlex.join([study, *options])

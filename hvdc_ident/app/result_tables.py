@@ -13,7 +13,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.display import Table, rounded
 from hvdc_ident.report.overlay import Overlay
 from hvdc_ident.study.run_summary import interval_text
-from hvdc_ident.text import figures_of, percentage
+from hvdc_ident.text import figures_of, one_of, percentage
 
 _COMMAND = re.compile(r"`?hvdc-ident ([a-z]+) STUDY(?: --to FILE)?`?")
 _BUTTONS = {"letter": "the button Letter", "export": "a button below Take away", "run": "Run all"}
@@ -82,7 +82,7 @@ def finding_table(diagnosis: Mapping[str, Any]) -> Table:
         places = [f"{', '.join(p['at'])} ({percentage(p['probability'])})" for p in f["places"]]
         more = [f"{len(places) - PLACES} more"] if len(places) > PLACES else []
         where = "; ".join([*places[:PLACES], *more])
-        rows.append((" or ".join(f["same_as"]), percentage(f["probability"]), "; ".join(sizes), where))
+        rows.append((one_of(f["same_as"]), percentage(f["probability"]), "; ".join(sizes), where))
     return Table(("effect", "probability", "size (95 %)", "likely at"), tuple(rows)).without_empty()
 
 

@@ -7,20 +7,16 @@ name for it takes a form for told that the data do not tell.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Mapping
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit
 from hvdc_ident.discrepancy.formula import Term, at_run, at_runs, formula_job, terms
-from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.outside.filtered import filters
 from hvdc_ident.discrepancy.outside.law import regression
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import RefitJob
-from hvdc_ident.discrepancy.refitted import PRICE
 from hvdc_ident.discrepancy.rounds import gained
 from hvdc_ident.discrepancy.scores import Path
 from hvdc_ident.discrepancy.signatures.candidates import additive, proportional, source_signals
@@ -62,44 +58,32 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, flo
 
 
 def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], list[float]]:
-    """The formulas that by regression leave least for what their coefficients cost, and the share that each has of its form."""
+    """Of each form the formula that by regression leaves least, and the share that one formula has of its form.
+
+    Of formulas that are the same signal in these records the first is tried: of a signal above 0 the magnitude is itself.
+    """
     paths = found.answers()
     library, formulas = _formulas(found, paths, place, source)
     regressed = regression(found.before.nominal(), paths, place, [at_run(t) for t in library])
-    ranked = []
+    of_form: dict[tuple[str, ...], list[tuple[float, tuple[int, ...], Array]]] = {}
     for formula in formulas:
         coefficients, gain = regressed.solved(formula)
         if coefficients.all():
-            ranked.append((gain - PRICE * len(formula), formula, coefficients))
-    ranked.sort(key=lambda r: -r[0])
-    of_form = Counter(tuple(library[k].form for k in formula) for formula in formulas)
+            of_form.setdefault(tuple(library[k].form for k in formula), []).append((gain, formula, coefficients))
     jobs, shares = [], []
-    for formula, coefficients in _shortlist([(f, c) for _, f, c in ranked], library, paths):
-        chosen = [library[k] for k in formula]
+    shapes: list[tuple[int, list[Array]]] = []
+    for members in of_form.values():
+        _, formula, coefficients = max(members, key=lambda m: m[0])
+        shape = at_runs(library[formula[0]], paths)
+        if any(n == len(formula) and proportional(shape, other) for n, other in shapes):
+            continue
         try:
-            jobs.append(formula_job(found.before, place, chosen, coefficients))
+            jobs.append(formula_job(found.before, place, [library[k] for k in formula], coefficients))
         except ModelError:  # a formula that would close a loop through itself is none of this model
             continue
-        shares.append(1.0 / of_form[tuple(t.form for t in chosen)])
+        shapes.append((len(formula), shape))
+        shares.append(1.0 / len(members))
     return jobs, shares
-
-
-def _shortlist(
-    ranked: Sequence[tuple[tuple[int, ...], Array]], library: Sequence[Term], paths: Mapping[str, Path]
-) -> list[tuple[tuple[int, ...], Array]]:
-    """The best with one coefficient and the best with two, in turn, each shape once: of a signal above 0 the magnitude is itself.
-
-    A second coefficient often gains by what the regression leaves out, and a truth with one alone would not be tried.
-    """
-    kept: dict[int, list[tuple[tuple[int, ...], Array]]] = {1: [], 2: []}
-    shapes: dict[int, list[list[Array]]] = {1: [], 2: []}
-    for formula, coefficients in ranked:
-        n, shape = len(formula), at_runs(library[formula[0]], paths)
-        if not any(proportional(shape, other) for other in shapes[n]):
-            kept[n].append((formula, coefficients))
-            shapes[n].append(shape)
-    in_turn = [f for pair in zip_longest(kept[1], kept[2]) for f in pair if f is not None]
-    return in_turn[:SHORTLIST]
 
 
 def _formulas(

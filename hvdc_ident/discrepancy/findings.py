@@ -57,7 +57,7 @@ def finding(found: Round, one: EffectClass, put_in: FoundEffect | None = None) -
     places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
     does = own.text if own is not None else sentence(best, best.parameters, filled(best.expression, best.parameters))
     text = f"{does}{_sizes(parameters)}{_others(one, best)}{_apart(best, places)}."
-    return Finding(best.effect, one.names, one.probability, FrozenMap(parameters), places, text, delay)
+    return Finding(best.effect, _names(one, best.effect), one.probability, FrozenMap(parameters), places, text, delay)
 
 
 def _over_places(size: EffectSize, before: EffectSize, spans: Sequence[tuple[float, float]]) -> EffectSize:
@@ -122,10 +122,20 @@ def _sizes(parameters: Mapping[str, EffectSize]) -> str:
     return f" (95 %: {', '.join(each)})" if each else ""
 
 
+def _likely(one: EffectClass) -> list[str]:
+    """The effects of a class that are likely, over all their places, the likeliest first."""
+    return [n for n, p in one.equations.items() if p >= LIKELY * one.probability]
+
+
+def _names(one: EffectClass, own: str) -> tuple[str, ...]:
+    """The names of a class: its own, then those of its likely effects, each followed by others for the same equation."""
+    alike = [r.effect for name in _likely(one) for r, _ in one.members if (r.same_as or r.effect) == name]
+    return tuple(dict.fromkeys((own, *alike)))
+
+
 def _others(one: EffectClass, best: Rival) -> str:
     """The other effects of a class than its best, as its sentence goes on."""
-    told = [n for n, p in one.equations.items() if p >= LIKELY * one.probability and n in one.kinds]
-    others = [n for n in told if not _equation(n, best.effect)]
+    others = [n for n in _likely(one) if n in one.kinds and not _equation(n, best.effect)]
     kind = (
         "another kind of delay as long"
         if best.late is not None

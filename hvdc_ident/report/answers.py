@@ -16,7 +16,7 @@ import numpy as np
 from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.report.overlay import STAGES, Overlay, overlay_of
 from hvdc_ident.report.results import Results
-from hvdc_ident.text import percentage, quantity
+from hvdc_ident.text import one_of, percentage, quantity
 
 Signal = tuple[str, str]
 """An output and an experiment."""
@@ -280,7 +280,7 @@ class Answers:
             parameters = f["effect"] == "parameter"
             found.append(
                 Missing(
-                    "parameter" if parameters else " or ".join(f["same_as"]),
+                    "parameter" if parameters else one_of(f["same_as"]),
                     (said or str(f["text"])).rstrip("."),
                     float(f["probability"]),
                     () if parameters else tuple((", ".join(p["at"]), float(p["probability"])) for p in places),

@@ -129,6 +129,15 @@ def test_what_was_put_in_is_told_where_it_is_as_likely(monkeypatch: pytest.Monke
     assert told.parameters["T"].value == 0.03 and "w is late" not in told.text
 
 
+def test_the_names_of_a_finding_are_those_of_its_likely_effects_its_own_first() -> None:
+    gain = replace(Rival("gain", ("wm",), 1.0, FrozenMap({"k": 0.9})), akin="offset")
+    deadband = replace(Rival("deadband", ("wm",), 9.0, FrozenMap({"width": 0.1})), akin="gain")
+    limit = Rival("limit", ("wm",), 1.0, FrozenMap(), refitted=False, same_as="gain")
+    (one,) = classes([Rival("offset", ("wm",), 0.0, FrozenMap({"c": 0.1})), gain, limit, deadband])
+    assert told_as._names(one, "gain") == ("gain", "offset", "limit")
+    assert told_as._others(one, one.members[0][0]) == ", or another effect that does the same in these records (gain)"
+
+
 def test_a_size_that_later_effects_moved_is_told_with_its_interval_there() -> None:
     """The interval of the last model, wider by as much as the places make that of the effect's own round."""
     last, own = EffectSize(0.018, (0.017, 0.019), "s"), EffectSize(0.020, (0.0195, 0.0205), "s")

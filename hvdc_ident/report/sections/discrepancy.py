@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.report.drawing import AFTER, BEFORE, EFFECT, MARK, MEASURED, figure, svg, visible
 from hvdc_ident.report.html import captioned, folded, number, percent, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import form_of, listed, percentage, span, with_unit
+from hvdc_ident.text import form_of, listed, one_of, percentage, span, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,7 +93,7 @@ def _findings(found: dict[str, Any]) -> str:
         where += f"; and {len(f['places']) - PLACES} more" if len(f["places"]) > PLACES else ""
         value = delay.get("value")
         late = "" if value is None else number(1e3 * value, 3)
-        rows.append([text(", ".join(f["same_as"])), text(f"{percent(f['probability'])}"), text(where), late])
+        rows.append([text(one_of(f["same_as"])), text(f"{percent(f['probability'])}"), text(where), late])
     if not rows or (len(rows) == 1 and len(found["findings"][0]["places"]) < 2):
         return ""
     return "<h3>What may be missing, and where</h3>" + table(
