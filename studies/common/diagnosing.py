@@ -92,7 +92,7 @@ def _finding(f: Mapping[str, Any] | None) -> list[str]:
         number(f["probability"], 3),
         size,
         "-" if late is None else number(1e3 * late["value"], 3),
-        _places(f["places"]),
+        "-" if f["effect"] == "parameter" else _places(f["places"]),
     ]
 
 

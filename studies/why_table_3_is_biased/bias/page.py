@@ -26,19 +26,12 @@ def tables(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _verdicts(told: Mapping[str, Any], louder: Mapping[str, Any]) -> str:
-    rows = [
-        [
-            signals,
-            noise,
-            found["verdict"],
-            diagnosing.effects_of(found),
-            ", ".join(number(found["pooled"][m]["holdout"], 3) for m in ("nominal", "refitted", "augmented")),
-        ]
+    cases = {
+        f"{signals}; {noise}": found
         for signals, t in told.items()
         for noise, found in {f"{diagnosed.NOISE:g}": t, **louder.get(signals, {})}.items()
-    ]
-    head = ["recorded", "noise, pu", "verdict", "inserted effects", "held-out gap: given, refitted, with them"]
-    return markdown(head, rows)
+    }
+    return diagnosing.findings(cases, "recorded; noise, pu")
 
 
 def _gains(told: Mapping[str, Any]) -> str:
