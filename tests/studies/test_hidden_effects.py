@@ -415,3 +415,31 @@ def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere(large):
     best = found.winner.refit
     assert (best.placed[0].candidate.effect, best.placed[0].candidate.at) == ("rate-limit", ("xi",))
     assert best.sizes(best.placed[0])["rate"] == pytest.approx(1.4, rel=0.01)
+
+
+def test_the_sensitivity_study_sets_a_number_wherever_it_is_used_and_sets_it_back() -> None:
+    from hvdc_ident.discrepancy import options, remainder, verdict
+
+    study = load("hidden_effects", "sensitivity")
+    by_label = {n.label: n for n in study.numbers()}
+    assert {"options.TOLERANCE", "refitted.PRICE", "options.set_bic"} <= set(by_label)
+    with study.changed(by_label["options.TOLERANCE"], 0.3) as changed:
+        assert options.TOLERANCE == remainder.TOLERANCE == verdict.TOLERANCE == 0.3 and changed == DiagnosisOptions()
+    assert options.TOLERANCE == remainder.TOLERANCE == verdict.TOLERANCE == by_label["options.TOLERANCE"].value
+    with study.changed(by_label["options.set_bic"], 12.0) as changed:
+        assert changed == DiagnosisOptions(set_bic=12.0)
+    share, count = study.Number("m", "CERTAIN", 0.95), study.Number("m", "FIELD", 5)
+    assert share.times(2.0) == pytest.approx(0.9) and share.times(0.5) == pytest.approx(0.975)
+    assert (count.times(0.5), count.times(2.0)) == (2, 10)
+
+
+def test_the_sensitivity_table_lists_the_sensitive_numbers_first() -> None:
+    study = load("hidden_effects", "sensitivity")
+    base = {"number": "", "factor": 1.0, "case": "1 a", "verdict": "named", "found": ["lag"], "seconds": 2.0}
+    runs = [base]
+    for number in ("options.BEAM", "options.SURE"):
+        runs += [base | {"number": number, "factor": f, "seconds": 3.0} for f in study.FACTORS]
+    runs[-1] |= {"verdict": "ambiguous", "found": ["gain", "lag"]}
+    rows = study.table(runs).splitlines()
+    assert rows[2] == "| options.SURE | 4 | same in 1 | 1 a: named (lag) becomes ambiguous (gain, lag) | 1.5 |"
+    assert rows[3] == "| options.BEAM | 2 | same in 1 | same in 1 | 1.5 |"
