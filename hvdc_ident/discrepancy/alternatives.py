@@ -7,7 +7,7 @@ name for it takes a form for told that the data do not tell.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
@@ -16,11 +16,11 @@ from hvdc_ident.discrepancy.formula import Term, at_run, at_runs, formula_job, t
 from hvdc_ident.discrepancy.outside.filtered import filters
 from hvdc_ident.discrepancy.outside.law import regression
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import RefitJob
+from hvdc_ident.discrepancy.refit import Refit, RefitJob
 from hvdc_ident.discrepancy.rounds import gained
 from hvdc_ident.discrepancy.scores import Path
 from hvdc_ident.discrepancy.signatures.candidates import additive, proportional, source_signals
-from hvdc_ident.discrepancy.signatures.finite import additions, is_linear, kind_of
+from hvdc_ident.discrepancy.signatures.finite import additions, alike, is_linear, kind_of
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import ModelError
 from hvdc_ident.model import Model
@@ -32,6 +32,8 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, flo
     Of what bends a signal or brings one in, without memory, at one slot inside a model: formulas there, each with the
     winner's pick. No formula of signals at one time is a delay: for one kind of these or another filters, wherever they are.
     A form is as likely before any data as an effect of the catalogue, and shares that with all places and sources, as one does.
+    One that does the same as a winner that is linear is no other hypothesis, its prior 0: where signals move so little, a
+    formula is its own tangent.
     """
     winner = found.winner
     assert winner is not None and found.ruler is not None
@@ -47,18 +49,34 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, flo
         return ()
     if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:
         return ()
-    jobs, shares = _jobs(found, placed.candidate.at[0], placed.candidate.source)
+    place, source, paths = placed.candidate.at, placed.candidate.source, found.answers()
+    jobs, formulas, shares = _jobs(found, place[0], source)
     elsewhere = sum(c.effect == effect.name and len(c.at) == 1 for c in found.candidates)
-    texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {placed.candidate.at[0]}" for job in jobs]
-    return tuple(
-        (gained(CandidateFit(winner.pick, r, 0.0), found.before, found.ruler), share / elsewhere)
-        for r, share in zip(done(search, jobs, texts), shares, strict=True)
-        if not r.failure
-    )
+    texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {place[0]}" for job in jobs]
+    own = None
+    if is_linear(kind_of(placed.candidate, winner.pick.probe)):
+        sizes = winner.refit.sizes(placed)
+        own = found.shown(place, additions(effect.name, sizes, place, source, paths.values()))
+    weighed = []
+    for refit, formula, share in zip(done(search, jobs, texts), formulas, shares, strict=True):
+        if refit.failure:
+            continue
+        same = own is not None and alike(own, found.shown(place, _added(formula, refit, paths)))
+        trial = gained(CandidateFit(winner.pick, refit, 0.0), found.before, found.ruler)
+        weighed.append((trial, 0.0 if same else share / elsewhere))
+    return tuple(weighed)
 
 
-def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], list[float]]:
-    """Of each form the formula that by regression leaves least, and the share that one formula has of its form.
+def _added(formula: Sequence[Term], refit: Refit, paths: Mapping[str, Path]) -> list[Array]:
+    """What a refitted formula adds to its slot along each run, (K,) each."""
+    sizes = refit.sizes(refit.placed[-1]).values()
+    terms = [at_runs(term, paths) for term in formula]
+    return [sum(k * run for k, run in zip(sizes, runs, strict=True)) for runs in zip(*terms, strict=True)]
+
+
+def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], list[list[Term]], list[float]]:
+    """Of each form the formula that by regression leaves least, its refit and its terms, and the share that one formula has of
+    its form.
 
     Of formulas that are the same signal in these records the first is tried: of a signal above 0 the magnitude is itself.
     """
@@ -70,7 +88,7 @@ def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], list[f
         coefficients, gain = regressed.solved(formula)
         if coefficients.all():
             of_form.setdefault(tuple(library[k].form for k in formula), []).append((gain, formula, coefficients))
-    jobs, shares = [], []
+    jobs, chosen, shares = [], [], []
     shapes: list[tuple[int, list[Array]]] = []
     for members in of_form.values():
         _, formula, coefficients = max(members, key=lambda m: m[0])
@@ -81,9 +99,10 @@ def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], list[f
             jobs.append(formula_job(found.before, place, [library[k] for k in formula], coefficients))
         except ModelError:  # a formula that would close a loop through itself is none of this model
             continue
+        chosen.append([library[k] for k in formula])
         shapes.append((len(formula), shape))
         shares.append(1.0 / len(members))
-    return jobs, shares
+    return jobs, chosen, shares
 
 
 def _formulas(

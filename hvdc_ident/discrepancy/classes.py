@@ -9,7 +9,6 @@ from itertools import combinations
 
 import numpy as np
 
-from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
@@ -17,7 +16,7 @@ from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import Hypothesis, Rival
 from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.signatures.finite import additions, is_linear, kind_of
+from hvdc_ident.discrepancy.signatures.finite import additions, alike, is_linear, kind_of
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 
@@ -68,32 +67,19 @@ def _akin(found: Round, group: Sequence[Rival]) -> list[str]:
     what is lost in proportion to it. Where the records do not show an offset, what differs by one is the same.
     """
     paths = found.answers().values() if len({r.effect for r in group if r.parameters}) > 1 else ()
-    offsets = {i: c.at for i, c in enumerate(found.candidates) if c.effect == "offset"}
-    seen = {
-        offsets.get(c.candidate) for c, usable in zip(found.scores.columns, found.scores.usable, strict=True) if usable
-    }
-
-    def added(r: Rival) -> Array | None:
-        if not paths or not r.parameters:
-            return None
-        signal = np.concatenate(additions(r.effect, r.parameters, r.at, r.source, paths))
-        return signal - np.mean(signal) if r.at in offsets.values() and r.at not in seen else signal
-
-    signals = [added(r) for r in group]
+    signals = [
+        found.shown(r.at, additions(r.effect, r.parameters, r.at, r.source, paths)) if paths and r.parameters else None
+        for r in group
+    ]
     akin = []
     for k, (r, own) in enumerate(zip(group, signals, strict=True)):
         earlier = (
             q.effect
             for q, other in zip(group[:k], signals, strict=False)
-            if own is not None and other is not None and q.at == r.at and q.effect != r.effect and _alike(own, other)
+            if own is not None and other is not None and q.at == r.at and q.effect != r.effect and alike(own, other)
         )
         akin.append(next(earlier, ""))
     return akin
-
-
-def _alike(one: Array, other: Array) -> bool:
-    """Return True for two signals whose difference is within the tolerance: that share of the square of the larger."""
-    return bool(np.sum((one - other) ** 2) <= TOLERANCE * max(np.sum(one**2), np.sum(other**2)))
 
 
 def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) -> bool:
@@ -114,14 +100,18 @@ def formula_rivals(
     """By how much the winner is behind the best formula outside the catalogue, in BIC, and the formulas that are near it; infinite
     where one is further ahead than they can be told apart.
 
-    formulas: refitted in the winner's stead, each with its prior.
+    formulas: refitted in the winner's stead, each with its prior; none is near of which that is 0.
     """
     assert found.winner is not None
     own, *behind = behinds([found.winner, *(t for t, _ in formulas)])
     within = max(options.set_bic, SLIGHT * found.winner.told)
     if own > within:
         return np.inf, ()
-    near = [replace(_rival(t, b), prior=prior) for b, (t, prior) in zip(behind, formulas, strict=True) if b <= within]
+    near = [
+        replace(_rival(t, b), prior=prior)
+        for b, (t, prior) in zip(behind, formulas, strict=True)
+        if b <= within and prior > 0.0
+    ]
     return own, tuple(sorted(near, key=lambda r: r.delta_bic))
 
 

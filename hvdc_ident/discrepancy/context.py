@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler
 from hvdc_ident.discrepancy.formula import Law
@@ -142,6 +144,14 @@ class Round:
     def answers(self) -> Mapping[str, Path]:
         """The model's answers at its slots, by experiment: computed again where the round has released them."""
         return self.paths or runs(self.before.model, self.before.nominal())
+
+    def shown(self, at: tuple[str, ...], added: Sequence[Array]) -> Array:
+        """What the records show of additions to the signals of slots, (K,) each: all of it, one behind the other; less their mean
+        where an offset was looked for at the slots and none could be seen."""
+        whole = np.concatenate(added)
+        offsets = {i for i, c in enumerate(self.candidates) if c.effect == "offset" and c.at == at}
+        seen = {c.candidate for c, usable in zip(self.scores.columns, self.scores.usable, strict=True) if usable}
+        return whole - np.mean(whole) if offsets and not offsets & seen else whole
 
     def light(self) -> Round:
         """The round without those answers, which are hundreds of MiB of a large model."""

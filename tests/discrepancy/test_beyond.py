@@ -14,13 +14,14 @@ from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, InputSignal, Model
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.alternatives import beyond
+from hvdc_ident.discrepancy.alternatives import _added, beyond
 from hvdc_ident.discrepancy.classes import formula_rivals
 from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler
 from hvdc_ident.discrepancy.formula import Term, formula_job
 from hvdc_ident.discrepancy.refit import run
 from hvdc_ident.discrepancy.rounds import one_round
+from hvdc_ident.discrepancy.signatures.finite import additions, alike
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
@@ -124,3 +125,20 @@ def test_a_formula_that_is_an_effect_of_the_catalogue_is_no_rival_of_it() -> Non
     assert not formulas & {"k1*w", "k1*abs(w)", "k1*w**2", "k1*w*abs(w)"}
     assert found.findings[0].same_as[0] in ("conductance", "loss")
     assert found.findings[0].parameters["g"].value == pytest.approx(0.05, rel=0.1)
+
+
+@pytest.mark.parametrize(("change", "same"), [(0.02, True), (0.6, False)])
+def test_a_formula_of_a_signal_that_hardly_moves_is_its_own_tangent(change: float, same: bool) -> None:
+    """The cube of a set-point of 1 moves three times as much as that, and bends only where it moves far."""
+    moved = FrozenMap({"ref": InputSignal.step(0.3, 1.0, 1.0 + change), "load": InputSignal.constant(0.3)})
+    records = answered(model(), [replace(e, inputs=moved) for e in experiments()], seed=5)
+    search = SearchContext(
+        ("conductance", "offset"), ("torque",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0
+    )
+    found = one_round(search, plain(records), 1)
+    paths = found.answers()
+    cube = run(formula_job(found.before, "torque", [Term("ref**3", ("ref",), "x3")], np.array([0.1])))
+    size = cube.sizes(cube.placed[-1])["k1"]
+    told = found.shown(("torque",), _added([Term("ref**3", ("ref",), "x3")], cube, paths))
+    linear = found.shown(("torque",), additions("conductance", {"g": -3.0 * size}, ("torque",), "ref", paths.values()))
+    assert alike(linear, told) == same

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.options import TOLERANCE
 from hvdc_ident.discrepancy.signatures.block import block, parameter
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.closed import Ends
@@ -115,6 +116,11 @@ def additions(
             brought = path.signal(sources[k])[:, None] if sources else None
             found.append(np.asarray(run(own, path.time, u, brought) - u)[:, 0])
     return found
+
+
+def alike(one: Array, other: Array) -> bool:
+    """Return True for two additions whose difference is within the tolerance: that share of the square of the larger."""
+    return bool(np.sum((one - other) ** 2) <= TOLERANCE * max(np.sum(one**2), np.sum(other**2)))
 
 
 @lru_cache(maxsize=256)
