@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import TypeVar
 
 import numpy as np
 
@@ -252,8 +253,16 @@ def _as_long(one: Rival, other: Rival) -> bool:
 
 def likely(each: Sequence[EffectClass]) -> list[EffectClass]:
     """The likeliest classes, as many as hold 95 % together."""
-    total = np.cumsum([0.0, *(c.probability for c in each)])
-    return [c for c, before in zip(each, total, strict=False) if before < CERTAIN]
+    return [c for c, _ in credible([(c, c.probability) for c in each])]
+
+
+T = TypeVar("T")
+
+
+def credible(each: Sequence[tuple[T, float]]) -> list[tuple[T, float]]:
+    """Of things with their probabilities, the likeliest first, as many as hold 95 % of them together."""
+    before = np.cumsum([0.0, *(p for _, p in each)])
+    return [one for one, held in zip(each, before, strict=False) if held < CERTAIN * before[-1]]
 
 
 def compared(first: Refit, outcome: SearchOutcome) -> tuple[Hypothesis, ...]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import product
 from typing import Any
 
-from hvdc_ident.discrepancy.classes import EffectClass
+from hvdc_ident.discrepancy.classes import EffectClass, credible
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.explain import advice, sentence
 from hvdc_ident.discrepancy.formula import filled
@@ -17,8 +17,6 @@ from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import listed, quantity
 
-LIKELY = 0.05
-"""Probability, given its class, from which a place is told, and its size counts for the class's interval."""
 SHARED = ("s", "rad/s", "Hz", "")
 """Units of parameters that mean the same at every place."""
 
@@ -30,7 +28,7 @@ def finding(found: Round, one: EffectClass, put_in: FoundEffect | None = None) -
     else it is the likeliest, as its own refit has it.
     """
     refits = {_key_of(t.refit): t.refit for t in found.trials}
-    likely_ones = [(r, p) for r, p in one.members if p >= LIKELY * one.probability and p > 0.0]
+    likely_ones = credible(one.members)
     there = next((r for r, _ in likely_ones if put_in is not None and _key(r) == _key(put_in)), None)
     own = put_in if there else None
     best = there or one.best
@@ -124,7 +122,7 @@ def _sizes(parameters: Mapping[str, EffectSize]) -> str:
 
 def _likely(one: EffectClass) -> list[str]:
     """The effects of a class that are likely, over all their places, the likeliest first."""
-    return [n for n, p in one.equations.items() if p >= LIKELY * one.probability]
+    return [n for n, _ in credible([*one.equations.items()])]
 
 
 def _names(one: EffectClass, own: str) -> tuple[str, ...]:

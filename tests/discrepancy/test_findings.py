@@ -129,6 +129,19 @@ def test_what_was_put_in_is_told_where_it_is_as_likely(monkeypatch: pytest.Monke
     assert told.parameters["T"].value == 0.03 and "w is late" not in told.text
 
 
+def test_an_effect_that_may_be_anywhere_is_told_with_its_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 40 places that are as likely none is likely, and 38 hold 95 %."""
+    members = [Rival("delay", (f"s{k}",), 0.0, FrozenMap({"T": 0.02})) for k in range(40)]
+    monkeypatch.setattr(told_as, "_key_of", lambda rival: (rival.effect, rival.at, rival.source))
+    monkeypatch.setattr(told_as, "_span", lambda _refit, _name: (0.019, 0.021))
+    found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
+    (one,) = classes(members)
+    told = told_as.finding(found, one)
+    assert len(told.places) == 38 and told.equivalent_delay is not None
+    assert told.equivalent_delay.ci95 == pytest.approx((0.019, 0.021))
+    assert "or one of 33 more" in told.text
+
+
 def test_the_names_of_a_finding_are_those_of_its_likely_effects_its_own_first() -> None:
     gain = replace(Rival("gain", ("wm",), 1.0, FrozenMap({"k": 0.9})), akin="offset")
     deadband = replace(Rival("deadband", ("wm",), 9.0, FrozenMap({"width": 0.1})), akin="gain")
