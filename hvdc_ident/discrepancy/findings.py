@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 from hvdc_ident.discrepancy.classes import EffectClass, credible
@@ -43,12 +42,9 @@ def finding(found: Round, one: EffectClass, put_in: FoundEffect | None = None) -
     late = best.late if own is None else own.late
     delay = None
     if late is not None and best.late is not None:
-        ends = [s for r, _ in likely_ones if (s := _delay_span(r, refits.get(_key(r)))) is not None]
-        delay = EffectSize(
-            late,
-            (min(low for low, _ in ends) + late - best.late, max(high for _, high in ends) + late - best.late),
-            "s",
-        )
+        spans = [s for r, _ in likely_ones if (s := _delay_span(r, refits.get(_key(r)))) is not None]
+        before = EffectSize(best.late, _delay_span(best, refits.get(_key(best))), "s")
+        delay = _over_places(EffectSize(late, _moved(before, late), "s"), before, spans)
     by_place: dict[tuple[tuple[str, ...], str], float] = {}
     for r, p in likely_ones:
         by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
@@ -72,16 +68,20 @@ def _over_places(size: EffectSize, before: EffectSize, spans: Sequence[tuple[flo
 
 
 def _delay_span(rival: Rival, refit: Refit | None) -> tuple[float, float] | None:
-    """The 95 % interval of a rival's equivalent delay, s: the least and most that the intervals of its parameters leave; itself
-    where one of them is not known, None for what is no delay."""
-    if rival.late is None:
+    """The 95 % interval of a rival's equivalent delay, s; None for what is no delay, and where more than one size makes it, for
+    how these go together is not known here."""
+    spans = {n: s for n in rival.parameters if (s := _span(refit, n)) is not None}
+    if rival.late is None or len(spans) != 1:
         return None
-    spans = {n: _span(refit, n) or (v, v) for n, v in rival.parameters.items()}
-    ends = [
-        effects()[rival.effect].delay_with(dict(zip(spans, corner, strict=True))) for corner in product(*spans.values())
-    ]
-    known = [late for late in ends if late is not None]
-    return min(known), max(known)
+    ((name, ends),) = spans.items()
+    low, high = (effects()[rival.effect].delay_with({**rival.parameters, name: end}) for end in ends)
+    return None if low is None or high is None else (min(low, high), max(low, high))
+
+
+def _moved(before: EffectSize, value: float) -> tuple[float | None, float | None] | None:
+    """The interval of a size, moved with it to another value."""
+    low, high = before.ci95 or (None, None)
+    return None if low is None or high is None else (low + value - before.value, high + value - before.value)
 
 
 def _equation(one: str, other: str) -> bool:

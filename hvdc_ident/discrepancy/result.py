@@ -101,7 +101,8 @@ class Finding:
     same_as: all names of it, its own first: effects that are the same equation there, or do the same in these records.
     probability: of the effect, summed over its places. parameters: at the likeliest place; their intervals hold over the
     likely places. places: the likely ones, the likeliest first. equivalent_delay: by how long it delays a slow signal, s, with
-    its span over the places; None for what is no delay. share: of the gap that it explains with the other findings.
+    the interval over the likely places, where one size makes it; None for what is no delay. share: of the gap that it explains
+    with the other findings.
     """
 
     effect: str

@@ -159,12 +159,13 @@ def test_a_size_that_later_effects_moved_is_told_with_its_interval_there() -> No
     assert told_as._over_places(last, own, []) is last
 
 
-def test_the_delay_of_a_second_order_holds_for_its_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """2 zeta/wn is longest where the damping is largest and the frequency least."""
-    spans = {"wn": (90.0, 110.0), "zeta": (0.45, 0.55)}
-    monkeypatch.setattr(told_as, "_span", lambda _refit, name: spans[name])
-    rival = Rival("second-order", ("wm",), 0.0, FrozenMap({"wn": 100.0, "zeta": 0.5}))
-    assert told_as._delay_span(rival, None) == pytest.approx((0.9 / 110.0, 1.1 / 90.0))
+def test_the_interval_of_a_delay_is_that_of_the_one_size_that_makes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mean over T is T/2 late. Of two sizes that go together, as in a lead-lag, the intervals tell nothing of the difference."""
+    monkeypatch.setattr(told_as, "_span", lambda _refit, _name: (0.018, 0.022))
+    mean = Rival("window-mean", ("wm",), 0.0, FrozenMap({"T": 0.02}))
+    assert told_as._delay_span(mean, None) == pytest.approx((0.009, 0.011))
+    lead = Rival("lead-lag", ("wm",), 0.0, FrozenMap({"T1": 0.010, "T2": 0.013}))
+    assert told_as._delay_span(lead, None) is None
     assert told_as._delay_span(Rival("gain", ("wm",), 0.0, FrozenMap({"k": 1.1})), None) is None
 
 
