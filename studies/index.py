@@ -150,7 +150,7 @@ def _missing(e: dict[str, Any]) -> str:
     (share,) = drop["parameters"].values()
     before, after = (cases[c]["values"]["KIVDC"] for c in ("fitted", "with the findings"))
     return (
-        f"the dc voltage of station 2 is {number(share['value'], 3)} pu per pu lower than the model's (the card "
+        f"the dc voltage of station 2 is {number(abs(share['value']), 3)} pu per pu lower than the model's (the card "
         f"has {number(RESISTANCES, 3)} pu too much between the terminals), its power {1e3 * late['equivalent_delay']['value']:.1f} ms "
         f"late; with both KIVDC is {number(after)} instead of {number(before)} (true 293.9)"
     )
