@@ -50,7 +50,7 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, flo
     if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:
         return ()
     place, source, paths = placed.candidate.at, placed.candidate.source, found.answers()
-    jobs, formulas, shares = _jobs(found, place[0], source)
+    jobs, formulas, shares = _jobs(found, paths, place[0], source)
     elsewhere = sum(c.effect == effect.name and len(c.at) == 1 for c in found.candidates)
     texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {place[0]}" for job in jobs]
     own = None
@@ -68,19 +68,19 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, flo
 
 
 def _added(formula: Sequence[Term], refit: Refit, paths: Mapping[str, Path]) -> list[Array]:
-    """What a refitted formula adds to its slot along each run, (K,) each."""
+    """Return what a refitted formula adds to its slot along each run, (K,) each."""
     sizes = refit.sizes(refit.placed[-1]).values()
     terms = [at_runs(term, paths) for term in formula]
     return [sum(k * run for k, run in zip(sizes, runs, strict=True)) for runs in zip(*terms, strict=True)]
 
 
-def _jobs(found: Round, place: str, source: str) -> tuple[list[RefitJob], list[list[Term]], list[float]]:
-    """Of each form the formula that by regression leaves least, its refit and its terms, and the share that one formula has of
-    its form.
+def _jobs(
+    found: Round, paths: Mapping[str, Path], place: str, source: str
+) -> tuple[list[RefitJob], list[list[Term]], list[float]]:
+    """Return for each form the refit and the terms of the formula that by regression leaves least, and its share of the form.
 
     Of formulas that are the same signal in these records the first is tried: of a signal above 0 the magnitude is itself.
     """
-    paths = found.answers()
     library, formulas = _formulas(found, paths, place, source)
     regressed = regression(found.before.nominal(), paths, place, [at_run(t) for t in library])
     of_form: dict[tuple[str, ...], list[tuple[float, tuple[int, ...], Array]]] = {}

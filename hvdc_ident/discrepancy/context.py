@@ -146,8 +146,8 @@ class Round:
         return self.paths or runs(self.before.model, self.before.nominal())
 
     def shown(self, at: tuple[str, ...], added: Sequence[Array]) -> Array:
-        """What the records show of additions to the signals of slots, (K,) each: all of it, one behind the other; less their mean
-        where an offset was looked for at the slots and none could be seen."""
+        """Return what the records show of additions to the signals of slots, (K,) each: all of it, one behind the other; less
+        their mean where an offset was looked for at the slots and none could be seen."""
         whole = np.concatenate(added)
         offsets = {i for i, c in enumerate(self.candidates) if c.effect == "offset" and c.at == at}
         seen = {c.candidate for c, usable in zip(self.scores.columns, self.scores.usable, strict=True) if usable}
