@@ -131,6 +131,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=HERE / "sensitivity-results", help="folder of the results")
     parser.add_argument("--judge-only", action="store_true", help="write the table of what is there")
     asked = parser.parse_args(arguments)
+    if unknown := sorted(set(asked.only or ()) - {n.label for n in numbers()}):
+        parser.error(
+            f"--only: no such number: {', '.join(unknown)}; expected names such as options.TOLERANCE or evidence.CLEARLY"
+        )
     asked.out.mkdir(parents=True, exist_ok=True)
     path = asked.out / "runs.jsonl"
     done = [json.loads(text) for text in path.read_text(encoding="utf-8").splitlines()] if path.exists() else []
