@@ -49,8 +49,8 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class _PlaceJob:
-    """One insertion point's share of the work: the candidates there, and (N, B) noise. own: whether the effects are put on the
-    model's own signal too, not only on the one that the records tell."""
+    """One insertion point's share of the work: the candidates there, and (N, B) noise, without what the parameters of this view
+    can make good. own: whether the effects are put on the model's own signal too, not only on the one that the records tell."""
 
     view: View
     found: tuple[Dense, ...]
@@ -130,14 +130,14 @@ def by_latent(
         search.options.bootstraps,
         search.seed + number,
     )
-    noise = nominal.projected(np.vstack(drawn))
+    noise = np.vstack(drawn)
     places: dict[str, list[Dense]] = {}
     for d in dense:
         places.setdefault(d.candidate.at[0], []).append(d)
     # With other gains than those that fit, the model's own signal is the one that is known to be wrong.
     jobs = [
-        _PlaceJob(View(v.nominal, {n: a.only(p) for n, a in v.paths.items()}), tuple(group), noise, own=v is seen[0])
-        for v in seen
+        _PlaceJob(View(v.nominal, {n: a.only(p) for n, a in v.paths.items()}), tuple(group), under, own=v is seen[0])
+        for v, under in ((v, v.nominal.projected(noise)) for v in seen)
         for p, group in places.items()
     ]
     spots: list[_Spot] = []
