@@ -78,7 +78,14 @@ def forward(search: SearchContext, first: Refit) -> SearchOutcome:
     found = found or one_round(search, first, 1)
     if found.winner is not None and _behind(found.winner.refit, here) <= level:
         return _onwards(search, first, first, [found])
-    return _onwards(search, base, here, [])
+    with_parameters = _onwards(search, base, here, [])
+    # A parameter may stand for one of several effects: that is seen when the others are there too.
+    if found.winner is None or not with_parameters.kept or search.spent:
+        return with_parameters
+    with_effects = _onwards(search, first, first, [found])
+    more = len(with_effects.kept) > len(with_parameters.kept)
+    behind = _behind(with_effects.refit, with_parameters.refit)
+    return with_effects if behind <= (-search.options.named_bic if more else level) else with_parameters
 
 
 def _behind(one: Refit, other: Refit) -> float:
@@ -92,41 +99,42 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
     nominal = here
     kept: list[Round] = []
     notes: tuple[str, ...] = ()
-    for number in range(1, search.options.most + 1):
-        if number > 1 and search.spent:
-            notes = ("The budget ended: no further effect was looked for.",)
+    settled_already = False
+    while len(kept) < search.options.most:
+        if kept and search.spent:
+            notes += ("The budget ended: no further effect was looked for.",)
             break
         if kept:
-            rounds[-1] = kept[-1] = kept[-1].light()
+            rounds[-1], kept[-1] = rounds[-1].light(), kept[-1].light()
         try:
-            if len(rounds) < number:
-                rounds.append(one_round(search, here, number))
+            if kept or not rounds:
+                rounds.append(one_round(search, here, len(rounds) + 1))
         except SimulationError as error:
-            if number == 1:
+            if not kept:
                 raise
-            notes = (f"nothing was looked for beside {here.placed[-1].candidate.label}: {error}",)
+            notes += (f"nothing was looked for beside {here.placed[-1].candidate.label}: {error}",)
             break
         found = rounds[-1]
         if found.winner is None:
             hopeful = (
                 found.significant
                 and found.law is None
-                and number < search.options.most
+                and len(kept) + 1 < search.options.most
                 and not (search.spent or is_noise(here, search.seed))
             )
-            both = _masked(search, here, found, number + 1) if hopeful else None
+            both = _masked(search, here, found, len(rounds) + 1) if hopeful else None
             if both is None:
                 break
             rounds[-1] = both[0]
             rounds.append(both[1])
             kept += both
             assert both[1].winner is not None
-            here = both[1].winner.refit
+            here, settled_already = both[1].winner.refit, False
             if not is_noise(here, search.seed):
                 base, here = released(search, base, here)
             break
         kept.append(found)
-        here = found.winner.refit
+        here, settled_already = found.winner.refit, False
         if is_noise(here, search.seed):
             break
         base, here = released(search, base, here)
@@ -134,8 +142,14 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
         little = left_by(here) <= TOLERANCE * left_by(nominal)
         if little or (here is not found.winner.refit and is_noise(here, search.seed)):
             break
+        # What is still left may be left by an effect that stands for another one.
+        if 1 < len(kept) < search.options.most and not search.spent:
+            here, kept, more = settled(search, base, here, kept, len(rounds))
+            notes, settled_already = notes + more, True
+            if is_noise(here, search.seed):
+                break
     # Where a parameter was set free beside an effect, its rivals were refitted without that.
-    if kept and not search.spent and (len(kept) > 1 or _closed_to(base, kept[0])):
+    if kept and not (search.spent or settled_already) and (len(kept) > 1 or _closed_to(base, kept[0])):
         here, kept, more = settled(search, base, here, kept, len(rounds))
         notes += more
     return SearchOutcome(here, tuple(rounds), tuple(kept), notes)
