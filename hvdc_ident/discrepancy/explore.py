@@ -30,7 +30,7 @@ from hvdc_ident.discrepancy.refitted import (
 )
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.size_profile import has_to_be_met, resized, sized
+from hvdc_ident.discrepancy.size_profile import has_to_be_met, resized
 from hvdc_ident.effects import Probe, effects
 
 FIELD = 40
@@ -217,12 +217,13 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
 class _Lead:
     """A hypothesis whose neighbours are asked for.
 
-    number: of its candidate. gains: the unknowns of the model before at its end. sizes: of its effect. late: by how long that
-    delays a slow signal, s; None for what is no kind of delay.
+    num    number: of its candidate; probe: the one it began at. gains: the unknowns of the model before at its end. sizes: of its effect.
+    late: by how long that delays a slow signal, s; None for what is no kind of delay.
     """
 
     number: int
     candidate: CandidateEffect
+    probe: int
     gains: tuple[float, ...]
     sizes: Mapping[str, float]
     late: float | None
@@ -231,11 +232,20 @@ class _Lead:
     def of(cls, opened: Round, trial: CandidateFit) -> _Lead:
         refit, number = trial.refit, trial.pick.candidate
         sizes = refit.sizes(refit.placed[-1])
-        return cls(number, opened.candidates[number], _gains(opened, refit), sizes, _late(trial))
+        return cls(number, opened.candidates[number], trial.pick.probe, _gains(opened, refit), sizes, _late(trial))
 
     def is_elsewhere(self, other: CandidateEffect) -> bool:
         """Return True for the same effect at another place."""
         return other.effect == self.candidate.effect and other.at != self.candidate.at
+
+    def probe_at(self, other: CandidateEffect) -> Probe:
+        """The probe of the same effect at another place with the sizes that were found, to the last digit."""
+        own = next(
+            (p for p in other.probes if set(p.free) == set(self.candidate.probes[self.probe].free)), other.probes[0]
+        )
+        for name in own.free:
+            own = resized(own, name, self.sizes[name])
+        return own
 
     def is_other_delay(self, other: CandidateEffect) -> bool:
         """Return True for another kind of delay at the same place."""
@@ -255,22 +265,22 @@ def _neighbours(
     own: dict[int, Pick] = {}
     for p in field:
         own.setdefault(p.candidate, p)
-    tried = {t.pick.candidate for t in trials}
     extra: dict[int, list[Probe]] = {}
     picks: list[Pick] = []
     for lead in (_Lead.of(opened, t) for t in leaders):
         for n, c in enumerate(found):
-            elsewhere = lead.is_elsewhere(c) and n not in tried
+            elsewhere = lead.is_elsewhere(c)
             if not (elsewhere or lead.is_other_delay(c)) or (lead.number, n) in asked:
                 continue
             if c.still or not opened.reaches(c) or opened.bound(c) < LEVEL * opened.bound(lead.candidate):
                 continue
             asked.add((lead.number, n))
             score = opened.score_p(n)[0]
-            if elsewhere and has_to_be_met(c):  # the size that was met, to the last digit
+            # Elsewhere the sizes that were found, though it was refitted there from others: those may lead astray.
+            if elsewhere and (has_to_be_met(c) or lead.late is not None):
                 met = extra.setdefault(n, [])
                 picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains))
-                met.append(resized(c.probes[0], sized(c), lead.sizes[sized(c)]))
+                met.append(lead.probe_at(c))
             elif (start := _as_late(c, lead.late)) is not None:
                 picks.append(Pick(n, *start, score, lead.gains))
             if n in own:
