@@ -217,8 +217,8 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
 class _Lead:
     """A hypothesis whose neighbours are asked for.
 
-    num    number: of its candidate; probe: the one it began at. gains: the unknowns of the model before at its end. sizes: of its effect.
-    late: by how long that delays a slow signal, s; None for what is no kind of delay.
+    num    number: of its candidate; probe: the one it began at. gains: the unknowns of the model before at its end. sizes: of its
+    effect. late: by how long that delays a slow signal, s; None for what is no kind of delay.
     """
 
     number: int
