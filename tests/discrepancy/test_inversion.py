@@ -13,8 +13,11 @@ from scipy.stats import norm
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, proposals
+from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.latent import TRIED, Inversion
+from hvdc_ident.discrepancy.proposals import views_of
+from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.scores import Whitening, runs
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.effects import SignalScales, effects
@@ -164,6 +167,21 @@ def test_one_slot_of_a_run_answers_as_among_all() -> None:
     assert alone.slots == ("err",) and set(alone.values) == {"err"}
     for all_of_it, one in zip(path.answer(["err"], d), alone.answer(["err"], d), strict=True):
         assert np.array_equal(all_of_it, one)
+
+
+def test_noise_is_scored_without_what_the_parameters_of_each_view_make_good(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else it would score what the parameters do at the gains as given, and every effect would look like chance."""
+    seen, scored = [], proposals._at_place
+    monkeypatch.setattr(proposals, "_at_place", lambda job: (seen.append(job), scored(job))[1])
+    first = plain(experiments(lag=0.1))
+    search = SearchContext(("deadband",), ("wm", "err"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
+    found = one_round(search, first, 1)
+    assert {tuple(job.view.nominal.theta) for job in seen} == {
+        tuple(v.nominal.theta) for v in views_of(found, first.nominal())()
+    }
+    assert len({tuple(job.view.nominal.theta) for job in seen}) == 2
+    for job in seen:
+        assert np.abs(job.view.nominal.basis.T @ job.noise).max() < 1e-9 * np.linalg.norm(job.noise)
 
 
 def test_the_evidence_of_a_latent_input_is_that_of_a_gaussian_with_its_prior() -> None:
