@@ -56,8 +56,7 @@ def explored(
     taken = _entrants(opened, field)
     trials = refitted(search, opened, taken, f"round {number}")
     opened, trials = _with_neighbours(search, opened, trials, field, number)
-    if number == 1:
-        opened, trials = _with_sizes_to_be_met(search, opened, trials, field, views)
+    opened, trials = _with_sizes_to_be_met(search, opened, trials, field, views, number)
     if number == 1 and _tells(opened, trials):
         if search.options.fallback and not (_noise(search, trials) or search.spent):
             opened = _outside(search, opened, nominal, trials)
@@ -72,18 +71,19 @@ def _with_sizes_to_be_met(
     trials: list[CandidateFit],
     field: Sequence[Pick],
     views: Callable[[], Sequence[View]],
+    number: int,
 ) -> tuple[Round, list[CandidateFit]]:
     """The trials with sizes that have to be met: where nothing explains the records, or what does is a kind of delay."""
     far = all_far(opened.before, trials, near=TOLERANCE)
     late = {opened.candidates[t.pick.candidate].at for t in by_cost(trials)[:BEAM] if _late(t) is not None}
     if search.spent or not (far or late):
         return opened, trials
-    opened, more = by_latent(search, opened, views, 1, lambda c: has_to_be_met(c) and (far or c.at in late))
+    opened, more = by_latent(search, opened, views, number, lambda c: has_to_be_met(c) and (far or c.at in late))
     if not more:
         return opened, trials
-    met = refitted(search, opened, _entrants(opened, more), "round 1: sizes to be met", trials)
-    trials = once_more(search, opened, best_each([*trials, *met]), "round 1: sizes to be met")
-    return _with_neighbours(search, opened, trials, [*field, *more], 1)
+    met = refitted(search, opened, _entrants(opened, more), f"round {number}: sizes to be met", trials)
+    trials = once_more(search, opened, best_each([*trials, *met]), f"round {number}: sizes to be met")
+    return _with_neighbours(search, opened, trials, [*field, *more], number)
 
 
 def _with_the_others(

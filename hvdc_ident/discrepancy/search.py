@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
 from hvdc_ident.discrepancy.refit_jobs import as_given, job_of
-from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by
+from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by, once_more
 from hvdc_ident.discrepancy.released import released
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.rounds import against, closed, gained, one_round
@@ -264,6 +264,8 @@ def _looked_again(
     sound += [CandidateFit(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
     mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
     sound.append(mine_again[0] if mine_again else CandidateFit(_pick(again, mine), _last(here, k), 0.0))
+    # A size that has to be met was met beside a misfit that the others have since explained.
+    sound = once_more(search, again, sound, f"again with the others: {own.label}")
     ranked = closed(search, again, [*sound, *again.failed], number)
     winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
     return replace(ranked, winner=winner), winner
