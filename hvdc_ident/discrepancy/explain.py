@@ -58,6 +58,7 @@ def sentence(of: CandidateEffect | Rival, sizes: Mapping[str, float], expression
     if (late := entry.delay_with(sizes)) is not None:
         words["equivalent_delay"] = quantity(late, "s")
     absent = {n for n, q in entry.parameters.items() if q.optional and sizes.get(n, q.neutral) == q.neutral}
+    absent |= {n for n, q in entry.parameters.items() if q.fixed and sizes.get(n) == 0.0}
     text = _without(entry.sentence, absent)
     for name, value in words.items():
         text = text.replace("{" + name + "}", value)
@@ -65,7 +66,8 @@ def sentence(of: CandidateEffect | Rival, sizes: Mapping[str, float], expression
 
 
 def _without(sentence: str, absent: Collection[str]) -> str:
-    """Return an effect's sentence without the bracketed summands of absent parameters, and without the brackets."""
+    """Return an effect's sentence without the bracketed summands, or the bracketed part, of absent parameters, and without the
+    brackets."""
     whole = re.search(r"\[.*\]", sentence)
     if whole is None:
         return sentence

@@ -161,9 +161,9 @@ class Effect:
     """One entry of the catalogue.
 
     insertion_kinds: kinds of insertion point where it may sit. states: those it adds, as part of a sentence. sentence: for
-    the report, with {at}, {from}, {equivalent_delay} and the parameters by name; summands of optional ones stand in
-    brackets. excited_by: the experiment that makes it visible. example: values that show on a per-unit signal of some
-    tenths, as the list of effects and the tests use them.
+    the report, with {at}, {from}, {equivalent_delay} and the parameters by name; summands of optional ones, and a part that falls
+    away with a fixed one at 0, stand in brackets. excited_by: the experiment that makes it visible. example: values that show on
+    a per-unit signal of some tenths, as the list of effects and the tests use them.
     confusable: other effects that may explain the same data, each with what separates them.
     needs_source: True where it brings in another signal (`from`). needs_expression: True where its form is given with it,
     with coefficients of the user's own names. tried_by_default: False for a general form that stands for many others and is

@@ -181,6 +181,15 @@ def test_a_sentence_leaves_out_the_parts_that_are_not_there(values: dict[str, fl
     assert sentence(placed.candidate, values) == told
 
 
+@pytest.mark.parametrize(
+    ("compute", "told"),
+    [(0.0, "drag is sampled every 20 ms"), (0.003, "drag is sampled every 20 ms and published 3 ms later")],
+)
+def test_a_sampler_that_publishes_at_once_is_told_without_a_delay(compute: float, told: str) -> None:
+    sampled = Rival("sample-hold", ("drag",), 0.0, FrozenMap({"Ts": 0.02, "compute": compute}))
+    assert sentence(sampled, sampled.parameters) == told
+
+
 def test_a_finding_tells_places_and_sources_apart() -> None:
     best = Rival("coupling", ("eq1", "eq2"), 0.0, FrozenMap({"k": 0.1}), source="Q1f, Q2f")
     places = [
