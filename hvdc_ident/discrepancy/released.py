@@ -46,10 +46,12 @@ def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Re
     """Return the nominal model and the hypothesis `here`, with those held parameters free that bring more evidence than they cost.
 
     base: the nominal model that `here` adds effects to, at its values. One is set free at a time, the one that gains most, and has
-    to gain as much in BIC as an effect needs to be named, until noise is left. here: one that leaves more than noise.
+    to gain as much in BIC as an effect needs to be named, until noise is left; one that ends on its bound stays held. here: a
+    hypothesis that leaves more than noise.
     """
+    refused: set[str] = set()
     while not search.spent:
-        held = [f for f in (*search.held, *search.stated) if f.name not in here.problem.names]
+        held = [f for f in (*search.held, *search.stated) if f.name not in (*here.problem.names, *refused)]
         best = _most_wanted(search, here, held)
         if best is None:
             break
@@ -61,10 +63,41 @@ def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Re
             break
         if freed.failure or not evidence_between(here, freed, Ruler.of(freed), 1) > search.options.named_bic:
             break
+        # What asks for more than a value may be off is something else; free, the value would hide it from every score.
+        if best.on_bound(freed.values[best.name]):
+            refused.add(best.name)
+            continue
         base, here = wider, freed
         if is_noise(here, search.seed):
             break
     return base, here
+
+
+def held_again(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
+    """Return the nominal model and the hypothesis `here`, with those parameters held again that bring no evidence any more.
+
+    A parameter that was set free may have stood for an effect that has been added since. base: the nominal model that `here` adds
+    effects to.
+    """
+    for f in (*search.held, *search.stated):
+        if f.name not in here.problem.names or search.spent:
+            continue
+        fewer = _with_held(base, f)
+        try:
+            without = run(job_of(fewer, here, here.placed, {}))
+        except SimulationError:
+            continue
+        if not without.failure and evidence_between(without, here, Ruler.of(here), 1) <= search.options.named_bic:
+            base, here = fewer, without
+    return base, here
+
+
+def _with_held(refit: Refit, parameter: FitParameter) -> Refit:
+    """Return the nominal model with one parameter less among the free ones, at its given value."""
+    at = refit.problem.names.index(parameter.name)
+    free = tuple(f for f in refit.problem.free if f.name != parameter.name)
+    held = FrozenMap({**refit.problem.held, parameter.name: parameter.given})
+    return replace(refit, problem=replace(refit.problem, free=free, held=held), theta=np.delete(refit.theta, at))
 
 
 def _with_free(refit: Refit, parameter: FitParameter) -> Refit:

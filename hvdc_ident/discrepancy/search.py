@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
 from hvdc_ident.discrepancy.refit_jobs import as_given, job_of
 from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by, once_more
-from hvdc_ident.discrepancy.released import released
+from hvdc_ident.discrepancy.released import held_again, released
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.rounds import against, closed, gained, one_round
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
@@ -99,7 +99,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
     nominal = here
     kept: list[Round] = []
     notes: tuple[str, ...] = ()
-    settled_already = False
+    settled_already = little = False
     while len(kept) < search.options.most:
         if kept and search.spent:
             notes += ("The budget ended: no further effect was looked for.",)
@@ -119,6 +119,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
             hopeful = (
                 found.significant
                 and found.law is None
+                and not little
                 and len(kept) + 1 < search.options.most
                 and not (search.spent or is_noise(here, search.seed))
             )
@@ -133,17 +134,21 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
             if not is_noise(here, search.seed):
                 base, here = released(search, base, here)
             break
+        noise = is_noise(found.winner.refit, search.seed)
+        if little and not noise:
+            break
         kept.append(found)
-        here, settled_already = found.winner.refit, False
-        if is_noise(here, search.seed):
+        base, here = held_again(search, base, found.winner.refit)
+        settled_already = False
+        if noise:
             break
         base, here = released(search, base, here)
-        # Nothing is added where so little of the gap is left that nobody asks about it.
-        little = left_by(here) <= TOLERANCE * left_by(nominal)
-        if little or (here is not found.winner.refit and is_noise(here, search.seed)):
+        if here is not found.winner.refit and is_noise(here, search.seed):
             break
+        # Nobody asks about so little of the gap: an effect is added to it only if that leaves noise.
+        little = left_by(here) <= TOLERANCE * left_by(nominal)
         # What is still left may be left by an effect that stands for another one.
-        if 1 < len(kept) < search.options.most and not search.spent:
+        if 1 < len(kept) < search.options.most and not (little or search.spent):
             here, kept, more = settled(search, base, here, kept, len(rounds))
             notes, settled_already = notes + more, True
             if is_noise(here, search.seed):
