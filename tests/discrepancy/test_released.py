@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import pytest
 from cases import FREE, experiments, model
+from refits import beside
 
-from hvdc_ident.discrepancy import diagnose
+from hvdc_ident import Experiment
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.nominal import nominal
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
+from hvdc_ident.discrepancy.released import _with_free, held_again, released
 from hvdc_ident.fit import FitParameter
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.simulate import ModelSimulator
 
 FRICTION = 0.45
 CANDIDATES = (*FREE, FitParameter("b", 0.3, 0.01, 2.0))
@@ -58,3 +66,44 @@ def test_a_stated_value_that_is_two_per_cent_off_is_told_beside_the_effect() -> 
     assert found.verdict == "named" and found.effects[0].parameters["T"].value == pytest.approx(0.03, rel=0.02)
     (inertia,) = [f for f in found.findings if f.effect == "parameter"]
     assert inertia.parameters["J"].value == pytest.approx(0.2, rel=2e-3)
+
+
+def held_at(b: float, data: tuple[Experiment, ...]) -> tuple[SearchContext, Refit]:
+    """A search that may set the friction free, and the drive with the friction held at a value, refitted to the records."""
+    search = SearchContext(
+        ("lag", "coupling"),
+        None,
+        FrozenMap(),
+        DiagnosisOptions(),
+        seed=0,
+        held=(FitParameter("b", b, 0.9 * b, 1.1 * b),),
+    )
+    start, _ = nominal(ModelSimulator(model()), data, FREE, {"b": b}, None, starts=1, seed=0, executor=None)
+    return search, judged(Refit(model(), (), start.problem, start.noise, start.theta))
+
+
+def test_a_parameter_that_would_have_to_be_further_off_than_it_may_stays_held() -> None:
+    """Free and on its bound it would be taken out of every score, though it explains the gap no more than in part."""
+    search, first = held_at(0.3, experiments(drag=lambda w: FRICTION * w))
+    base, here = released(search, first, first)
+    assert base is first and here is first
+
+
+def test_a_parameter_that_stood_for_an_effect_is_held_again_beside_it() -> None:
+    search, first = held_at(0.3, experiments(lag=0.03))
+    base, here = _with_free(first, search.held[0]), run(lagged(_with_free(first, search.held[0])))
+    assert "b" in here.problem.names and here.values["b"] == pytest.approx(0.3, rel=0.05)
+    base, here = held_again(search, base, here)
+    assert "b" not in base.problem.names and "b" not in here.problem.names
+    assert here.problem.held["b"] == 0.3 and [p.candidate.label for p in here.placed] == ["lag at wm"]
+
+
+def test_a_parameter_that_is_off_beside_an_effect_stays_free() -> None:
+    search, first = held_at(0.42, experiments(lag=0.03, drag=lambda w: FRICTION * w))
+    wider = _with_free(first, search.held[0])
+    base, here = held_again(search, wider, run(lagged(wider)))
+    assert base is wider and here.values["b"] == pytest.approx(FRICTION, rel=0.01)
+
+
+def lagged(before: Refit) -> RefitJob:
+    return beside(before, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)})
