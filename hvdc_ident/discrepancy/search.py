@@ -134,18 +134,17 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
             if not is_noise(here, search.seed):
                 base, here = released(search, base, here)
             break
-        noise = is_noise(found.winner.refit, search.seed)
-        if little and not noise:
+        # Nobody asks about so little of the gap: an effect is added to it only if it explains that.
+        if little and is_far(here, found.winner.refit):
             break
         kept.append(found)
         base, here = held_again(search, base, found.winner.refit)
         settled_already = False
-        if noise:
+        if is_noise(here, search.seed):
             break
         base, here = released(search, base, here)
-        if here is not found.winner.refit and is_noise(here, search.seed):
+        if is_noise(here, search.seed):
             break
-        # Nobody asks about so little of the gap: an effect is added to it only if that leaves noise.
         little = left_by(here) <= TOLERANCE * left_by(nominal)
         # What is still left may be left by an effect that stands for another one.
         if 1 < len(kept) < search.options.most and not (little or search.spent):
