@@ -8,7 +8,7 @@ of one diagnosis through the modules:
     latent                  what any effect at an insertion point could explain: a bound, and the signal that is truly there
     proposals, refit, race  effects with sizes that promise most, refitted together with the parameters
     explore, size_profile   their neighbours (another place, another kind of delay), and sizes that no slope leads to
-    released                parameters that were held, set free where the records speak against their values
+    released, clocks        parameters that were held, set free where the records speak against their values; and their clocks
     rounds, search          one effect after the other, each looked for again beside the others, or done without
     outside, alternatives   forms that the catalogue has no name for
     evidence, classes       what each hypothesis gains; effects that are one equation, wherever they are

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.data import Array
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler
 from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.latent import Reach
@@ -64,7 +64,7 @@ class SearchContext:
     """Settings of a search, which stay over its rounds.
 
     deadline: instant at which its budget ends (`time.monotonic`), s. held: candidates of the fit that the nominal
-    model holds; stated: its other parameters, with bounds as near as they are known.
+    model holds; stated: its other parameters, with bounds as near as they are known. records: the experiments, on their own clocks.
     """
 
     effects: tuple[str, ...] | Literal["all"]
@@ -77,6 +77,7 @@ class SearchContext:
     deadline: float = math.inf
     held: tuple[FitParameter, ...] = ()
     stated: tuple[FitParameter, ...] = ()
+    records: tuple[Experiment, ...] = ()
 
     @property
     def spent(self) -> bool:

@@ -14,6 +14,7 @@ from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.bode import responses
 from hvdc_ident.discrepancy.candidate_table import detectable, lines
 from hvdc_ident.discrepancy.classes import compared
+from hvdc_ident.discrepancy.clocks import clocks, told
 from hvdc_ident.discrepancy.context import Course, SearchContext
 from hvdc_ident.discrepancy.explain import at_given, found_of, gap, off_given
 from hvdc_ident.discrepancy.findings import separating
@@ -95,7 +96,7 @@ def diagnose(
     )
     first = judged(Refit(model, (), start.problem, start.noise, start.theta))
     held_now = tuple(f for f in free if f.name not in first.problem.names)
-    search = replace(search, held=held_now, stated=stated(model, free))
+    search = replace(search, held=held_now, stated=stated(model, free), records=first.problem.experiments)
     outcome = from_either_side(search, first)
     judgement = judge(search, first, outcome)
     inside = isinstance(model, Model)
@@ -167,6 +168,8 @@ def _assembled(
     text = headline(judgement, findings)
     if judgement.verdict == "no-evidence" and (moved := off_given(last, given)) is not None:
         findings, text = (moved,), moved.text
+    if off := clocks(search, last):
+        text = f"{text} {told(off)}"
     left, bound = judgement.remainder, outcome.rounds[0].reach
     return Diagnosis(
         verdict=judgement.verdict,

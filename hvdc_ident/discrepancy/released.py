@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.clocks import as_recorded, on_their_clocks
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler, evidence_between
 from hvdc_ident.discrepancy.refit import Refit, run
@@ -43,7 +44,8 @@ def stated(model: AnyModel, candidates: Sequence[FitParameter]) -> tuple[FitPara
 
 
 def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
-    """Return the nominal model and the hypothesis `here`, with those held parameters free that bring more evidence than they cost.
+    """Return the nominal model and the hypothesis `here`, with those held parameters free, and the clocks of the records as far
+    off, as bring more evidence than they cost.
 
     base: the nominal model that `here` adds effects to, at its values. One is set free at a time, the one that gains most, and has
     to gain as much in BIC as an effect needs to be named, until noise is left; one that ends on its bound stays held. here: a
@@ -69,16 +71,22 @@ def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Re
             continue
         base, here = wider, freed
         if is_noise(here, search.seed):
-            break
-    return base, here
+            return base, here
+    clocked = on_their_clocks(search, base, here)
+    return clocked if clocked[1] is here else _held_again(search, *clocked)
 
 
 def held_again(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
-    """Return the nominal model and the hypothesis `here`, with those parameters held again that bring no evidence any more.
+    """Return the nominal model and the hypothesis `here`, with those parameters held, and the records on their clocks, again that
+    bring no evidence any more.
 
     A parameter that was set free may have stood for an effect that has been added since. base: the nominal model that `here` adds
     effects to.
     """
+    return as_recorded(search, *_held_again(search, base, here))
+
+
+def _held_again(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
     for f in (*search.held, *search.stated):
         if f.name not in here.problem.names or search.spent:
             continue

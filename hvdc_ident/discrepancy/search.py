@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.clocks import clocks, on_their_clocks
 from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, clear, evidence_between
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST, TOLERANCE
@@ -67,7 +68,9 @@ def forward(search: SearchContext, first: Refit) -> SearchOutcome:
     if not search.held:  # a stated value has to bring more than an effect that leaves noise could leave it
         found = one_round(search, first, 1)
         if found.winner is not None and is_noise(found.winner.refit, search.seed):
-            return SearchOutcome(found.winner.refit, (found,), (found,))
+            clocked = on_their_clocks(search, first, first)[1]
+            if clocked is first or _behind(search, found.winner.refit, clocked) <= 0.0:
+                return SearchOutcome(found.winner.refit, (found,), (found,))
     base, here = (first, first) if is_noise(first, search.seed) else released(search, first, first)
     if here is first:
         return _onwards(search, first, first, [found] if found else [])
@@ -76,7 +79,7 @@ def forward(search: SearchContext, first: Refit) -> SearchOutcome:
     moved = set(here.problem.names) - set(first.problem.names)
     level = search.options.set_bic if moved & {f.name for f in search.stated} else -search.options.set_bic
     found = found or one_round(search, first, 1)
-    if found.winner is not None and _behind(found.winner.refit, here) <= level:
+    if found.winner is not None and _behind(search, found.winner.refit, here) <= level:
         return _onwards(search, first, first, [found])
     with_parameters = _onwards(search, base, here, [])
     # A parameter may stand for one of several effects: that is seen when the others are there too.
@@ -84,14 +87,15 @@ def forward(search: SearchContext, first: Refit) -> SearchOutcome:
         return with_parameters
     with_effects = _onwards(search, first, first, [found])
     more = len(with_effects.kept) > len(with_parameters.kept)
-    behind = _behind(with_effects.refit, with_parameters.refit)
+    behind = _behind(search, with_effects.refit, with_parameters.refit)
     return with_effects if behind <= (-search.options.named_bic if more else level) else with_parameters
 
 
-def _behind(one: Refit, other: Refit) -> float:
+def _behind(search: SearchContext, one: Refit, other: Refit) -> float:
     """By how much evidence, in BIC, the first hypothesis is behind the other."""
     ruler = Ruler.of(min(one, other, key=lambda r: r.chi2))
-    return evidence_between(one, other, ruler, len(other.problem.free) - len(one.problem.free))
+    few, many = (len(r.problem.free) + len(clocks(search, r)) for r in (one, other))
+    return evidence_between(one, other, ruler, many - few)
 
 
 def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round]) -> SearchOutcome:
@@ -160,8 +164,9 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
 
 
 def _closed_to(base: Refit, found: Round) -> bool:
-    """Return True where a round held a parameter that has since been set free."""
-    return bool({f.name for f in base.problem.free} - set(found.before.problem.names))
+    """Return True where a round held a parameter that has since been set free, or had the records on other clocks."""
+    freed = {f.name for f in base.problem.free} - set(found.before.problem.names)
+    return bool(freed) or base.problem.experiments[0].time is not found.before.problem.experiments[0].time
 
 
 def _masked(search: SearchContext, before: Refit, found: Round, number: int) -> tuple[Round, Round] | None:

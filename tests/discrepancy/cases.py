@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 
 import numpy as np
@@ -62,16 +62,21 @@ def experiments(
     noise: str = "white",
     seed: int = 0,
     meter: Callable[[Array], Array] | None = None,
+    late: Mapping[str, float] | None = None,
 ) -> tuple[Experiment, ...]:
     """Records of the drive with something hidden. lag: of the measured speed, s. drag: of the speed, instead of b w.
 
-    offset: of the torque that acts. noise: white, ar (0.9) or quantised. meter: what becomes of the torque before it.
+    offset: of the torque that acts. noise: white, ar (0.9) or quantised. meter: what becomes of the torque before it. late: by
+    how much the clock of a record is late, s: its rows show what was so long before.
     """
     random = np.random.default_rng(seed)
     found = []
     for name, (role, moves) in RUNS.items():
         inputs = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
-        clean = _solved(inputs, lag, drag or (lambda w: TRUE["b"] * w), offset)
+        later = (late or {}).get(name, 0.0)
+        shown = {n: [(t + later, change) for t, change in m] for n, m in moves.items()}
+        seen = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in shown.items()}
+        clean = _solved(seen, lag, drag or (lambda w: TRUE["b"] * w), offset)
         if meter:
             clean[:, 1] = meter(clean[:, 1])
         y = np.column_stack([_noisy(clean[:, k], s, noise, random) for k, s in enumerate(SIGMA.values())])

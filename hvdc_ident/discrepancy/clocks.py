@@ -1,0 +1,132 @@
+"""Clocks of the records as a hypothesis: two recorders of one rate cannot be aligned better than to half a row.
+
+What the time stamps of a record are off would be told as an effect, a sampler at the set-points say. So "the clocks are off" is
+compared with the effects as a parameter off its value is, and asked again beside them. A record that is moved is simulated from
+where it began: what the plant does from then on, as taking its samples, does not move with the recorder's clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.data import Experiment, Trajectory
+from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.evidence import Ruler, evidence_between
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, of_held_out, run
+from hvdc_ident.discrepancy.refit_jobs import job_of
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit import Problem
+from hvdc_ident.fit.simulator import TIME_SHIFT
+from hvdc_ident.text import listed, quantity
+
+OFF = 0.5
+"""Rows by which a record's time stamps are off at most, with recorders of one rate."""
+
+
+def on_their_clocks(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
+    """Return the nominal model and the hypothesis `here` on records that are moved to suit it, where that brings more evidence
+    than it costs; else as they are.
+
+    base: the nominal model that `here` adds effects to. A clock that would be off by more than half a row is no clock, and the
+    records stay where they are; so they do where the study declares that clocks may be off.
+    """
+    if search.spent or any(TIME_SHIFT in e.nuisance for e in here.problem.experiments):
+        return base, here
+    search.tell(0, 1, "with clocks that are off")
+    late = _late(here)
+    reach = {e.name: OFF * float(np.median(np.diff(e.time))) for e in search.records}
+    total = {n: v + clocks(search, here).get(n, 0.0) for n, v in late.items()}
+    if not late or any(abs(total.get(n, 0.0)) >= r for n, r in reach.items()):
+        return base, here
+    moved = _refitted(base, here, tuple(_moved(e, total.get(e.name, 0.0)) for e in search.records))
+    # The row that leaves the record takes its share of the noise along.
+    as_many = replace(here, chi2=here.chi2 * moved[1].rows / here.rows)
+    gain = evidence_between(as_many, moved[1], Ruler.of(moved[1]), len(total))
+    return moved if not moved[1].failure and gain > search.options.named_bic else (base, here)
+
+
+def as_recorded(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
+    """Return the nominal model and the hypothesis `here` on the records as they are, unless their clocks still bring evidence."""
+    off = clocks(search, here)
+    if not off or search.spent:
+        return base, here
+    back = _refitted(base, here, search.records)
+    as_many = replace(back[1], chi2=back[1].chi2 * here.rows / max(back[1].rows, 1))
+    gain = evidence_between(as_many, here, Ruler.of(here), len(off))
+    return back if not back[1].failure and gain <= search.options.named_bic else (base, here)
+
+
+def clocks(search: SearchContext, here: Refit) -> dict[str, float]:
+    """By how much each clock is late in the hypothesis `here`, s; empty where the records stand as they were given."""
+    now = {e.name: e for e in here.problem.experiments}
+    if all(now[e.name].time is e.time for e in search.records):
+        return {}
+    return {e.name: float(e.time[-1] - now[e.name].time[-1]) for e in search.records}
+
+
+def told(off: Mapping[str, float]) -> str:
+    """The clocks as a sentence."""
+    each = [f"that of {n} is {quantity(abs(v), 's')} {'late' if v > 0 else 'early'}" for n, v in off.items()]
+    return f"The clocks of the records are off by less than half a row: {listed(each)}."
+
+
+def _late(here: Refit) -> dict[str, float]:
+    """By how much each clock is late, s, as it suits the hypothesis; empty where that cannot be told.
+
+    Of the fitted records together with all unknowns, of each of the others with these unknowns.
+    """
+    timed = _timed(here.problem)
+    values = dict(zip(here.problem.names, here.theta, strict=True))
+    begin = np.array([values.get(n, 0.0) for n in timed.names])
+    try:
+        end = run(RefitJob(here.model, here.placed, timed, (begin,), here.noise))
+        if end.failure:
+            return {}
+        at = dict(zip(timed.names, end.theta, strict=True))
+        found = {e.name: float(at[f"{e.name}:{TIME_SHIFT}"]) for e in timed.fitted_experiments}
+        others = of_held_out(here.problem)
+        return found | ({} if others is None else _late_alone(_timed(others), end.theta[: len(others.free)]))
+    except SimulationError:
+        return {}
+
+
+def _late_alone(others: Problem, known: np.ndarray) -> dict[str, float]:
+    """By how much the clock of each record is late, s, to first order, with all other unknowns known."""
+    blocks = others.blocks(np.concatenate([known, np.zeros(len(others.experiments))]))
+    found = {}
+    for e in others.experiments:
+        column = others.names.index(f"{e.name}:{TIME_SHIFT}")
+        own = [b for b in blocks if b.experiment == e.name]
+        slope, left = np.concatenate([b.jacobian[:, column] for b in own]), np.concatenate([b.residual for b in own])
+        power = float(slope @ slope)
+        found[e.name] = -float(slope @ left) / power if power > 0 else 0.0
+    return found
+
+
+def _timed(problem: Problem) -> Problem:
+    """The problem with a late clock of each fitted record among its unknowns."""
+    experiments = (
+        e.with_(nuisance=(*e.nuisance, TIME_SHIFT)) if e.role == "fit" and e.outputs else e for e in problem.experiments
+    )
+    return replace(problem, experiments=tuple(experiments))
+
+
+def _moved(experiment: Experiment, late: float) -> Experiment:
+    """The experiment with its record earlier by so many s; it begins at the instant at which it began, with no value there."""
+    assert experiment.measured is not None
+    time = experiment.time - late
+    after = time > experiment.time[0]
+    grid = np.concatenate([experiment.time[:1], time[after]])
+    values = np.vstack([np.full((1, len(experiment.measured.names)), np.nan), experiment.measured.values[after]])
+    names, units = experiment.measured.names, experiment.measured.units
+    return experiment.with_(time=grid, measured=Trajectory(grid, values, names, units))
+
+
+def _refitted(base: Refit, here: Refit, records: tuple[Experiment, ...]) -> tuple[Refit, Refit]:
+    """The nominal model, at its values, and the hypothesis refitted, on other records."""
+    other = replace(base, problem=replace(base.problem, experiments=records))
+    same = replace(here, problem=replace(here.problem, experiments=records))
+    return other, run(job_of(other, same, same.placed, {}))
