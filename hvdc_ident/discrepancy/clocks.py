@@ -33,7 +33,7 @@ def on_their_clocks(search: SearchContext, base: Refit, here: Refit) -> tuple[Re
     base: the nominal model that `here` adds effects to. A clock that would be off by more than half a row is no clock, and the
     records stay where they are; so they do where the study declares that clocks may be off.
     """
-    if search.spent or any(TIME_SHIFT in e.nuisance for e in here.problem.experiments):
+    if search.spent or not search.records or any(TIME_SHIFT in e.nuisance for e in here.problem.experiments):
         return base, here
     search.tell(0, 1, "with clocks that are off")
     late = _late(here)

@@ -64,7 +64,8 @@ class SearchContext:
     """Settings of a search, which stay over its rounds.
 
     deadline: instant at which its budget ends (`time.monotonic`), s. held: candidates of the fit that the nominal
-    model holds; stated: its other parameters, with bounds as near as they are known. records: the experiments, on their own clocks.
+    model holds; stated: its other parameters, with bounds as near as they are known. records: the experiments, on their
+    own clocks; none where it is not asked whether these are off.
     """
 
     effects: tuple[str, ...] | Literal["all"]
