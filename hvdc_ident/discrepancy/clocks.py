@@ -36,15 +36,15 @@ def on_their_clocks(search: SearchContext, base: Refit, here: Refit) -> tuple[Re
     if search.spent or not search.records or any(TIME_SHIFT in e.nuisance for e in here.problem.experiments):
         return base, here
     search.tell(0, 1, "with clocks that are off")
-    late = _late(here)
+    now = clocks(search, here)
+    late = {n: v + now.get(n, 0.0) for n, v in _late(here).items()}
     reach = {e.name: OFF * float(np.median(np.diff(e.time))) for e in search.records}
-    total = {n: v + clocks(search, here).get(n, 0.0) for n, v in late.items()}
-    if not late or any(abs(total.get(n, 0.0)) >= r for n, r in reach.items()):
+    if not late or any(abs(v) >= reach[n] for n, v in late.items()):
         return base, here
-    moved = _refitted(base, here, tuple(_moved(e, total.get(e.name, 0.0)) for e in search.records))
+    moved = _refitted(base, here, tuple(_moved(e, late[e.name]) if e.name in late else e for e in search.records))
     # The row that leaves the record takes its share of the noise along.
     as_many = replace(here, chi2=here.chi2 * moved[1].rows / here.rows)
-    gain = evidence_between(as_many, moved[1], Ruler.of(moved[1]), len(total))
+    gain = evidence_between(as_many, moved[1], Ruler.of(moved[1]), len(late))
     return moved if not moved[1].failure and gain > search.options.named_bic else (base, here)
 
 
