@@ -140,10 +140,13 @@ def by_latent(
         for v, under in ((v, v.nominal.projected(noise)) for v in seen)
         for p, group in places.items()
     ]
+    # A fall is one from what the model leaves: with other gains than those that fit, more is left to begin with.
+    begins = [float(np.sum(v.nominal.projected(v.nominal.residual[:, None]) ** 2)) for v in seen]
+    dearer = [b - begins[0] for b in begins for _ in places]
     spots: list[_Spot] = []
     largest = np.zeros(noise.shape[1])
     for k, (more, under) in enumerate(mapped(search.executor, _at_place, jobs), start=1):
-        spots += more
+        spots += [replace(s, fall=s.fall - dearer[k - 1]) for s in more]
         largest = np.maximum(largest, under)
         search.tell(k, len(jobs), f"round {number}: many sizes of {len(dense)} candidates")
     beside = opened.scores.beside
