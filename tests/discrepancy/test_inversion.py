@@ -16,7 +16,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, proposals
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.latent import TRIED, Inversion
-from hvdc_ident.discrepancy.proposals import views_of
+from hvdc_ident.discrepancy.proposals import by_latent, views_of
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.scores import Whitening, runs
 from hvdc_ident.discrepancy.signatures.response import Along
@@ -182,6 +182,18 @@ def test_noise_is_scored_without_what_the_parameters_of_each_view_make_good(monk
     assert len({tuple(job.view.nominal.theta) for job in seen}) == 2
     for job in seen:
         assert np.abs(job.view.nominal.basis.T @ job.noise).max() < 1e-9 * np.linalg.norm(job.noise)
+
+
+def test_no_proposal_promises_more_than_the_model_leaves() -> None:
+    """At the gains as given more is left, so a fall from there is no fall from what the refitted model leaves."""
+    first = plain(experiments(lag=0.03))
+    search = SearchContext(("lag", "delay"), ("wm", "err"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
+    found, nominal = one_round(search, first, 1), first.nominal()
+    views = views_of(found, nominal)
+    left = [float(np.sum(v.nominal.projected(v.nominal.residual[:, None]) ** 2)) for v in views()]
+    assert left[1] > 1.2 * left[0]
+    _, picks = by_latent(search, found, views, 1, lambda _: True)
+    assert 0.5 * left[0] < max(p.fall for p in picks) <= left[0]
 
 
 def test_the_evidence_of_a_latent_input_is_that_of_a_gaussian_with_its_prior() -> None:
