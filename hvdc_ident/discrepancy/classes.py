@@ -30,6 +30,8 @@ MISSED = 0.15
 def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True) -> tuple[Rival, ...]:
     """The winner and every candidate within delta BIC of it, the best first, and those that are the same equation or do the same.
 
+    What does the same within the tolerance, with no parameter more, is told however far behind it is: no model is right to
+    the last unit of evidence.
     tries: whether an effect is one of those that are looked for.
     """
     assert found.winner is not None and found.ruler is not None
@@ -39,14 +41,16 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
     # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
     alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
     group: list[Rival] = []
+    further: list[Rival] = []
     for trial, behind, good in zip(found.trials, behind_by, sound, strict=True):
         c = found.candidates[trial.pick.candidate]
-        one_more = trial.refit.count - found.winner.refit.count == 1
-        spared = one_more and (not alone or _as_likely(found, c, options))
-        if not good or behind > options.set_bic + (found.ruler.price if spared else 0.0):
-            continue
-        sizes = trial.refit.sizes(trial.refit.placed[-1])
-        group.append(Rival(c.effect, c.at, behind, FrozenMap(sizes), c.source))
+        more = trial.refit.count - found.winner.refit.count
+        spared = more == 1 and (not alone or _as_likely(found, c, options))
+        rival = Rival(c.effect, c.at, behind, FrozenMap(trial.refit.sizes(trial.refit.placed[-1])), c.source)
+        if good and behind <= options.set_bic + (found.ruler.price if spared else 0.0):
+            group.append(rival)
+        elif good and more <= 0 and trial.told >= (1.0 - TOLERANCE) * found.winner.told:
+            further.append(rival)
     group += _unfitted(found, best_gain(found.trials), options)
     group += _at_rest(found, group)
     group += _equal(found, group, tries)
@@ -57,23 +61,30 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
         if r.same_as:
             same[r.effect, r.at, r.source] = r.same_as
     count = Counter(c.effect for c in found.candidates)
-    told = [replace(r, same_as=same.get(key, ""), prior=1.0 / max(count[r.effect], 1)) for key, r in each.items()]
-    return tuple(replace(r, akin=akin) for r, akin in zip(told, _akin(found, told), strict=True))
+    told = [replace(r, same_as=same.get(key, "")) for key, r in each.items()]
+    further = [r for r in further if (r.effect, r.at, r.source) not in each]
+    akin = _akin(found, told, further)
+    whole = [replace(r, akin=a) for r, a in zip([*told, *further], akin, strict=True)]
+    return tuple(
+        replace(r, prior=1.0 / max(count[r.effect], 1)) for k, r in enumerate(whole) if k < len(told) or r.akin
+    )
 
 
-def _akin(found: Round, group: Sequence[Rival]) -> list[str]:
-    """For each the first effect before it that adds the same to the same signals, within the tolerance; empty where none does.
+def _akin(found: Round, group: Sequence[Rival], further: Sequence[Rival] = ()) -> list[str]:
+    """For each of both the first effect of the group before it that adds the same to the same signals, within the tolerance;
+    empty where none does.
 
     A dead band whose signal stays beyond its edge is an offset; so are, where a signal hardly moves, its gain error and
     what is lost in proportion to it. Where the records do not show an offset, what differs by one is the same.
     """
-    paths = found.answers().values() if len({r.effect for r in group if r.parameters}) > 1 else ()
+    both = [*group, *further]
+    paths = found.answers().values() if len({r.effect for r in both if r.parameters}) > 1 else ()
     signals = [
         found.shown(r.at, additions(r.effect, r.parameters, r.at, r.source, paths)) if paths and r.parameters else None
-        for r in group
+        for r in both
     ]
     akin = []
-    for k, (r, own) in enumerate(zip(group, signals, strict=True)):
+    for k, (r, own) in enumerate(zip(both, signals, strict=True)):
         earlier = (
             q.effect
             for q, other in zip(group[:k], signals, strict=False)
