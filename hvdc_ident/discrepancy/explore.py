@@ -1,6 +1,6 @@
 """One step of the search: refit what promises most, then its neighbours, until nothing comes nearer.
 
-Neighbours of a hypothesis differ from it in one thing: the place, the kind of delay, or the parts of the effect. They begin at the
+Neighbours of a hypothesis differ from it in one thing: the place, the effect, or the parts of the effect. They begin at the
 size that does the same (a delay as long, a level as high) and with the gains that the refit came to, for these are nearer to
 the truth than those which the misfit has moved.
 """
@@ -30,6 +30,7 @@ from hvdc_ident.discrepancy.refitted import (
 )
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.discrepancy.size_profile import has_to_be_met, resized
 from hvdc_ident.effects import Probe, effects
 
@@ -247,6 +248,17 @@ class _Lead:
             own = resized(own, name, self.sizes[name])
         return own
 
+    def is_in_stead(self, other: CandidateEffect) -> bool:
+        """Return True for another effect at the same place whose size no slope at 0 tells: with the gains that were found it may
+        be the true one."""
+        return (
+            other.at == self.candidate.at and other.effect != self.candidate.effect and not is_linear(kind_of(other, 0))
+        )
+
+    def is_as_large(self, other: CandidateEffect) -> bool:
+        """Return True for another effect at the same place with sizes of the same names, as the level of a limit and a saturation."""
+        return self.is_in_stead(other) and any(set(p.free) <= set(self.sizes) for p in other.probes)
+
     def is_other_delay(self, other: CandidateEffect) -> bool:
         """Return True for another kind of delay at the same place."""
         delays = (self.late or 0.0) > 0 and effects()[other.effect].equivalent_delay is not None
@@ -262,29 +274,31 @@ def _neighbours(
 ) -> tuple[Round, list[Pick]]:
     """The round with the sizes that the neighbours of the leaders begin at, and these, those that were asked for left out."""
     found = opened.candidates
-    own: dict[int, Pick] = {}
+    own: dict[int, list[Pick]] = {}
     for p in field:
-        own.setdefault(p.candidate, p)
+        own.setdefault(p.candidate, []).append(p)
     extra: dict[int, list[Probe]] = {}
     picks: list[Pick] = []
     for lead in (_Lead.of(opened, t) for t in leaders):
         for n, c in enumerate(found):
             elsewhere = lead.is_elsewhere(c)
-            if not (elsewhere or lead.is_other_delay(c)) or (lead.number, n) in asked:
+            if not (elsewhere or lead.is_in_stead(c)) or (lead.number, n) in asked:
                 continue
             if c.still or not opened.reaches(c) or opened.bound(c) < LEVEL * opened.bound(lead.candidate):
                 continue
             asked.add((lead.number, n))
             score = opened.score_p(n)[0]
-            # Elsewhere the sizes that were found, though it was refitted there from others: those may lead astray.
-            if elsewhere and (has_to_be_met(c) or lead.late is not None):
+            # The sizes that were found, though it was refitted there from others: those may lead astray.
+            if (elsewhere and (has_to_be_met(c) or lead.late is not None)) or lead.is_as_large(c):
                 met = extra.setdefault(n, [])
                 picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains))
                 met.append(lead.probe_at(c))
-            elif (start := _as_late(c, lead.late)) is not None:
+            elif lead.is_other_delay(c) and (start := _as_late(c, lead.late)) is not None:
                 picks.append(Pick(n, *start, score, lead.gains))
-            if n in own:
-                picks.append(own[n] if own[n].gains else replace(own[n], gains=lead.gains))
+            if lead.is_in_stead(c) and n in own:
+                picks += [replace(p, gains=lead.gains) for p in own[n]]
+            elif n in own:
+                picks.append(own[n][0] if own[n][0].gains else replace(own[n][0], gains=lead.gains))
             elif score > opened.scores.threshold(0.5):
                 picks.append(Pick(n, opened.scores.columns[opened.score_p(n)[2]].probe, 1.0, score, lead.gains))
         picks += _other_forms(opened, lead.number, trials, asked)
