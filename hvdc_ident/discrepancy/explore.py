@@ -219,7 +219,7 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
 class _Lead:
     """A hypothesis whose neighbours are asked for.
 
-    num    number: of its candidate; probe: the one it began at. gains: the unknowns of the model before at its end. sizes: of its
+    number: of its candidate; probe: the one it began at. gains: the unknowns of the model before at its end. sizes: of its
     effect. late: by how long that delays a slow signal, s; None for what is no kind of delay.
     """
 
@@ -240,14 +240,19 @@ class _Lead:
         """Return True for the same effect at another place."""
         return other.effect == self.candidate.effect and other.at != self.candidate.at
 
-    def probe_at(self, other: CandidateEffect) -> Probe:
-        """The probe of the same effect at another place with the sizes that were found, to the last digit."""
-        own = next(
-            (p for p in other.probes if set(p.free) == set(self.candidate.probes[self.probe].free)), other.probes[0]
-        )
-        for name in own.free:
-            own = resized(own, name, self.sizes[name])
-        return own
+    def probe_of(self, other: CandidateEffect) -> Probe | None:
+        """The probe of another candidate with the sizes that were found, to the last digit; None where it has sizes of other names.
+
+        A limit and a saturation have a level each.
+        """
+        own = set(self.candidate.probes[self.probe].free)
+        alike = [p for p in other.probes if set(p.free) <= set(self.sizes)]
+        if not alike:
+            return None
+        found = next((p for p in alike if set(p.free) == own), alike[0])
+        for name in found.free:
+            found = resized(found, name, self.sizes[name])
+        return found
 
     def is_in_stead(self, other: CandidateEffect) -> bool:
         """Return True for another effect at the same place whose size no slope at 0 tells: with the gains that were found it may
@@ -255,10 +260,6 @@ class _Lead:
         return (
             other.at == self.candidate.at and other.effect != self.candidate.effect and not is_linear(kind_of(other, 0))
         )
-
-    def is_as_large(self, other: CandidateEffect) -> bool:
-        """Return True for another effect at the same place with sizes of the same names, as the level of a limit and a saturation."""
-        return self.is_in_stead(other) and any(set(p.free) <= set(self.sizes) for p in other.probes)
 
     def is_other_delay(self, other: CandidateEffect) -> bool:
         """Return True for another kind of delay at the same place."""
@@ -290,10 +291,11 @@ def _neighbours(
             asked.add((lead.number, n))
             score = opened.score_p(n)[0]
             # The sizes that were found, though it was refitted there from others: those may lead astray.
-            if (elsewhere and (has_to_be_met(c) or lead.late is not None)) or lead.is_as_large(c):
+            as_found = has_to_be_met(c) or lead.late is not None if elsewhere else not lead.is_other_delay(c)
+            if as_found and (probe := lead.probe_of(c)) is not None:
                 met = extra.setdefault(n, [])
                 picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains))
-                met.append(lead.probe_at(c))
+                met.append(probe)
             elif lead.is_other_delay(c) and (start := _as_late(c, lead.late)) is not None:
                 picks.append(Pick(n, *start, score, lead.gains))
             if lead.is_in_stead(c) and n in own:
