@@ -7,7 +7,7 @@ where it began: what the plant does from then on, as taking its samples, does no
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler, evidence_between
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, of_held_out, run
 from hvdc_ident.discrepancy.refit_jobs import job_of
-from hvdc_ident.errors import SimulationError
+from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.simulator import TIME_SHIFT
 from hvdc_ident.text import listed, quantity
@@ -42,10 +42,12 @@ def on_their_clocks(search: SearchContext, base: Refit, here: Refit) -> tuple[Re
     if not late or any(abs(v) >= reach[n] for n, v in late.items()):
         return base, here
     moved = _refitted(base, here, tuple(_moved(e, late[e.name]) if e.name in late else e for e in search.records))
+    if moved is None:
+        return base, here
     # The row that leaves the record takes its share of the noise along.
     as_many = replace(here, chi2=here.chi2 * moved[1].rows / here.rows)
     gain = evidence_between(as_many, moved[1], Ruler.of(moved[1]), len(late))
-    return moved if not moved[1].failure and gain > search.options.named_bic else (base, here)
+    return moved if gain > search.options.named_bic else (base, here)
 
 
 def as_recorded(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
@@ -54,9 +56,11 @@ def as_recorded(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit,
     if not off or search.spent:
         return base, here
     back = _refitted(base, here, search.records)
-    as_many = replace(back[1], chi2=back[1].chi2 * here.rows / max(back[1].rows, 1))
+    if back is None:
+        return base, here
+    as_many = replace(back[1], chi2=back[1].chi2 * here.rows / back[1].rows)
     gain = evidence_between(as_many, here, Ruler.of(here), len(off))
-    return back if not back[1].failure and gain <= search.options.named_bic else (base, here)
+    return back if gain <= search.options.named_bic else (base, here)
 
 
 def clocks(search: SearchContext, here: Refit) -> dict[str, float]:
@@ -88,18 +92,20 @@ def _late(here: Refit) -> dict[str, float]:
         at = dict(zip(timed.names, end.theta, strict=True))
         found = {e.name: float(at[f"{e.name}:{TIME_SHIFT}"]) for e in timed.fitted_experiments}
         others = of_held_out(here.problem)
-        return found | ({} if others is None else _late_alone(_timed(others), end.theta[: len(others.free)]))
-    except SimulationError:
+        return found | (
+            {} if others is None else _late_alone(_timed(others), end.theta[: len(others.free)], timed.outputs)
+        )
+    except (SimulationError, StudyError):  # it does not run, or the record has one instant
         return {}
 
 
-def _late_alone(others: Problem, known: np.ndarray) -> dict[str, float]:
-    """By how much the clock of each record is late, s, to first order, with all other unknowns known."""
+def _late_alone(others: Problem, known: np.ndarray, outputs: Collection[str]) -> dict[str, float]:
+    """By how much the clock of each record is late, s, to first order, with all other unknowns known; told by these outputs."""
     blocks = others.blocks(np.concatenate([known, np.zeros(len(others.experiments))]))
     found = {}
     for e in others.experiments:
         column = others.names.index(f"{e.name}:{TIME_SHIFT}")
-        own = [b for b in blocks if b.experiment == e.name]
+        own = [b for b in blocks if b.experiment == e.name and b.output in outputs]
         slope, left = np.concatenate([b.jacobian[:, column] for b in own]), np.concatenate([b.residual for b in own])
         power = float(slope @ slope)
         found[e.name] = -float(slope @ left) / power if power > 0 else 0.0
@@ -125,8 +131,12 @@ def _moved(experiment: Experiment, late: float) -> Experiment:
     return experiment.with_(time=grid, measured=Trajectory(grid, values, names, units))
 
 
-def _refitted(base: Refit, here: Refit, records: tuple[Experiment, ...]) -> tuple[Refit, Refit]:
-    """The nominal model, at its values, and the hypothesis refitted, on other records."""
+def _refitted(base: Refit, here: Refit, records: tuple[Experiment, ...]) -> tuple[Refit, Refit] | None:
+    """The nominal model, at its values, and the hypothesis refitted, on other records; None where it does not run on them."""
     other = replace(base, problem=replace(base.problem, experiments=records))
     same = replace(here, problem=replace(here.problem, experiments=records))
-    return other, run(job_of(other, same, same.placed, {}))
+    try:
+        found = run(job_of(other, same, same.placed, {}))
+    except SimulationError:
+        return None
+    return None if found.failure else (other, found)

@@ -9,9 +9,11 @@ from cases import FREE, TRUE, experiments, model
 from refits import plain
 
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy import clocks as told_by
 from hvdc_ident.discrepancy.clocks import _moved, _refitted, as_recorded, clocks, on_their_clocks
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 
 LATE = {"fit-1": 1.5e-3, "fit-2": -1.2e-3, "held": 1e-3}
@@ -66,9 +68,22 @@ def test_records_are_put_back_on_their_clocks_where_that_is_no_worse() -> None:
     """Of what was moved for a misfit that an effect has since explained; what a clock has to explain stays moved."""
     first = plain(experiments())
     moved = _refitted(first, first, tuple(_moved(e, 1e-3) for e in first.problem.experiments))
+    assert moved is not None
     assert clocks(search_of(first), moved[1]) == pytest.approx(dict.fromkeys(LATE, 1e-3))
     _, here = as_recorded(search_of(first), *moved)
     assert clocks(search_of(first), here) == {} and here.chi2 == pytest.approx(first.chi2, rel=1e-6)
     late = plain(experiments(late=LATE))
     off = on_their_clocks(search_of(late), late, late)
     assert as_recorded(search_of(late), *off) == off
+
+
+def test_records_stay_where_the_hypothesis_does_not_run_on_moved_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    first = plain(experiments(late=LATE))
+    search, done = search_of(first), on_their_clocks(search_of(first), first, first)
+    monkeypatch.setattr(told_by, "job_of", raising)
+    assert on_their_clocks(search, first, first) == (first, first)
+    assert as_recorded(search, *done) == done
+
+
+def raising(*_: object) -> None:
+    raise SimulationError("it does not run")
