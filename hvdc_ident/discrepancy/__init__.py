@@ -7,7 +7,7 @@ of one diagnosis through the modules:
     signatures, scores      how the outputs would differ if an effect were there, and how far chi2 would then fall
     latent                  what any effect at an insertion point could explain: a bound, and the signal that is truly there
     proposals, refit, race  effects with sizes that promise most, refitted together with the parameters
-    explore, size_profile   their neighbours (another place, another kind of delay), and sizes that no slope leads to
+    explore, size_profile   their neighbours (another place, another effect), and sizes that no slope leads to
     released, clocks        parameters that were held, set free where the records speak against their values; and their clocks
     rounds, search          one effect after the other, each looked for again beside the others, or done without
     outside, alternatives   forms that the catalogue has no name for

@@ -1,7 +1,7 @@
 """Clocks of the records as a hypothesis: two recorders of one rate cannot be aligned better than to half a row.
 
-What the time stamps of a record are off would be told as an effect, a sampler at the set-points say. So "the clocks are off" is
-compared with the effects as a parameter off its value is, and asked again beside them. A record that is moved is simulated from
+Time stamps that are off would be told as an effect, a sampler at the set-points say. So "the clocks are off" is compared with
+the effects as a parameter off its value is, and asked again beside them. A record that is moved is simulated from
 where it began: what the plant does from then on, as taking its samples, does not move with the recorder's clock.
 """
 
@@ -19,7 +19,7 @@ from hvdc_ident.discrepancy.refit import Refit, RefitJob, of_held_out, run
 from hvdc_ident.discrepancy.refit_jobs import job_of
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit import Problem
-from hvdc_ident.fit.simulator import TIME_SHIFT
+from hvdc_ident.fit.simulator import TIME_SHIFT, unknown_of
 from hvdc_ident.text import listed, quantity
 
 OFF = 0.5
@@ -44,10 +44,7 @@ def on_their_clocks(search: SearchContext, base: Refit, here: Refit) -> tuple[Re
     moved = _refitted(base, here, tuple(_moved(e, late[e.name]) if e.name in late else e for e in search.records))
     if moved is None:
         return base, here
-    # The row that leaves the record takes its share of the noise along.
-    as_many = replace(here, chi2=here.chi2 * moved[1].rows / here.rows)
-    gain = evidence_between(as_many, moved[1], Ruler.of(moved[1]), len(late))
-    return moved if gain > search.options.named_bic else (base, here)
+    return moved if _gain(here, moved[1], len(late)) > search.options.named_bic else (base, here)
 
 
 def as_recorded(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
@@ -58,9 +55,14 @@ def as_recorded(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit,
     back = _refitted(base, here, search.records)
     if back is None:
         return base, here
-    as_many = replace(back[1], chi2=back[1].chi2 * here.rows / back[1].rows)
-    gain = evidence_between(as_many, here, Ruler.of(here), len(off))
-    return back if gain <= search.options.named_bic else (base, here)
+    return back if _gain(back[1], here, len(off)) <= search.options.named_bic else (base, here)
+
+
+def _gain(still: Refit, moved: Refit, count: int) -> float:
+    """Return the evidence, in BIC, for so many clocks being off."""
+    # The row that leaves a record takes its share of the noise along.
+    as_many = replace(still, chi2=still.chi2 * moved.rows / still.rows)
+    return evidence_between(as_many, moved, Ruler.of(moved), count)
 
 
 def clocks(search: SearchContext, here: Refit) -> dict[str, float]:
@@ -90,7 +92,7 @@ def _late(here: Refit) -> dict[str, float]:
         if end.failure:
             return {}
         at = dict(zip(timed.names, end.theta, strict=True))
-        found = {e.name: float(at[f"{e.name}:{TIME_SHIFT}"]) for e in timed.fitted_experiments}
+        found = {e.name: float(at[unknown_of(e.name, TIME_SHIFT)]) for e in timed.fitted_experiments}
         others = of_held_out(here.problem)
         return found | (
             {} if others is None else _late_alone(_timed(others), end.theta[: len(others.free)], timed.outputs)
@@ -104,7 +106,7 @@ def _late_alone(others: Problem, known: np.ndarray, outputs: Collection[str]) ->
     blocks = others.blocks(np.concatenate([known, np.zeros(len(others.experiments))]))
     found = {}
     for e in others.experiments:
-        column = others.names.index(f"{e.name}:{TIME_SHIFT}")
+        column = others.names.index(unknown_of(e.name, TIME_SHIFT))
         own = [b for b in blocks if b.experiment == e.name and b.output in outputs]
         slope, left = np.concatenate([b.jacobian[:, column] for b in own]), np.concatenate([b.residual for b in own])
         power = float(slope @ slope)

@@ -145,8 +145,9 @@ def by_latent(
     dearer = [b - begins[0] for b in begins for _ in places]
     spots: list[_Spot] = []
     largest = np.zeros(noise.shape[1])
-    for k, (more, under) in enumerate(mapped(search.executor, _at_place, jobs), start=1):
-        spots += [replace(s, fall=s.fall - dearer[k - 1]) for s in more]
+    done = zip(mapped(search.executor, _at_place, jobs), dearer, strict=True)
+    for k, ((more, under), extra) in enumerate(done, start=1):
+        spots += [replace(s, fall=s.fall - extra) for s in more]
         largest = np.maximum(largest, under)
         search.tell(k, len(jobs), f"round {number}: many sizes of {len(dense)} candidates")
     beside = opened.scores.beside

@@ -73,7 +73,7 @@ def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Re
         if is_noise(here, search.seed):
             return base, here
     clocked = on_their_clocks(search, base, here)
-    return clocked if clocked[1] is here else _held_again(search, *clocked)
+    return clocked if clocked[1] is here else _parameters_held_again(search, *clocked)
 
 
 def held_again(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
@@ -83,10 +83,11 @@ def held_again(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, 
     A parameter that was set free may have stood for an effect that has been added since. base: the nominal model that `here` adds
     effects to.
     """
-    return as_recorded(search, *_held_again(search, base, here))
+    return as_recorded(search, *_parameters_held_again(search, base, here))
 
 
-def _held_again(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
+def _parameters_held_again(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
+    """Return both with those parameters held again that bring no evidence any more."""
     for f in (*search.held, *search.stated):
         if f.name not in here.problem.names or search.spent:
             continue

@@ -103,7 +103,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
     nominal = here
     kept: list[Round] = []
     notes: tuple[str, ...] = ()
-    settled_already = little = False
+    asked_again, little = None, False
     while len(kept) < search.options.most:
         if kept and search.spent:
             notes += ("The budget ended: no further effect was looked for.",)
@@ -134,7 +134,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
             rounds.append(both[1])
             kept += both
             assert both[1].winner is not None
-            here, settled_already = both[1].winner.refit, False
+            here = both[1].winner.refit
             if not is_noise(here, search.seed):
                 base, here = released(search, base, here)
             break
@@ -143,21 +143,20 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
             break
         kept.append(found)
         base, here = held_again(search, base, found.winner.refit)
-        settled_already = False
         if is_noise(here, search.seed):
             break
         base, here = released(search, base, here)
         if is_noise(here, search.seed):
             break
         little = left_by(here) <= TOLERANCE * left_by(nominal)
-        # What is still left may be left by an effect that stands for another one.
+        # An effect that stands for another one may be why something is left.
         if 1 < len(kept) < search.options.most and not (little or search.spent):
             here, kept, more = settled(search, base, here, kept, len(rounds))
-            notes, settled_already = notes + more, True
+            notes, asked_again = notes + more, here
             if is_noise(here, search.seed):
                 break
     # Where a parameter was set free beside an effect, its rivals were refitted without that.
-    if kept and not (search.spent or settled_already) and (len(kept) > 1 or _closed_to(base, kept[0])):
+    if kept and not search.spent and asked_again is not here and (len(kept) > 1 or _closed_to(base, kept[0])):
         here, kept, more = settled(search, base, here, kept, len(rounds))
         notes += more
     return SearchOutcome(here, tuple(rounds), tuple(kept), notes)
