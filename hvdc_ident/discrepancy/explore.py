@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import BEAM, TOLERANCE
 from hvdc_ident.discrepancy.outside.filtered import filtered, filters
 from hvdc_ident.discrepancy.outside.law import law
-from hvdc_ident.discrepancy.proposals import View, by_latent, by_score, joined, views_of
+from hvdc_ident.discrepancy.proposals import View, by_latent, by_score, by_score_elsewhere, joined, views_of
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.refitted import (
     all_far,
@@ -51,10 +51,11 @@ def explored(
 ) -> tuple[Round, tuple[CandidateFit, ...]]:
     """The round and its refits. A first round goes on until a refit comes near the noise or nothing is left to try."""
     views = views_of(opened, nominal)
+    elsewhere = by_score_elsewhere(search, opened, views)
     opened, more = by_latent(search, opened, views, number, lambda c: not has_to_be_met(c))
     chance = opened.scores.threshold(0.5)
     field = sorted((p for p in [*by_score(opened), *more] if max(p.score, p.fall) > chance), key=lambda p: -p.fall)
-    taken = _entrants(opened, field)
+    taken = [*_entrants(opened, field), *_entrants(opened, elsewhere)]
     trials = refitted(search, opened, taken, f"round {number}")
     opened, trials = _with_neighbours(search, opened, trials, field, number)
     opened, trials = _with_sizes_to_be_met(search, opened, trials, field, views, number)

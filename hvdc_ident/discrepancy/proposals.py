@@ -22,7 +22,7 @@ from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit_jobs import as_given
-from hvdc_ident.discrepancy.scores import runs
+from hvdc_ident.discrepancy.scores import Scores, runs, scored
 from hvdc_ident.discrepancy.signatures.block import block, parameter
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
@@ -70,7 +70,27 @@ class _Spot:
 
 def by_score(opened: Round) -> list[Pick]:
     """Every candidate within reach at its best size, once for each form it is scored in (optional parts of an effect)."""
-    scores = opened.scores
+    return _best_sizes(opened, opened.scores, ())
+
+
+def by_score_elsewhere(search: SearchContext, opened: Round, views: Callable[[], Sequence[View]]) -> list[Pick]:
+    """The same with the gains as they were given, where `views_of` has them: an effect whose part the gains of the optimum have
+    taken leaves no trace beside those.
+
+    Their falls are counted from what the model leaves with these gains, and compare with each other only.
+    """
+    picks: list[Pick] = []
+    for view in views()[1:]:
+        search.tell(0, 1, f"scores of {len(opened.candidates)} candidates with the given values")
+        scores = scored(
+            view.nominal, opened.candidates, view.paths, bootstraps=0, seed=search.seed, executor=search.executor
+        )
+        picks += _best_sizes(opened, scores, tuple(view.nominal.theta.tolist()))
+    return picks
+
+
+def _best_sizes(opened: Round, scores: Scores, gains: tuple[float, ...]) -> list[Pick]:
+    """The best size of each form by these scores, the best first. What noise is judged by stays the score at the optimum."""
     best: dict[tuple[int, frozenset[str]], int] = {}
     for k, column in enumerate(scores.columns):
         c = opened.candidates[column.candidate]
@@ -79,11 +99,14 @@ def by_score(opened: Round) -> list[Pick]:
             best[form] = k
     picks = []
     for k in best.values():
-        column, t = scores.columns[k], float(scores.t[k])
+        column = scores.columns[k]
         met = has_to_be_met(opened.candidates[column.candidate])
-        picks.append(Pick(column.candidate, column.probe, 1.0 if met else float(scores.expected[k]), t, fall=t))
+        factor = 1.0 if met else float(scores.expected[k])
+        picks.append(
+            Pick(column.candidate, column.probe, factor, float(opened.scores.t[k]), gains, float(scores.t[k]))
+        )
     # Of equal scores the simpler: fewer places first, as listed.
-    return sorted(picks, key=lambda p: (-round(p.score, 6), len(opened.candidates[p.candidate].at), p.candidate))
+    return sorted(picks, key=lambda p: (-round(p.fall, 6), len(opened.candidates[p.candidate].at), p.candidate))
 
 
 def views_of(opened: Round, nominal: Nominal) -> Callable[[], list[View]]:
