@@ -15,7 +15,8 @@ import numpy as np
 from hvdc_ident.data import Experiment, Trajectory
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler, evidence_between
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, of_held_out, run
+from hvdc_ident.discrepancy.nominal import of_held_out
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
 from hvdc_ident.discrepancy.refit_jobs import job_of
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit import Problem

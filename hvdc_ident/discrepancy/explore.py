@@ -17,7 +17,15 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import BEAM, TOLERANCE
 from hvdc_ident.discrepancy.outside.filtered import filtered, filters
 from hvdc_ident.discrepancy.outside.law import law
-from hvdc_ident.discrepancy.proposals import View, by_latent, by_score, by_score_elsewhere, joined, views_of
+from hvdc_ident.discrepancy.proposals import (
+    View,
+    by_latent,
+    by_score,
+    by_score_elsewhere,
+    has_one_size,
+    joined,
+    views_of,
+)
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.refitted import (
     all_far,
@@ -277,6 +285,7 @@ def _neighbours(
 ) -> tuple[Round, list[Pick]]:
     """The round with the sizes that the neighbours of the leaders begin at, and these, those that were asked for left out."""
     found = opened.candidates
+    far = all_far(opened.before, trials)
     own: dict[int, list[Pick]] = {}
     for p in field:
         own.setdefault(p.candidate, []).append(p)
@@ -295,7 +304,8 @@ def _neighbours(
             as_found = has_to_be_met(c) or lead.late is not None if elsewhere else not lead.is_other_delay(c)
             if as_found and (probe := lead.probe_of(c)) is not None:
                 met = extra.setdefault(n, [])
-                picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains))
+                scanned = far and not elsewhere and has_one_size(c) and not has_to_be_met(c)
+                picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains, scanned=scanned))
                 met.append(probe)
             elif lead.is_other_delay(c) and (start := _as_late(c, lead.late)) is not None:
                 picks.append(Pick(n, *start, score, lead.gains))

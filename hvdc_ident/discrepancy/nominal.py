@@ -191,3 +191,10 @@ def _told_apart(optimum: LocalAnalysis) -> tuple[LocalAnalysis, dict[str, float]
     given = {f.name: f.given for f in optimum.problem.free if f.name in lost}
     fewer = optimum.with_held(dict.fromkeys(lost, "not told apart"), given)
     return fewer, {n: fewer.problem.held[n] for n in lost}
+
+
+def of_held_out(problem: Problem) -> Problem | None:
+    """The problem on the held-out experiments, without nuisances; None where there are none."""
+    others = [e.with_(role="fit", nuisance=()) for e in problem.experiments if e.role == "holdout" and e.outputs]
+    others = [e for e in others if set(e.outputs) & set(problem.outputs)]
+    return replace(problem, experiments=tuple(others)) if others else None

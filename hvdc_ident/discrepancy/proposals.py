@@ -138,7 +138,7 @@ def by_latent(
     score that noise gives over all these sizes. wanted: the candidates looked at, of those at one place with one free size."""
     signals = slot_signals(opened.before.model, opened.paths, opened.before.placed)
     times = [p.time for p in opened.paths.values()]
-    chosen = [c for c in opened.candidates if _has_one_size(c) and opened.reaches(c) and wanted(c)]
+    chosen = [c for c in opened.candidates if has_one_size(c) and opened.reaches(c) and wanted(c)]
     dense = [
         every_size(c, SignalScales.of(times, signals[c.at[0]])) if has_to_be_met(c) else widened(c) for c in chosen
     ]
@@ -186,7 +186,7 @@ def by_latent(
     return replace(opened, candidates=found, scores=scores), sorted(picks, key=lambda p: -p.fall)
 
 
-def _has_one_size(candidate: CandidateEffect) -> bool:
+def has_one_size(candidate: CandidateEffect) -> bool:
     """Return True for a candidate at one place that moves, of which one size is looked for and is not met by proportion."""
     if candidate.still or len(candidate.at) > 1 or candidate.source or not candidate.probes:
         return False

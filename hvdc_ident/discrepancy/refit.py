@@ -9,9 +9,10 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.discrepancy.nominal import Nominal, orthonormal
+from hvdc_ident.discrepancy.nominal import Nominal, of_held_out, orthonormal
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.record_noise import OutputNoise
+from hvdc_ident.discrepancy.size_line import SizeLine
 from hvdc_ident.effects import distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Problem
@@ -29,6 +30,10 @@ GLANCE = 3
 """Evaluations of each of several starts, of which the best goes on: its start, and the first two steps."""
 SCANNED = 15
 """Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
+SIZES = 30
+"""Sizes that are looked at, evenly in the logarithm, where a start may be far from the size: a level is met to a few percent."""
+LEAST = 1e-3
+"""Of the largest: where they begin for a size that may be 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +41,8 @@ class RefitJob:
     """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start).
 
     evaluations: of each start at most. spare: starts that are tried, one after the other, where none of the others runs.
+    scanned: the size of which many are looked at beside each start, empty where it begins as given: each start has then one more,
+    at the size that leaves least.
     """
 
     model: AnyModel
@@ -45,6 +52,7 @@ class RefitJob:
     noise: FrozenMap[OutputNoise]
     evaluations: int = METHOD.max_evaluations
     spare: tuple[Array, ...] = ()
+    scanned: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +170,7 @@ def run(job: RefitJob) -> Refit:
 
 def _best_walk(job: RefitJob, most: int) -> OptimiserResult:
     """The end of a walk of so many evaluations from the start whose first steps come lowest; a failed one where none runs."""
-    starts = _apart(job.begins)
+    starts = _apart([*job.begins, *(_scanned(job, b) for b in job.begins if job.scanned)])
     glance = most if len(starts) == 1 else min(GLANCE, most)
     walks = [_walk(job.problem, begin, glance) for begin in starts]
     best = min(walks, key=_cost)
@@ -174,6 +182,20 @@ def _best_walk(job: RefitJob, most: int) -> OptimiserResult:
         return best
     further = _walk(job.problem, best.theta, most - glance)
     return further if _cost(further) <= _cost(best) else best
+
+
+def _scanned(job: RefitJob, begin: Array) -> Array:
+    """The start with the size that leaves least, the others' answer to first order; as it is where the model does not run there."""
+    at = job.problem.names.index(job.scanned)
+    unknown = job.problem.unknowns[at]
+    try:
+        line = SizeLine.of(job.model, job.problem, begin, at)
+    except SimulationError:
+        return begin
+    sizes = np.geomspace(max(unknown.min, LEAST * unknown.max), unknown.max, SIZES)
+    best = begin.copy()
+    best[at] = sizes[np.argmin([line.fitted(s) for s in sizes])]
+    return best
 
 
 def _walk(problem: Problem, begin: Array, evaluations: int) -> OptimiserResult:
@@ -292,13 +314,6 @@ def held_out(problem: Problem, theta: Array) -> tuple[ResidualBlock, ...] | None
     except SimulationError:
         return ()
     return tuple(b for b in blocks if b.output in problem.outputs)
-
-
-def of_held_out(problem: Problem) -> Problem | None:
-    """The problem on the held-out experiments, without nuisances; None where there are none."""
-    others = [e.with_(role="fit", nuisance=()) for e in problem.experiments if e.role == "holdout" and e.outputs]
-    others = [e for e in others if set(e.outputs) & set(problem.outputs)]
-    return replace(problem, experiments=tuple(others)) if others else None
 
 
 def press(blocks: Sequence[ResidualBlock], parts: int = 4) -> float | None:

@@ -52,7 +52,8 @@ def job(
     if (given := as_given(before)) is not None:
         begins.append(_begin(before, given, asked))
     spare = [] if exact or len(picks) > 1 else [_begin(before, before.theta, s) for s in _sizes(only, placed[-1])]
-    return RefitJob(model, tuple(placed), problem, tuple(begins), before.noise, spare=tuple(spare))
+    scanned = "" if not picks[0].scanned else placed[-1].names[next(iter(placed[-1].bounds))]
+    return RefitJob(model, tuple(placed), problem, tuple(begins), before.noise, spare=tuple(spare), scanned=scanned)
 
 
 def _sizes(candidate: CandidateEffect, placed: Placed) -> list[Array]:

@@ -9,10 +9,10 @@ import numpy as np
 
 from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, unseen_rows
-from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, of_held_out, unseen
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, unseen
 from hvdc_ident.discrepancy.refit_jobs import job
 from hvdc_ident.discrepancy.residual_checks import loud_after_breaks, residual_tests
 from hvdc_ident.discrepancy.size_profile import hopped

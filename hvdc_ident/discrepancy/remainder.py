@@ -21,10 +21,10 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import unseen_rows
 from hvdc_ident.discrepancy.latent import Inversion
-from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.record_noise import draws
-from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, of_held_out, unseen
+from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
 from hvdc_ident.discrepancy.refitted import left_by
 from hvdc_ident.discrepancy.scores import runs
 from hvdc_ident.discrepancy.signatures.response import Along

@@ -17,19 +17,18 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import unseen_rows
-from hvdc_ident.discrepancy.nominal import orthonormal
 from hvdc_ident.discrepancy.options import BEAM, SURE
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, RefitResult, found_by, judged, of_held_out, run, signal
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, RefitResult, found_by, judged, run, signal
 from hvdc_ident.discrepancy.refit_jobs import as_given
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.size_line import PATIENT, SizeLine
 from hvdc_ident.effects import Probe, SignalScales, effects, size_grid
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import mapped
-from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate import ModelSimulator, Tolerance
+from hvdc_ident.simulate import ModelSimulator
 
 BENT = 30
 """Sizes of an effect that need not be met to the last digit: a refit goes the rest of the way."""
@@ -98,8 +97,6 @@ def resized(probe: Probe, name: str, size: float) -> Probe:
 K = TypeVar("K", bound=Hashable)
 Data = Literal["fitted", "held out", "all"]
 
-PATIENT = Tolerance(rtol=1e-5, atol=1e-8, max_steps=5000)
-"""Of runs at many sizes: one that takes more steps, chattering in a loop, is passed over."""
 HOPS = 3
 """Times that a better size is looked for."""
 WIDTH = 3.0
@@ -344,56 +341,7 @@ class _Piece:
 
 def _left_at(piece: _Piece) -> Array:
     """Chi2 at each size; infinite for one that could not be run."""
-    left = _Left.of(piece.refit, _size(piece.refit)[0])
-    asked: dict[Data, Callable[[float], float]] = {"fitted": left.fitted, "held out": left.unseen, "all": left}
+    line = SizeLine.of(piece.refit.model, piece.refit.problem, piece.refit.theta, _size(piece.refit)[0])
+    asked: dict[Data, Callable[[float], float]] = {"fitted": line.fitted, "held out": line.unseen, "all": line.left}
     of = asked[piece.what]
     return np.array([of(float(s)) for s in piece.sizes])
-
-
-@dataclass(frozen=True, eq=False)
-class _Left:
-    """chi2 of all data by the size of the last effect, with what the other unknowns can make good of the fitted ones taken
-    out to first order.
-
-    held: the problem of the held-out ones, where there are any. others: (N, k) orthonormal, what the unknowns can.
-    """
-
-    refit: Refit
-    at: int
-    problem: Problem
-    held: Problem | None
-    others: Array
-
-    @classmethod
-    def of(cls, refit: Refit, at: int) -> _Left:
-        quick = replace(refit.problem, simulator=ModelSimulator(refit.model, PATIENT))
-        jacobian = np.vstack([b.jacobian for b in refit.problem.blocks(refit.theta)])
-        return cls(refit, at, quick, of_held_out(quick), orthonormal(np.delete(jacobian, at, axis=1)))
-
-    def __call__(self, size: float) -> float:
-        """Infinite for a size that could not be run."""
-        return self.fitted(size) + self.unseen(size)
-
-    def fitted(self, size: float) -> float:
-        """Chi2 on the fitted data; infinite for a size that could not be run."""
-        try:
-            r = np.concatenate([b.residual for b in self.problem.blocks(self._at(size), derivatives=False)])
-        except SimulationError:
-            return np.inf
-        return float(r @ r - np.sum((self.others.T @ r) ** 2))
-
-    def unseen(self, size: float) -> float:
-        """Chi2 on the held-out data; 0 where there are none, infinite for a size that could not be run."""
-        if self.held is None:
-            return 0.0
-        try:
-            further = self.held.blocks(self._at(size)[: len(self.held.free)], derivatives=False)
-        except SimulationError:
-            return np.inf
-        return sum(float(b.residual @ b.residual) for b in further if b.output in self.problem.outputs)
-
-    def _at(self, size: float) -> Array:
-        """The unknowns with another size of the last effect."""
-        theta = self.refit.theta.copy()
-        theta[self.at] = size
-        return theta
