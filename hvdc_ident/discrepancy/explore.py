@@ -58,14 +58,17 @@ def explored(
     search: SearchContext, opened: Round, nominal: Nominal, number: int
 ) -> tuple[Round, tuple[CandidateFit, ...]]:
     """The round and its refits. A first round goes on until a refit comes near the noise or nothing is left to try."""
-    views = views_of(opened, nominal)
-    elsewhere = by_score_elsewhere(search, opened, views)
+    views, scored = views_of(opened, nominal), opened
     opened, more = by_latent(search, opened, views, number, lambda c: not has_to_be_met(c))
     chance = opened.scores.threshold(0.5)
     field = sorted((p for p in [*by_score(opened), *more] if max(p.score, p.fall) > chance), key=lambda p: -p.fall)
-    taken = [*_entrants(opened, field), *_entrants(opened, elsewhere)]
+    taken = _entrants(opened, field)
     trials = refitted(search, opened, taken, f"round {number}")
     opened, trials = _with_neighbours(search, opened, trials, field, number)
+    if not (_noise(search, trials) or search.spent):
+        given = _entrants(scored, by_score_elsewhere(search, scored, views))
+        trials = [*trials, *refitted(search, opened, given, f"round {number}: from the given values", trials)]
+        opened, trials = _with_neighbours(search, opened, trials, [*field, *given], number)
     opened, trials = _with_sizes_to_be_met(search, opened, trials, field, views, number)
     if number == 1 and _tells(opened, trials):
         if search.options.fallback and not (_noise(search, trials) or search.spent):

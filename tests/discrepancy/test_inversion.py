@@ -13,10 +13,11 @@ from scipy.stats import norm
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, proposals
-from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, proposals, rounds
+from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.latent import TRIED, Inversion
-from hvdc_ident.discrepancy.proposals import by_latent, views_of
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.proposals import by_latent, by_score, by_score_elsewhere, views_of
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.discrepancy.scores import Whitening, runs
 from hvdc_ident.discrepancy.signatures.response import Along
@@ -194,6 +195,27 @@ def test_no_proposal_promises_more_than_the_model_leaves() -> None:
     assert left[1] > 1.2 * left[0]
     _, picks = by_latent(search, found, views, 1, lambda _: True)
     assert 0.5 * left[0] < max(p.fall for p in picks) <= left[0]
+
+
+def test_gains_that_hide_an_effect_are_left_for_those_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lag of half the loop's period: the gains fall to a fifth, and with them others answer more like the records."""
+    ranks = {}
+
+    def looked_at(search: SearchContext, opened: Round, nominal: Nominal, number: int) -> None:
+        views = views_of(opened, nominal)
+        own, given = by_score(opened), by_score_elsewhere(search, opened, views)
+        labels = {n: [opened.candidates[p.candidate].label for p in v] for n, v in (("own", own), ("given", given))}
+        ranks.update({n: v.index("lag at wm") for n, v in labels.items()})
+        assert {p.gains for p in given} == {tuple(views()[1].nominal.theta)} and {p.gains for p in own} == {()}
+        # What noise is judged by stays what it was.
+        assert max(p.score for p in given) <= max(p.score for p in own)
+        raise StopIteration
+
+    monkeypatch.setattr(rounds, "explored", looked_at)
+    first = plain(experiments(lag=0.1))
+    with pytest.raises(StopIteration):
+        one_round(SearchContext("all", None, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0), first, 1)
+    assert ranks["given"] < 5 < ranks["own"]
 
 
 def test_the_evidence_of_a_latent_input_is_that_of_a_gaussian_with_its_prior() -> None:
