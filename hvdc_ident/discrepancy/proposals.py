@@ -102,9 +102,7 @@ def _best_sizes(opened: Round, scores: Scores, gains: tuple[float, ...]) -> list
         column = scores.columns[k]
         met = has_to_be_met(opened.candidates[column.candidate])
         factor = 1.0 if met else float(scores.expected[k])
-        picks.append(
-            Pick(column.candidate, column.probe, factor, float(opened.scores.t[k]), gains, float(scores.t[k]))
-        )
+        picks.append(Pick(column.candidate, column.probe, factor, float(opened.scores.t[k]), gains, float(scores.t[k])))
     # Of equal scores the simpler: fewer places first, as listed.
     return sorted(picks, key=lambda p: (-round(p.fall, 6), len(opened.candidates[p.candidate].at), p.candidate))
 
