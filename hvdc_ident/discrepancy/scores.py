@@ -25,6 +25,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit.residual import ResidualBlock, Treatment
 from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.simulate import ModelSimulator
 
 Path = Along | Ends
 """A run with its answers: of equations, or of something closed."""
@@ -104,10 +105,14 @@ class Scores:
 
 
 def runs(model: AnyModel, nominal: Nominal) -> dict[str, Path]:
-    """The model's runs of the fitted experiments, with their answers, by the experiment's name."""
-    experiments = nominal.problem.fitted_experiments
+    """The model's runs of the fitted experiments, with their answers, by the experiment's name.
+
+    They are as accurate as those of the refit: a play at the edge of turning runs at one tolerance and not at another.
+    """
+    experiments, simulator = nominal.problem.fitted_experiments, nominal.problem.simulator
+    tolerance = simulator.tolerance if isinstance(simulator, ModelSimulator) else None
     if isinstance(model, Model):
-        return {e.name: along(model, e, nominal.values) for e in experiments}
+        return {e.name: along(model, e, nominal.values, tolerance) for e in experiments}
     return {e.name: ends(model, e, nominal.values) for e in experiments}
 
 

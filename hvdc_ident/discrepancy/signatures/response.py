@@ -19,7 +19,7 @@ from hvdc_ident.discrepancy.signatures.propagation import propagate
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
-from hvdc_ident.simulate import simulate, with_recording
+from hvdc_ident.simulate import Tolerance, simulate, with_recording
 
 CHUNK = 128
 FEWEST = 600
@@ -124,25 +124,26 @@ def _observed(model: Model, parts: EquationPartials) -> Model:
     return replace(model, outputs=FrozenMap({n: Output(symbol(n)) for n in parts.variables}))
 
 
-def along(model: Model, experiment: Experiment, values: Mapping[str, float]) -> Along:
+def along(
+    model: Model, experiment: Experiment, values: Mapping[str, float], tolerance: Tolerance | None = None
+) -> Along:
     """The model's run of the experiment with the answers of its measured outputs.
 
-    Raises SimulationError where the run fails.
+    tolerance: of the run (default: the engine's own). Raises SimulationError where the run fails.
     """
     plant = with_recording(model, experiment)
     outputs = experiment.outputs
     parts = tangent(plant, outputs)
     time, rows = instants(experiment)
-    run = simulate(_observed(plant, parts), experiment.with_(time=time, measured=None, drive=(), instrument={}), values)
+    asked = experiment.with_(time=time, measured=None, drive=(), instrument={})
+    run = simulate(_observed(plant, parts), asked, values, tolerance=tolerance)
     states = np.column_stack([run[n] for n in parts.variables])
     given = {**experiment.values, **values}
     p = np.array([float(given.get(n, q.value)) for n, q in plant.parameters.items()])
     system = _system(parts, plant, time, rows, states, p)
     before, share = _memory(parts, plant, time, p)
     seen = {n: states[:, k] for n, k in parts.place.items()}
-    recorded = simulate(
-        plant, experiment.with_(time=time, measured=None, drive=(), instrument={}), values, outputs=outputs
-    )
+    recorded = simulate(plant, asked, values, outputs=outputs, tolerance=tolerance)
     seen |= {f"outputs.{o}": recorded[o] for o in outputs}
     seen |= {o: recorded[o] for o in outputs if o not in seen}
     return Along(time, rows, seen, outputs, places(plant, outputs), system, before, share, experiment.time.size)
