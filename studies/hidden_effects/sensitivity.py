@@ -34,8 +34,10 @@ import hvdc_ident.discrepancy  # noqa: E402
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose  # noqa: E402
 from hvdc_ident.errors import HvdcIdentError  # noqa: E402
 
-CASES = ((94, "single-007"), (91, "single-004"), (94, "outside-000"), (97, "clean-000"))
-"""Seed and name: a gain, a delay, a cube (outside the catalogue), and nothing."""
+CASES = ((100, "single-000"), (100, "single-007"), (100, "clean-001"))
+"""Seed and name: a backlash in slow noise whose size is not stated, a gain, and nothing in such noise."""
+OUTSIDE = ((94, "outside-000"),)
+"""A cube, for the numbers that only what is outside the catalogue meets."""
 FACTORS = (0.5, 2.0)
 
 
@@ -51,6 +53,11 @@ class Number:
     def label(self) -> str:
         """Module and name, as the table has them."""
         return f"{self.module.removeprefix('hvdc_ident.discrepancy.')}.{self.name}"
+
+    @property
+    def cases(self) -> tuple[tuple[int, str], ...]:
+        """Seed and name of the cases that it is tried on."""
+        return OUTSIDE if ".outside." in self.module else CASES
 
     def times(self, factor: float) -> float:
         """Return the value times a factor; of a share of at least a half its distance from 1 is multiplied, a count is rounded."""
@@ -143,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         jobs = [(None, 1.0), *((n, f) for n in numbers() for f in FACTORS if not asked.only or n.label in asked.only)]
         with path.open("a", encoding="utf-8") as file:
             for k, (number, factor) in enumerate(jobs):
-                for seed, name in CASES:
+                for seed, name in (*CASES, *OUTSIDE) if number is None else number.cases:
                     key = ("" if number is None else number.label, factor, f"{seed} {name}")
                     if key in there:
                         continue
