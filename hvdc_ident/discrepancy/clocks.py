@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler, evidence_between
 from hvdc_ident.discrepancy.nominal import of_held_out
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
-from hvdc_ident.discrepancy.refit_jobs import job_of
+from hvdc_ident.discrepancy.refit_jobs import refit_again
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.simulator import TIME_SHIFT, unknown_of
@@ -138,8 +138,5 @@ def _refitted(base: Refit, here: Refit, records: tuple[Experiment, ...]) -> tupl
     """The nominal model, at its values, and the hypothesis refitted, on other records; None where it does not run on them."""
     other = replace(base, problem=replace(base.problem, experiments=records))
     same = replace(here, problem=replace(here.problem, experiments=records))
-    try:
-        found = run(job_of(other, same, same.placed, {}))
-    except SimulationError:
-        return None
+    found = refit_again(other, same, same.placed)
     return None if found.failure else (other, found)

@@ -10,10 +10,11 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import Pick
 from hvdc_ident.discrepancy.placed import PATIENCE, Placed, added, moved
-from hvdc_ident.discrepancy.refit import Refit, RefitJob
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import apply_effects, effects
+from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -76,6 +77,14 @@ def as_given(refit: Refit) -> Array | None:
         far = far or abs(value - f.given) > BIASED * abs(f.given) or f.on_bound(value)
         theta[k] = min(max(f.given, f.min), f.max)
     return theta if far else None
+
+
+def refit_again(first: Refit, here: Refit, placed: Sequence[Placed]) -> Refit:
+    """The nominal model `first` with these effects, refitted from where they stand in the hypothesis `here`; a failure is told."""
+    try:
+        return run(job_of(first, here, placed, {}))
+    except HvdcIdentError as error:
+        return replace(here, failure=str(error))
 
 
 def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]) -> RefitJob:

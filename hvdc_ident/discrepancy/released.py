@@ -16,8 +16,8 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.clocks import as_recorded, on_their_clocks
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler, evidence_between
-from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.refit_jobs import job_of
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.refit_jobs import refit_again
 from hvdc_ident.discrepancy.refitted import is_noise
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter
@@ -59,10 +59,7 @@ def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Re
             break
         search.tell(0, 1, f"with {best.name} free")
         wider = _with_free(base, best)
-        try:
-            freed = run(job_of(wider, here, here.placed, {}))
-        except SimulationError:
-            break
+        freed = refit_again(wider, here, here.placed)
         if freed.failure or not evidence_between(here, freed, Ruler.of(freed), 1) > search.options.named_bic:
             break
         # What asks for more than a value may be off is something else; free, the value would hide it from every score.
@@ -92,10 +89,7 @@ def _parameters_held_again(search: SearchContext, base: Refit, here: Refit) -> t
         if f.name not in here.problem.names or search.spent:
             continue
         fewer = _with_held(base, f)
-        try:
-            without = run(job_of(fewer, here, here.placed, {}))
-        except SimulationError:
-            continue
+        without = refit_again(fewer, here, here.placed)
         if not without.failure and evidence_between(without, here, Ruler.of(here), 1) <= search.options.named_bic:
             base, here = fewer, without
     return base, here

@@ -14,8 +14,8 @@ from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, 
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
-from hvdc_ident.discrepancy.refit_jobs import as_given, job_of
+from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged
+from hvdc_ident.discrepancy.refit_jobs import as_given, job_of, refit_again
 from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by, once_more
 from hvdc_ident.discrepancy.released import held_again, released
 from hvdc_ident.discrepancy.remainder import is_small
@@ -210,7 +210,7 @@ def settled(
     while k < len(kept):
         search.tell(k, len(kept), f"again with the others: {here.placed[k].candidate.label}")
         others = tuple(p for j, p in enumerate(here.placed) if j != k)
-        without = _again(first, here, others)
+        without = refit_again(first, here, others)
         if without.failure:
             k += 1
             continue
@@ -307,11 +307,3 @@ def _in_place(refit: Refit, k: int) -> Refit:
 
 def _ordered(refit: Refit, order: Sequence[int]) -> Refit:
     return replace(refit, placed=tuple(refit.placed[j] for j in order), apart=tuple(refit.apart[j] for j in order))
-
-
-def _again(first: Refit, here: Refit, placed: Sequence[Placed]) -> Refit:
-    """The nominal model with these effects, refitted from where they stand."""
-    try:
-        return run(job_of(first, here, placed, {}))
-    except HvdcIdentError as error:
-        return replace(here, failure=str(error))
