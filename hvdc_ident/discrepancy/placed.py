@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,8 +13,8 @@ from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel
-from hvdc_ident.simulate import ModelSimulator, Tolerance
+from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.simulate import ModelSimulator, Tolerance, equilibria
 
 PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=20_000)
 """Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""
@@ -67,15 +67,36 @@ def added(
     names = dict(zip(present, new, strict=True))
     bounds = {n: b for n, b in chosen.free.items() if n in names}
     free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-    free_initial_states = problem.free_initial_states or effects()[candidate.effect].self_exciting
+    restless = effects()[candidate.effect].self_exciting or rests_anywhere(larger, model, [use])
     more = replace(
         problem,
         simulator=ModelSimulator(larger, PATIENCE),
         free=(*problem.free, *free),
-        free_initial_states=free_initial_states,
+        free_initial_states=problem.free_initial_states or restless,
     )
     placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
     return larger, more, placed, np.array([f.start for f in free])
+
+
+def rests_anywhere(model: AnyModel, without: AnyModel, uses: Sequence[EffectUse]) -> bool:
+    """Return True where effects leave open at which of many steady states the model rests, as without them it does not.
+
+    A dead band before an integrator holds it at any level, and a record begins at the one that was left by what came before.
+    """
+    if (
+        not any(effects()[u.effect].holds for u in uses)
+        or not isinstance(model, Model)
+        or not isinstance(without, Model)
+    ):
+        return False
+    one, other = (_determinant(m) for m in (model, without))
+    return one == 0.0 and other not in (None, 0.0)
+
+
+def _determinant(model: Model) -> float | None:
+    """Sign of the determinant of the equations at the model's own steady state; None where it has none."""
+    anchor = equilibria(model).anchor(model, np.array([i.value for i in model.inputs.values()]))
+    return None if anchor is None else anchor.sign
 
 
 def _absent(candidate: CandidateEffect, name: str, values: Mapping[str, float]) -> bool:

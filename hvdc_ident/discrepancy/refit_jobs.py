@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import Pick
-from hvdc_ident.discrepancy.placed import PATIENCE, Placed, added, moved
+from hvdc_ident.discrepancy.placed import PATIENCE, Placed, added, moved, rests_anywhere
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
@@ -104,13 +104,14 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         free += [FitParameter(names[n], values[n], *p.bounds[n]) for n in p.bounds]
         moved = replace(p.candidate, at=use.at, source=use.source)
         again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
-    free_initial_states = any(effects()[p.use.effect].self_exciting for p in placed)
+    uses = [p.use for p in placed]
+    restless = any(effects()[u.effect].self_exciting for u in uses) or rests_anywhere(model, first.model, uses)
     problem = replace(
         here.problem,
         simulator=ModelSimulator(model, PATIENCE),
         free=tuple(free),
         held=first.problem.held,
-        free_initial_states=free_initial_states,
+        free_initial_states=restless,
     )
     nuisance = here.theta[len(here.problem.free) :]
     gains = [at.get(f.name, f.start) for f in first.problem.free]

@@ -169,6 +169,7 @@ class Effect:
     with coefficients of the user's own names. tried_by_default: False for a general form that stands for many others and is
     tried where none of them is enough. resistance: the parameter that a resistance of the model replaces.
     self_exciting: True where it moves the model by itself, so that a record of it does not begin in steady state.
+    holds: True where it passes no small change on, so that what integrates its signal may rest at any level.
     equivalent_delay: delay of a slow signal, s, from its parameters' values, which effects that are hard to tell apart
     share; None for what is no delay of any kind. numpy_form: y of u in numpy, where the equations are too many to be
     evaluated for thousands of sizes. generalises: effects that it becomes at the end of a parameter's range, and whose data
@@ -191,6 +192,7 @@ class Effect:
     tried_by_default: bool = True
     resistance: str = ""
     self_exciting: bool = False
+    holds: bool = False
     equivalent_delay: Callable[[Mapping[str, float]], float] | None = None
     numpy_form: Callable[[Array, Mapping[str, Array]], Array] | None = None
     generalises: tuple[str, ...] = ()

@@ -30,6 +30,7 @@ EFFECT = Effect(
         }
     ),
     rewrite=rewrite,
+    holds=True,
     sentence="{at} is 0 within +-{width} and smaller by that beyond",
     excited_by="slow ramps both ways through 0",
     example=FrozenMap({"width": 0.02}),
