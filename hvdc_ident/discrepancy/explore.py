@@ -86,9 +86,8 @@ def _with_sizes_to_be_met(
     views: Callable[[], Sequence[View]],
     number: int,
 ) -> tuple[Round, list[CandidateFit]]:
-    """The trials with sizes that have to be met: in a first round where nothing explains the records, and where what does is a
-    kind of delay."""
-    far = number == 1 and all_far(opened.before, trials, near=TOLERANCE)
+    """The trials with sizes that have to be met: where nothing explains the records, and where what does is a kind of delay."""
+    far = all_far(opened.before, trials, near=TOLERANCE)
     late = {opened.candidates[t.pick.candidate].at for t in by_cost(trials)[:BEAM] if _late(t) is not None}
     if search.spent or not (far or late):
         return opened, trials
