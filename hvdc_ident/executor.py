@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.text import duration
@@ -45,6 +45,20 @@ class TolerantExecutor(Protocol):
 
     def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Outcome]:
         """Yield the outcome of each item."""
+
+
+@dataclass(frozen=True)
+class Made(Generic[T]):
+    """Items that are made one after the other as they are asked for, where all of them together would be large."""
+
+    make: Callable[[Any], T]
+    of: Sequence[Any]
+
+    def __len__(self) -> int:
+        return len(self.of)
+
+    def __iter__(self) -> Iterator[T]:
+        return map(self.make, self.of)
 
 
 def mapped(executor: Executor | None, function: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.nominal import F, Nominal
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.scores import SEEN, Path, Whitening
 from hvdc_ident.discrepancy.signatures.response import Along
-from hvdc_ident.executor import Executor, mapped
+from hvdc_ident.executor import Executor, Made, mapped
 from hvdc_ident.immutable import FrozenMap
 
 KNOTS = 600
@@ -144,7 +144,7 @@ class Inversion:
         """(k n, C) at the knots of what is added at the instants, (K, C) in each experiment."""
         return np.vstack([m @ d for m, d in zip(self.means, changes, strict=True)])
 
-    def against(self, rows: Array) -> Array:
+    def against(self, rows: NDArray[np.floating]) -> Array:
         """(m, B) what whitened rows (N, B), without what parameters can make good, have of each direction."""
         return np.asarray(self.directions.T @ _with_hats(self.shown, rows) / self.strength[:, None])
 
@@ -179,12 +179,12 @@ class Inversion:
         return np.clip(nominal.theta - step, low, high)
 
 
-def _split(rows: Array, like: Sequence[Array | scipy.sparse.csr_array]) -> list[Array]:
+def _split(rows: NDArray[F], like: Sequence[Array | scipy.sparse.csr_array]) -> list[NDArray[F]]:
     """The rows of each experiment: as many as its own matrix has."""
     return np.split(rows, np.cumsum([m.shape[0] for m in like])[:-1])
 
 
-def _with_hats(shown: Sequence[Array], rows: Array) -> Array:
+def _with_hats(shown: Sequence[Array], rows: NDArray[np.floating]) -> Array:
     """(k n, B) products of whitened rows (N, B) with what each hat shows."""
     return np.vstack([s.T @ r for s, r in zip(shown, _split(rows, shown), strict=True)])
 
@@ -244,19 +244,22 @@ def reach(nominal: Nominal, paths: Mapping[str, Path], slots: Sequence[str], exe
     gap = float(np.sum(left**2)) - rows
     if not gap > SURE * np.sqrt(2.0 * rows):
         return None
-    jobs = [_SlotJob(nominal, {n: p.only(s) for n, p in inner.items()}, s) for s in slots]
-    found = np.array(list(mapped(executor, _at_slot, jobs)))
+
+    def job(place: str) -> _SlotJob:
+        return _SlotJob(nominal, {n: p.only(place) for n, p in inner.items()}, place)
+
+    found = np.array(list(mapped(executor, _at_slot, Made(job, slots))))
     brings, count = found[:, 0] - found[:, 1], found[:, 1]
     chance = SURE * np.sqrt(2.0 * count + 4.0 * np.maximum(brings, 0.0))
     best = int(np.argmax(brings))
     enough = brings + chance >= SHARE * (brings[best] - chance[best])
     order = np.argsort(-brings, kind="stable")
-    shown = [k for k in order[:SHOWN] if brings[k] > 0]
-    curves = mapped(executor, _curve, [jobs[k] for k in shown])
+    shown = [slots[k] for k in order[:SHOWN] if brings[k] > 0]
+    curves = mapped(executor, _curve, Made(job, shown))
     return Reach(
         FrozenMap({slots[k]: float(max(brings[k], 0.0) / gap) for k in order}),
         frozenset(s for s, near in zip(slots, enough, strict=True) if near),
-        FrozenMap({slots[k]: curve for k, curve in zip(shown, curves, strict=True)}),
+        FrozenMap(dict(zip(shown, curves, strict=True))),
     )
 
 

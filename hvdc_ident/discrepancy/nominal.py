@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.discrepancy.record_noise import OutputNoise, noise_of
+from hvdc_ident.discrepancy.record_noise import OutputNoise, draws, noise_of
 from hvdc_ident.errors import StudyError
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit import FitParameter, Problem, Simulator
@@ -22,6 +23,7 @@ from hvdc_ident.sensitivity import independent, null_directions
 
 NEAR = 0.05
 """Share of the rows' interval: a row this near to a jump of an input lies on it."""
+F = TypeVar("F", bound=np.floating)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,9 +77,15 @@ class Nominal:
         """Parameters at the optimum, those held included."""
         return self.problem.values(self.theta)
 
-    def projected(self, columns: Array) -> Array:
-        """M columns: what the parameters cannot make good."""
-        return columns - self.basis @ (self.basis.T @ columns)
+    def projected(self, columns: NDArray[F]) -> NDArray[F]:
+        """M columns: what the parameters cannot make good, in as many digits as the columns have."""
+        basis = self.basis.astype(columns.dtype)
+        return columns - basis @ (basis.T @ columns)
+
+    def drawn(self, count: int, seed: int) -> NDArray[np.float32]:
+        """(N, count) records of nothing but noise, as the residuals are; in half the digits, for noise needs no more."""
+        found = draws(self.problem, self.blocks, self.noise, self.fitted(), count, seed)
+        return np.vstack([d.astype(np.float32) for d in found])
 
     def fitted(self) -> list[Array]:
         """The model's output at each block's rows, in its unit."""

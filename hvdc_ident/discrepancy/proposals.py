@@ -20,7 +20,6 @@ from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import Pick
 from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit_jobs import as_given
 from hvdc_ident.discrepancy.scores import Scores, runs, scored
 from hvdc_ident.discrepancy.signatures.block import block, parameter
@@ -30,7 +29,7 @@ from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.discrepancy.size_profile import Dense, every_size, has_to_be_met, sized, widened
 from hvdc_ident.effects import SignalScales
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.executor import mapped
+from hvdc_ident.executor import Made, mapped
 from hvdc_ident.model import Model
 
 SIZES = 3
@@ -54,7 +53,7 @@ class _PlaceJob:
 
     view: View
     found: tuple[Dense, ...]
-    noise: Array
+    noise: NDArray[np.float32]
     own: bool
 
 
@@ -142,25 +141,19 @@ def by_latent(
     ]
     if not dense or not isinstance(opened.before.model, Model) or not (seen := views()):
         return opened, []
-    nominal = seen[0].nominal
-    drawn = draws(
-        nominal.problem,
-        nominal.blocks,
-        nominal.noise,
-        nominal.fitted(),
-        search.options.bootstraps,
-        search.seed + number,
-    )
-    noise = np.vstack(drawn)
+    noise = seen[0].nominal.drawn(search.options.bootstraps, search.seed + number)
     places: dict[str, list[Dense]] = {}
     for d in dense:
         places.setdefault(d.candidate.at[0], []).append(d)
-    # With other gains than those that fit, the model's own signal is the one that is known to be wrong.
-    jobs = [
-        _PlaceJob(View(v.nominal, {n: a.only(p) for n, a in v.paths.items()}), tuple(group), under, own=v is seen[0])
-        for v, under in ((v, v.nominal.projected(noise)) for v in seen)
-        for p, group in places.items()
-    ]
+    left = {id(v): v.nominal.projected(noise) for v in seen}
+
+    def job(at: tuple[View, str]) -> _PlaceJob:
+        """With other gains than those that fit, the model's own signal is the one that is known to be wrong."""
+        view, place = at
+        alone = View(view.nominal, {n: a.only(place) for n, a in view.paths.items()})
+        return _PlaceJob(alone, tuple(places[place]), left[id(view)], own=view is seen[0])
+
+    jobs = Made(job, [(v, p) for v in seen for p in places])
     # A fall is one from what the model leaves: with other gains than those that fit, more is left to begin with.
     begins = [float(np.sum(v.nominal.projected(v.nominal.residual[:, None]) ** 2)) for v in seen]
     dearer = [b - begins[0] for b in begins for _ in places]

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from hvdc_ident.data import Array
@@ -29,7 +30,7 @@ from hvdc_ident.discrepancy.refitted import left_by
 from hvdc_ident.discrepancy.scores import runs
 from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.executor import mapped
+from hvdc_ident.executor import Made, mapped
 from hvdc_ident.immutable import FrozenMap
 
 NOISE_SHARE, RANGE_SHARE = 0.1, 0.01
@@ -86,7 +87,7 @@ class _LatentJob:
     nominal: Nominal
     paths: Mapping[str, Along]
     place: str
-    noise: Array | None
+    noise: NDArray[np.float32] | None
 
 
 def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float) -> Remainder:
@@ -158,14 +159,14 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
         return found
     places = list(slot_signals(last.model, inner, last.placed))
     search.tell(0, 1, "anything else that is missing")
-    jobs = [_LatentJob(nominal, {n: p.only(s) for n, p in inner.items()}, s, None) for s in places]
-    falls = list(mapped(search.executor, _fall, jobs))
+
+    def job(place: str, noise: NDArray[np.float32] | None = None) -> _LatentJob:
+        return _LatentJob(nominal, {n: p.only(place) for n, p in inner.items()}, place, noise)
+
+    falls = list(mapped(search.executor, _fall, Made(job, places)))
     best = sorted(range(len(places)), key=lambda k: -falls[k])[:SHORTLIST]
-    drawn = draws(
-        nominal.problem, nominal.blocks, nominal.noise, nominal.fitted(), _least_draws(search), search.seed + 5
-    )
-    noise = nominal.projected(np.vstack(drawn))
-    jobs = [_LatentJob(nominal, {n: p.only(places[k]) for n, p in inner.items()}, places[k], noise) for k in best]
+    noise = nominal.projected(nominal.drawn(_least_draws(search), search.seed + 5))
+    jobs = [job(places[k], noise) for k in best]
     table = np.array(list(mapped(search.executor, _log_evidence, jobs))).reshape(len(jobs), -1)
     if not table.size:
         return found

@@ -13,7 +13,6 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.nominal import Nominal, unit_columns
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.placed import Placed
-from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.effects import effects
 
@@ -44,10 +43,7 @@ def residual_tests(
     nominal: Nominal, signals: Mapping[str, Mapping[str, Array]], *, bootstraps: int, seed: int
 ) -> tuple[Binned, ...]:
     """The residuals over stretches of time, and over levels and slopes of each signal given (by name and experiment, at its rows)."""
-    blocks = nominal.blocks
-    noise = nominal.projected(
-        np.vstack(draws(nominal.problem, blocks, nominal.noise, nominal.fitted(), bootstraps, seed))
-    )
+    noise = nominal.projected(nominal.drawn(bootstraps, seed))
     groups = {"time": _time_bins(nominal)}
     for name, by_experiment in signals.items():
         groups[f"level of {name}"] = _level_bins(nominal, by_experiment)
@@ -74,12 +70,12 @@ def loud_after_breaks(nominal: Nominal) -> bool:
     return bool(np.mean(power[at]) > limit * np.mean(power[~at]))
 
 
-def _binned(name: str, group: NDArray[np.intp], residual: Array, noise: Array) -> Binned:
+def _binned(name: str, group: NDArray[np.intp], residual: Array, noise: NDArray[np.floating]) -> Binned:
     count = int(group.max()) + 1
     keep = group >= 0
     sizes = np.maximum(np.bincount(group[keep], minlength=count), 1)
 
-    def statistic(r: Array) -> float:
+    def statistic(r: NDArray[np.floating]) -> float:
         sums = np.bincount(group[keep], weights=r[keep], minlength=count)
         return float(np.sum(sums**2 / sizes))
 

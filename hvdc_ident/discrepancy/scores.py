@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.closed import Ends, ends
 from hvdc_ident.discrepancy.signatures.finite import LOOSE, SignatureColumn, Task, columns_of, signatures, tasks
@@ -46,7 +45,7 @@ class Scores:
     raw: Array
     size: Array
     left: Array
-    noise: Array
+    noise: NDArray[np.float32]
     sound: NDArray[np.bool_]
     two_sided: NDArray[np.bool_]
     beside: Array | None = None
@@ -67,7 +66,7 @@ class Scores:
         own = np.asarray(self._t(self.noise).max(axis=0, initial=0.0))
         return own if self.beside is None or not own.size else np.maximum(own, self.beside)
 
-    def _t(self, raw: Array) -> Array:
+    def _t(self, raw: NDArray[np.floating]) -> Array:
         left = np.where(self.left > 0, self.left, 1.0)[:, None]
         allowed = self.usable[:, None] & (self.two_sided[:, None] | (raw > 0))
         return np.where(allowed, raw**2 / left, 0.0)
@@ -144,47 +143,33 @@ def scored(
     """The scores of all candidates at the nominal model's optimum."""
     columns = columns_of(found)
     plan = tasks(found, columns, _largest(paths))
-    blocks = nominal.blocks
-    noise = (
-        np.vstack(draws(nominal.problem, blocks, nominal.noise, nominal.fitted(), bootstraps, seed))
-        if bootstraps
-        else None
-    )
+    noise = nominal.projected(nominal.drawn(bootstraps, seed)) if bootstraps else nominal.drawn(1, seed)[:, :0]
     residual = nominal.projected(nominal.residual[:, None])
     restless = np.array([effects()[found[c.candidate].effect].self_exciting for c in columns], dtype=bool)
     starts = nominal.starts if restless.any() else np.zeros((residual.shape[0], 0))
-    parts = [residual, nominal.basis, starts]
-    if noise is not None:
-        parts.append(nominal.projected(noise))
-    right = np.hstack(parts)
+    right = np.hstack([residual, nominal.basis, starts])
     jobs, at = [], 0
     for e in nominal.problem.fitted_experiments:
-        own = [b for b in blocks if b.experiment == e.name]
-        width = sum(b.residual.size for b in own)
+        own = [b for b in nominal.blocks if b.experiment == e.name]
+        rows = slice(at, at + sum(b.residual.size for b in own))
         jobs.append(
-            ScoreJob(
-                paths[e.name],
-                plan,
-                Whitening.of(own, e, nominal),
-                right[at : at + width],
-                len(columns),
-                nominal.basis.shape[1],
-            )
+            ScoreJob(paths[e.name], plan, Whitening.of(own, e, nominal), right[rows], noise[rows], len(columns))
         )
-        at += width
-    outcomes = list(mapped(executor, _products, jobs))
-    products = np.sum([o[0] for o in outcomes], axis=0)
-    squares = np.sum([o[1] for o in outcomes], axis=0)
-    change = np.max([o[2] for o in outcomes], axis=0)
-    k, m = nominal.basis.shape[1], starts.shape[1]
-    raw, under = products[:, 0], products[:, 1 + k + m :]
-    left = squares - np.sum(products[:, 1 : 1 + k] ** 2, axis=1)
+        at = rows.stop
+    products, under = np.zeros((len(columns), right.shape[1])), np.zeros((len(columns), noise.shape[1]), np.float32)
+    squares, change = np.zeros(len(columns)), np.zeros(len(columns))
+    for own_products, own_under, own_squares, own_change in mapped(executor, _products, jobs):
+        products += own_products
+        under += own_under
+        squares += own_squares
+        change = np.maximum(change, own_change)
+    k = 1 + nominal.basis.shape[1]
+    raw, left = products[:, 0], squares - np.sum(products[:, 1:k] ** 2, axis=1)
     # What moves the model by itself meets records that do not begin at rest: their starts are for it to make good.
-    besides = np.where(restless[:, None], products[:, 1 + k : 1 + k + m], 0.0)
+    besides = np.where(restless[:, None], products[:, k:], 0.0)
     left = np.maximum(left - np.sum(besides**2, axis=1), 0.0)
     raw = raw - besides @ (starts.T @ residual[:, 0])
-    if noise is not None:
-        under = under - besides @ (starts.T @ parts[-1])
+    under -= (besides @ (starts.T @ noise)).astype(np.float32)
     either = np.array([two_sided(found[c.candidate]) for c in columns], dtype=bool)
     return Scores(columns, raw, squares, left, under, change <= LOOSE, either)
 
@@ -221,24 +206,23 @@ class ScoreJob:
     plan: tuple[tuple[Task, ...], ...]
     whitening: Whitening
     right: Array
+    noise: NDArray[np.float32]
     columns: int
-    exact: int
 
 
-def _products(job: ScoreJob) -> tuple[Array, Array, Array]:
-    """(C, k) signatures times the right-hand sides, (C,) their squares, (C,) how far the loop was from closed."""
-    products, squares = np.zeros((job.columns, job.right.shape[1])), np.zeros(job.columns)
-    change = np.full(job.columns, np.inf)
-    right = job.right.astype(np.float32)
-    exact = 1 + job.exact
+def _products(job: ScoreJob) -> tuple[Array, NDArray[np.float32], Array, Array]:
+    """(C, k) signatures times the right-hand sides, (C, B) times the noise, (C,) their squares, (C,) how far the loop was from
+    closed."""
+    products = np.zeros((job.columns, job.right.shape[1]))
+    under = np.zeros((job.columns, job.noise.shape[1]), np.float32)
+    squares, change = np.zeros(job.columns), np.full(job.columns, np.inf)
     for index, y, last in signatures(job.path, job.plan):
         s = job.whitening(y)
-        products[index, :exact] = s.T @ job.right[:, :exact]
-        # Noise need not be had to more than six digits, and costs most.
-        products[index, exact:] = s.T.astype(np.float32) @ right[:, exact:]
+        products[index] = s.T @ job.right
+        under[index] = s.T.astype(np.float32) @ job.noise
         squares[index] = np.einsum("ij,ij->j", s, s)
         change[index] = last
-    return products, squares, change
+    return products, under, squares, change
 
 
 MOST = 4
