@@ -78,9 +78,8 @@ class Nominal:
         return self.problem.values(self.theta)
 
     def projected(self, columns: NDArray[F]) -> NDArray[F]:
-        """M columns: what the parameters cannot make good, in as many digits as the columns have."""
-        basis = self.basis.astype(columns.dtype)
-        return columns - basis @ (basis.T @ columns)
+        """M columns: what the parameters cannot make good, worked out in all digits and kept in as many as the columns have."""
+        return (columns - self.basis @ (self.basis.T @ columns)).astype(columns.dtype, copy=False)
 
     def drawn(self, count: int, seed: int) -> NDArray[np.float32]:
         """(N, count) records of nothing but noise, as the residuals are; in half the digits, for noise needs no more."""

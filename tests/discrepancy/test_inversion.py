@@ -182,7 +182,7 @@ def test_noise_is_scored_without_what_the_parameters_of_each_view_make_good(monk
     }
     assert len({tuple(job.view.nominal.theta) for job in seen}) == 2
     for job in seen:
-        assert np.abs(job.view.nominal.basis.T @ job.noise).max() < 1e-7 * np.linalg.norm(job.noise)
+        assert np.abs(job.view.nominal.basis.T @ job.noise).max() < 1e-9 * np.linalg.norm(job.noise)
 
 
 def test_no_proposal_promises_more_than_the_model_leaves() -> None:
