@@ -67,8 +67,9 @@ def explored(
     opened, trials = _with_neighbours(search, opened, trials, field, number)
     if not (_noise(search, trials) or search.spent):
         given = _entrants(scored, by_score_elsewhere(search, scored, views))
-        trials = [*trials, *refitted(search, opened, given, f"round {number}: from the given values", trials)]
-        opened, trials = _with_neighbours(search, opened, trials, [*field, *given], number)
+        if given:
+            trials = [*trials, *refitted(search, opened, given, f"round {number}: from the given values", trials)]
+            opened, trials = _with_neighbours(search, opened, trials, [*field, *given], number)
     opened, trials = _with_sizes_to_be_met(search, opened, trials, field, views, number)
     if number == 1 and _tells(opened, trials):
         if search.options.fallback and not (_noise(search, trials) or search.spent):
