@@ -26,7 +26,7 @@ class Pick:
     """A candidate to refit: its best probe, the size asked for in units of the probe's, and its score.
 
     gains: unknowns of the model before that go with this size, where they are known. fall: by how much chi2 is expected to fall.
-    scanned: whether the refit looks at many sizes before it begins, for a bend far from its own level leaves no slope.
+    swept: whether the refit looks at many sizes before it begins, for a bend far from its own level leaves no slope.
     """
 
     candidate: int
@@ -35,7 +35,7 @@ class Pick:
     score: float
     gains: tuple[float, ...] = ()
     fall: float = 0.0
-    scanned: bool = False
+    swept: bool = False
 
 
 @dataclass(frozen=True)

@@ -307,8 +307,8 @@ def _neighbours(
             as_found = has_to_be_met(c) or lead.late is not None if elsewhere else not lead.is_other_delay(c)
             if as_found and (probe := lead.probe_of(c)) is not None:
                 met = extra.setdefault(n, [])
-                scanned = far and not elsewhere and has_one_size(c) and not has_to_be_met(c)
-                picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains, scanned=scanned))
+                swept = far and not elsewhere and has_one_size(c) and not has_to_be_met(c)
+                picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains, swept=swept))
                 met.append(probe)
             elif lead.is_other_delay(c) and (start := _as_late(c, lead.late)) is not None:
                 picks.append(Pick(n, *start, score, lead.gains))

@@ -24,7 +24,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.nominal import F, Nominal
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.scores import SEEN, Path, Whitening
-from hvdc_ident.discrepancy.signatures.response import Along
+from hvdc_ident.discrepancy.signatures.response import Along, alone
 from hvdc_ident.executor import Executor, Made, mapped
 from hvdc_ident.immutable import FrozenMap
 
@@ -246,7 +246,7 @@ def reach(nominal: Nominal, paths: Mapping[str, Path], slots: Sequence[str], exe
         return None
 
     def job(place: str) -> _SlotJob:
-        return _SlotJob(nominal, {n: p.only(place) for n, p in inner.items()}, place)
+        return _SlotJob(nominal, alone(inner, place), place)
 
     found = np.array(list(mapped(executor, _at_slot, Made(job, slots))))
     brings, count = found[:, 0] - found[:, 1], found[:, 1]

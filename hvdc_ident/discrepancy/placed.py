@@ -67,30 +67,28 @@ def added(
     names = dict(zip(present, new, strict=True))
     bounds = {n: b for n, b in chosen.free.items() if n in names}
     free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-    restless = effects()[candidate.effect].self_exciting or rests_anywhere(larger, model, [use])
     more = replace(
         problem,
         simulator=ModelSimulator(larger, PATIENCE),
         free=(*problem.free, *free),
-        free_initial_states=problem.free_initial_states or restless,
+        free_initial_states=problem.free_initial_states or begins_anywhere(larger, model, [use]),
     )
     placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
     return larger, more, placed, np.array([f.start for f in free])
 
 
-def rests_anywhere(model: AnyModel, without: AnyModel, uses: Sequence[EffectUse]) -> bool:
-    """Return True where effects leave open at which of many steady states the model rests, as without them it does not.
+def begins_anywhere(model: AnyModel, without: AnyModel, uses: Sequence[EffectUse]) -> bool:
+    """Return True where a record of the model with these effects need not begin at the steady state that the solver finds.
 
-    A dead band before an integrator holds it at any level, and a record begins at the one that was left by what came before.
+    An effect moves the model by itself, or effects leave open at which of many steady states it rests, as without them it does
+    not: a dead band before an integrator holds it at any level, which is the one that was left by what came before.
     """
-    if (
-        not any(effects()[u.effect].holds for u in uses)
-        or not isinstance(model, Model)
-        or not isinstance(without, Model)
-    ):
+    entries = [effects()[u.effect] for u in uses]
+    if any(e.self_exciting for e in entries):
+        return True
+    if not (any(e.holds for e in entries) and isinstance(model, Model) and isinstance(without, Model)):
         return False
-    one, other = (_determinant(m) for m in (model, without))
-    return one == 0.0 and other not in (None, 0.0)
+    return _determinant(model) == 0.0 and _determinant(without) not in (None, 0.0)
 
 
 def _determinant(model: Model) -> float | None:

@@ -25,7 +25,7 @@ from hvdc_ident.discrepancy.scores import Scores, runs, scored
 from hvdc_ident.discrepancy.signatures.block import block, parameter
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
-from hvdc_ident.discrepancy.signatures.response import Along
+from hvdc_ident.discrepancy.signatures.response import Along, alone
 from hvdc_ident.discrepancy.size_profile import Dense, every_size, has_to_be_met, sized, widened
 from hvdc_ident.effects import SignalScales
 from hvdc_ident.errors import SimulationError
@@ -150,8 +150,8 @@ def by_latent(
     def job(at: tuple[View, str]) -> _PlaceJob:
         """With other gains than those that fit, the model's own signal is the one that is known to be wrong."""
         view, place = at
-        alone = View(view.nominal, {n: a.only(place) for n, a in view.paths.items()})
-        return _PlaceJob(alone, tuple(places[place]), left[id(view)], own=view is seen[0])
+        there = View(view.nominal, alone(view.paths, place))
+        return _PlaceJob(there, tuple(places[place]), left[id(view)], own=view is seen[0])
 
     jobs = Made(job, [(v, p) for v in seen for p in places])
     # A fall is one from what the model leaves: with other gains than those that fit, more is left to begin with.

@@ -12,8 +12,8 @@ from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out, orthonormal
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.record_noise import OutputNoise
-from hvdc_ident.discrepancy.size_line import SizeLine
-from hvdc_ident.effects import distance_from_neutral, effects
+from hvdc_ident.discrepancy.size_line import BENT, SizeLine
+from hvdc_ident.effects import SMALLEST, distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
@@ -30,10 +30,6 @@ GLANCE = 3
 """Evaluations of each of several starts, of which the best goes on: its start, and the first two steps."""
 SCANNED = 15
 """Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
-SIZES = 30
-"""Sizes that are looked at, evenly in the logarithm, where a start may be far from the size: a level is met to a few percent."""
-LEAST = 1e-3
-"""Of the largest: where they begin for a size that may be 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +37,7 @@ class RefitJob:
     """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start).
 
     evaluations: of each start at most. spare: starts that are tried, one after the other, where none of the others runs.
-    scanned: the size of which many are looked at beside each start, empty where it begins as given: each start has then one more,
+    swept: the size of which many are looked at beside each start, empty where it begins as given: each start has then one more,
     at the size that leaves least.
     """
 
@@ -52,7 +48,7 @@ class RefitJob:
     noise: FrozenMap[OutputNoise]
     evaluations: int = METHOD.max_evaluations
     spare: tuple[Array, ...] = ()
-    scanned: str = ""
+    swept: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +166,7 @@ def run(job: RefitJob) -> Refit:
 
 def _best_walk(job: RefitJob, most: int) -> OptimiserResult:
     """The end of a walk of so many evaluations from the start whose first steps come lowest; a failed one where none runs."""
-    starts = _apart([*job.begins, *(_scanned(job, b) for b in job.begins if job.scanned)])
+    starts = _apart([*job.begins, *(_swept(job, b) for b in job.begins if job.swept)])
     glance = most if len(starts) == 1 else min(GLANCE, most)
     walks = [_walk(job.problem, begin, glance) for begin in starts]
     best = min(walks, key=_cost)
@@ -184,15 +180,15 @@ def _best_walk(job: RefitJob, most: int) -> OptimiserResult:
     return further if _cost(further) <= _cost(best) else best
 
 
-def _scanned(job: RefitJob, begin: Array) -> Array:
+def _swept(job: RefitJob, begin: Array) -> Array:
     """The start with the size that leaves least, the others' answer to first order; as it is where the model does not run there."""
-    at = job.problem.names.index(job.scanned)
+    at = job.problem.names.index(job.swept)
     unknown = job.problem.unknowns[at]
     try:
         line = SizeLine.of(job.model, job.problem, begin, at)
     except SimulationError:
         return begin
-    sizes = np.geomspace(max(unknown.min, LEAST * unknown.max), unknown.max, SIZES)
+    sizes = np.geomspace(max(unknown.min, SMALLEST * unknown.max), unknown.max, BENT)
     best = begin.copy()
     best[at] = sizes[np.argmin([line.fitted(s) for s in sizes])]
     return best

@@ -9,11 +9,11 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import Pick
-from hvdc_ident.discrepancy.placed import PATIENCE, Placed, added, moved, rests_anywhere
+from hvdc_ident.discrepancy.placed import PATIENCE, Placed, added, begins_anywhere, moved
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
-from hvdc_ident.effects import apply_effects, effects
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
@@ -53,8 +53,8 @@ def job(
     if (given := as_given(before)) is not None:
         begins.append(_begin(before, given, asked))
     spare = [] if exact or len(picks) > 1 else [_begin(before, before.theta, s) for s in _sizes(only, placed[-1])]
-    scanned = "" if not picks[0].scanned else placed[-1].names[next(iter(placed[-1].bounds))]
-    return RefitJob(model, tuple(placed), problem, tuple(begins), before.noise, spare=tuple(spare), scanned=scanned)
+    swept = placed[-1].names[next(iter(placed[-1].bounds))] if picks[0].swept else ""
+    return RefitJob(model, tuple(placed), problem, tuple(begins), before.noise, spare=tuple(spare), swept=swept)
 
 
 def _sizes(candidate: CandidateEffect, placed: Placed) -> list[Array]:
@@ -104,14 +104,12 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         free += [FitParameter(names[n], values[n], *p.bounds[n]) for n in p.bounds]
         moved = replace(p.candidate, at=use.at, source=use.source)
         again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
-    uses = [p.use for p in placed]
-    restless = any(effects()[u.effect].self_exciting for u in uses) or rests_anywhere(model, first.model, uses)
     problem = replace(
         here.problem,
         simulator=ModelSimulator(model, PATIENCE),
         free=tuple(free),
         held=first.problem.held,
-        free_initial_states=restless,
+        free_initial_states=begins_anywhere(model, first.model, [p.use for p in placed]),
     )
     nuisance = here.theta[len(here.problem.free) :]
     gains = [at.get(f.name, f.start) for f in first.problem.free]

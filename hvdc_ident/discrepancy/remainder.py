@@ -28,7 +28,7 @@ from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
 from hvdc_ident.discrepancy.refitted import left_by
 from hvdc_ident.discrepancy.scores import runs
-from hvdc_ident.discrepancy.signatures.response import Along
+from hvdc_ident.discrepancy.signatures.response import Along, alone
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Made, mapped
 from hvdc_ident.immutable import FrozenMap
@@ -161,7 +161,7 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     search.tell(0, 1, "anything else that is missing")
 
     def job(place: str, noise: NDArray[np.float32] | None = None) -> _LatentJob:
-        return _LatentJob(nominal, {n: p.only(place) for n, p in inner.items()}, place, noise)
+        return _LatentJob(nominal, alone(inner, place), place, noise)
 
     falls = list(mapped(search.executor, _fall, Made(job, places)))
     best = sorted(range(len(places)), key=lambda k: -falls[k])[:SHORTLIST]

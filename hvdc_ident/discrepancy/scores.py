@@ -143,7 +143,7 @@ def scored(
     """The scores of all candidates at the nominal model's optimum."""
     columns = columns_of(found)
     plan = tasks(found, columns, _largest(paths))
-    noise = nominal.projected(nominal.drawn(bootstraps, seed)) if bootstraps else nominal.drawn(1, seed)[:, :0]
+    noise = nominal.projected(nominal.drawn(bootstraps, seed))
     residual = nominal.projected(nominal.residual[:, None])
     restless = np.array([effects()[found[c.candidate].effect].self_exciting for c in columns], dtype=bool)
     starts = nominal.starts if restless.any() else np.zeros((residual.shape[0], 0))

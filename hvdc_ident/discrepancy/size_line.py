@@ -1,4 +1,4 @@
-"""What a model leaves at many sizes of one effect, where the other unknowns answer to first order."""
+"""Chi2 at many sizes of one effect, with the other unknowns' answer to first order."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from hvdc_ident.fit import Problem
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator, Tolerance
 
+BENT = 30
+"""Sizes of an effect that need not be met to the last digit, evenly in the logarithm: a refit goes the rest of the way."""
 PATIENT = Tolerance(rtol=1e-5, atol=1e-8, max_steps=5000)
 """Of runs at many sizes: one that takes more steps, chattering in a loop, is passed over."""
 

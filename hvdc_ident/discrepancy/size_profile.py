@@ -22,7 +22,7 @@ from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, RefitResult, found_by, judged, run, signal
 from hvdc_ident.discrepancy.refit_jobs import as_given
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.size_line import PATIENT, SizeLine
+from hvdc_ident.discrepancy.size_line import BENT, PATIENT, SizeLine
 from hvdc_ident.effects import Probe, SignalScales, effects, size_grid
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import mapped
@@ -30,8 +30,6 @@ from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
-BENT = 30
-"""Sizes of an effect that need not be met to the last digit: a refit goes the rest of the way."""
 WIDE = 20.0
 """Below the least and above the largest probe of such an effect: how far its sizes reach."""
 BETWEEN = 7

@@ -3,6 +3,7 @@
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.effects.placement import EffectUse, apply_effects, effects, joined_sources, split_sources
 from hvdc_ident.effects.probing import (
+    SMALLEST,
     Probe,
     SignalScales,
     admissible_sources,
@@ -14,6 +15,7 @@ from hvdc_ident.effects.probing import (
 )
 
 __all__ = [
+    "SMALLEST",
     "Additions",
     "Effect",
     "EffectParameter",

@@ -20,7 +20,7 @@ def test_a_level_that_the_signal_never_reaches_is_left_only_by_a_look_at_many() 
     first = plain(experiments(meter=lambda torque: np.clip(torque, -LEVEL, LEVEL)))
     job = beside(first, "limit", "outputs.torque", {"level": 3.0}, {"level": BOUNDS})
     name = job.placed[-1].names["level"]
-    stuck, found = run(job), run(replace(job, scanned=name))
+    stuck, found = run(job), run(replace(job, swept=name))
     assert stuck.values[name] == pytest.approx(3.0) and stuck.chi2 == pytest.approx(first.chi2, rel=1e-6)
     assert found.values[name] == pytest.approx(LEVEL, rel=2e-3)
     assert found.values["Kp"] == pytest.approx(TRUE["Kp"], rel=2e-3)

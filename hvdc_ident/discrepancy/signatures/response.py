@@ -119,6 +119,11 @@ def _of(matrix: Array, at: Sequence[int]) -> Array:
     return np.ascontiguousarray(matrix[:, :, at])
 
 
+def alone(paths: Mapping[str, Along], place: str) -> dict[str, Along]:
+    """The runs, by experiment, with one slot alone."""
+    return {name: path.only(place) for name, path in paths.items()}
+
+
 def _observed(model: Model, parts: EquationPartials) -> Model:
     """The model whose outputs are all its variables."""
     return replace(model, outputs=FrozenMap({n: Output(symbol(n)) for n in parts.variables}))
