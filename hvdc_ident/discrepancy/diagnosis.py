@@ -30,7 +30,7 @@ from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
 from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
 from hvdc_ident.discrepancy.signatures.candidates import entries
-from hvdc_ident.discrepancy.verdict import Judgement, findings_of, headline, judge, tests_of
+from hvdc_ident.discrepancy.verdict import Judgement, findings_of, headline, judge, leaves_a_gap, tests_of
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.files import plain
@@ -166,8 +166,10 @@ def _assembled(
     sets = tuple(g for g in judgement.sets if len(g) > 1 or judgement.doubt)
     findings = findings_of(search, outcome, judgement, effects)
     text = headline(judgement, findings)
-    if judgement.verdict == "no-evidence" and (moved := off_given(last, given)) is not None:
-        findings, text = (moved,), moved.text
+    rest = remaining(first, last, tests, search)
+    if judgement.verdict == "no-evidence":
+        moved = off_given(last, given, rest["adequate"], leaves_a_gap(search, last))
+        findings, text = ((moved,), moved.text) if moved is not None else (findings, text)
     if off := clocks(search, last):
         text = f"{text} {told(off)}"
     left, bound = judgement.remainder, outcome.rounds[0].reach
@@ -181,7 +183,7 @@ def _assembled(
         location=localise(model if isinstance(model, Model) else None, first.nominal(), outcome.rounds[0].reach),
         detectable=detectable(outcome, search.options),
         gap=gap(given, first, last),
-        remaining=remaining(first, last, tests, search),
+        remaining=rest,
         parameters_before=FrozenMap({f.name: f.given for f in free}),
         parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.given) for f in free}),
         parameters_after=FrozenMap({f.name: last.values.get(f.name, f.given) for f in free}),

@@ -145,10 +145,11 @@ def at_given(refitted: Refit, given: Mapping[str, float]) -> Refit:
     return replace(refitted, problem=replace(refitted.problem, held=held), theta=refitted.theta_at_given)
 
 
-def off_given(last: Refit, given: Refit) -> Finding | None:
+def off_given(last: Refit, given: Refit, adequate: bool, matters: bool) -> Finding | None:
     """The parameters of a model without effects that explain its gap at the given values; None where it shows none there.
 
-    last: the model, refitted; given: the same at the given values.
+    last: the model, refitted; given: the same at the given values. adequate: whether what `last` leaves looks like noise, which is
+    then the noise, as loud as it is; matters: whether that is clearly louder than was supposed, or beyond the tolerance.
     """
     try:
         before = sum(b.chi2 for b in given.problem.blocks(given.theta, derivatives=False))
@@ -159,8 +160,17 @@ def off_given(last: Refit, given: Refit) -> Finding | None:
     found = moved_parameters(last, [f.name for f in last.problem.free])
     if found is None:
         return None
-    share = 1.0 - max(last.chi2 - last.rows, 0.0) / (before - last.rows)
-    text = f"No effect is missing: {found.text[:-1]}. That explains {percentage(share, 1)} of the gap."
+    noise = max(last.chi2, last.rows) if adequate else last.rows
+    share = 1.0 - max(last.chi2 - noise, 0.0) / (before - noise)
+    explains, louder = f"That explains {percentage(share, 1)} of the gap", f"{np.sqrt(last.chi2 / last.rows):.3g} times"
+    if matters and not adequate:
+        rest = (
+            f"what remains is {louder} the noise and does not look like noise, but no effect that was tried explains it"
+        )
+        text = f"{found.text} {explains}; {rest}."
+    else:
+        text = f"No effect is missing: {found.text} {explains}"
+        text += f"; what remains looks like noise, {louder} as loud as supposed." if matters else "."
     return replace(found, text=text, share=share)
 
 

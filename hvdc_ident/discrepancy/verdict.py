@@ -251,20 +251,23 @@ def noise_left(left: Nominal) -> float:
     return max(total / max(sum(rows.values()), 1), 1.0)
 
 
+def leaves_a_gap(search: SearchContext, last: Refit) -> bool:
+    """Return True where a model leaves more than the tolerance, or where none is stated clearly more than the noise."""
+    share, tolerance = search.options.holdout_share, search.tolerance
+    beyond_tolerance = worst(last), dict.fromkeys(tolerance, 0.0)
+    fitted = float(np.sqrt(last.chi2 / last.rows)) > 1.0 + share
+    return material_gap(unseen(last), 1.0, share, tolerance, beyond_tolerance) or (fitted and not tolerance)
+
+
 def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Judgement:
     found = outcome.rounds[-1]
     options = search.options
     if found.law is not None:
         text = f"Something is missing, and nothing of the catalogue can be named: {found.why}."
         return Judgement("unnameable", text, tests, instead=found.law)
-    was = unseen(last)
-    gap_there = material_gap(
-        was, 1.0, options.holdout_share, search.tolerance, (worst(last), dict.fromkeys(search.tolerance, 0.0))
-    )
     refused = any(b.p <= options.significance and b.excess > STRONG * last.rows for b in tests)
-    fitted = float(np.sqrt(last.chi2 / last.rows)) > 1.0 + options.holdout_share
     strong = found.significant and float(found.scores.t.max(initial=0.0)) > STRONG * last.rows
-    if (gap_there or (fitted and not search.tolerance)) and (strong or refused):
+    if leaves_a_gap(search, last) and (strong or refused):
         why = found.why or "the residuals are not noise"
         return Judgement(
             "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
