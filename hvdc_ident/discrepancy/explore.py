@@ -255,8 +255,10 @@ class _Lead:
     def probe_of(self, other: CandidateEffect) -> Probe | None:
         """The probe of another candidate with the sizes that were found, to the last digit; None where it has sizes of other names.
 
-        A limit and a saturation have a level each.
+        A limit and a saturation have a level each; a letter that two linear effects share, an offset and a loss, is chance.
         """
+        if other.effect != self.candidate.effect and is_linear(kind_of(other, 0)):
+            return None
         own = set(self.candidate.probes[self.probe].free)
         alike = [p for p in other.probes if set(p.free) <= set(self.sizes)]
         if not alike:
@@ -267,11 +269,11 @@ class _Lead:
         return found
 
     def is_in_stead(self, other: CandidateEffect) -> bool:
-        """Return True for another effect at the same place whose size no slope at 0 tells: with the gains that were found it may
-        be the true one."""
-        return (
-            other.at == self.candidate.at and other.effect != self.candidate.effect and not is_linear(kind_of(other, 0))
-        )
+        """Return True for another effect at the same place that may be the true one with the gains that were found: one whose size
+        no slope at 0 tells, or one that brings nothing in, of which a refit from other gains may have come to nothing."""
+        if other.at != self.candidate.at or other.effect == self.candidate.effect:
+            return False
+        return not is_linear(kind_of(other, 0)) or not other.source
 
     def is_other_delay(self, other: CandidateEffect) -> bool:
         """Return True for another kind of delay at the same place."""
@@ -286,28 +288,33 @@ def _neighbours(
     field: Sequence[Pick],
     asked: set[tuple[int, Hashable]],
 ) -> tuple[Round, list[Pick]]:
-    """The round with the sizes that the neighbours of the leaders begin at, and these, those that were asked for left out."""
+    """The round with the sizes that the neighbours of the leaders begin at, and these, those that were asked for left out.
+
+    All that may stand in a leader's stead at its place are refitted, whatever their scores, for they are its rivals; of those at
+    other places as many as are refitted at a time, and the others may be asked for again.
+    """
     found = opened.candidates
     far = all_far(opened.before, trials)
     own: dict[int, list[Pick]] = {}
     for p in field:
         own.setdefault(p.candidate, []).append(p)
     extra: dict[int, list[Probe]] = {}
-    picks: list[Pick] = []
+    rivals: list[Pick] = []
+    elsewhere: list[tuple[Pick, tuple[int, int]]] = []
     for lead in (_Lead.of(opened, t) for t in leaders):
         for n, c in enumerate(found):
-            elsewhere = lead.is_elsewhere(c)
-            if not (elsewhere or lead.is_in_stead(c)) or (lead.number, n) in asked:
+            away = lead.is_elsewhere(c)
+            if not (away or lead.is_in_stead(c)) or (lead.number, n) in asked:
                 continue
             if c.still or not opened.reaches(c) or opened.bound(c) < LEVEL * opened.bound(lead.candidate):
                 continue
-            asked.add((lead.number, n))
+            picks: list[Pick] = []
             score = opened.score_p(n)[0]
             # The sizes that were found, though it was refitted there from others: those may lead astray.
-            as_found = has_to_be_met(c) or lead.late is not None if elsewhere else not lead.is_other_delay(c)
+            as_found = has_to_be_met(c) or lead.late is not None if away else not lead.is_other_delay(c)
             if as_found and (probe := lead.probe_of(c)) is not None:
                 met = extra.setdefault(n, [])
-                swept = far and not elsewhere and has_one_size(c) and not has_to_be_met(c)
+                swept = far and not away and has_one_size(c) and not has_to_be_met(c)
                 picks.append(Pick(n, len(c.probes) + len(met), 1.0, score, lead.gains, swept=swept))
                 met.append(probe)
             elif lead.is_other_delay(c) and (start := _as_late(c, lead.late)) is not None:
@@ -318,9 +325,17 @@ def _neighbours(
                 picks.append(own[n][0] if own[n][0].gains else replace(own[n][0], gains=lead.gains))
             elif score > opened.scores.threshold(0.5):
                 picks.append(Pick(n, opened.scores.columns[opened.score_p(n)[2]].probe, 1.0, score, lead.gains))
-        picks += _other_forms(opened, lead.number, trials, asked)
+            if away:
+                elsewhere += [(p, (lead.number, n)) for p in picks]
+            else:
+                rivals += picks
+                asked.add((lead.number, n))
+        rivals += _other_forms(opened, lead.number, trials, asked)
+    nearest = sorted(elsewhere, key=lambda e: -e[0].score)[:FIELD]
+    asked |= {key for _, key in nearest}
     more = [replace(found[n], probes=tuple(probes)) for n, probes in extra.items()]
-    return replace(opened, candidates=joined(found, more)), sorted(picks, key=lambda p: -p.score)[:FIELD]
+    picked = sorted([*rivals, *(p for p, _ in nearest)], key=lambda p: -p.score)
+    return replace(opened, candidates=joined(found, more)), picked
 
 
 def _gains(opened: Round, refit: Refit) -> tuple[float, ...]:
