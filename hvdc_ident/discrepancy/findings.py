@@ -6,7 +6,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from hvdc_ident.discrepancy.classes import EffectClass, credible
+import numpy as np
+
+from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, credible
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.explain import advice, sentence
 from hvdc_ident.discrepancy.formula import filled
@@ -121,8 +123,11 @@ def _sizes(parameters: Mapping[str, EffectSize]) -> str:
 
 
 def _likely(one: EffectClass) -> list[str]:
-    """The effects of a class that are likely, over all their places, the likeliest first."""
-    return [n for n, _ in credible([*one.equations.items()])]
+    """The effects of a class that the records do not tell from its best, the likeliest first: whether one does the same is for
+    the data alone to say, however many places each was looked for at."""
+    least = min(r.delta_bic for r, _ in one.members)
+    near = {r.same_as or r.effect for r, _ in one.members if np.exp(0.5 * (least - r.delta_bic)) >= 1.0 - CERTAIN}
+    return [n for n in one.equations if n in near]
 
 
 def _names(one: EffectClass, own: str) -> tuple[str, ...]:
