@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy import findings as told_as
 from hvdc_ident.discrepancy.classes import classes
 from hvdc_ident.discrepancy.context import SearchContext
-from hvdc_ident.discrepancy.explain import sentence
+from hvdc_ident.discrepancy.explain import at_given, off_given, sentence
 from hvdc_ident.discrepancy.refit import run
 from hvdc_ident.discrepancy.remainder import remainder_of
 from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
@@ -149,6 +149,37 @@ def test_the_names_of_a_finding_are_those_of_its_likely_effects_its_own_first() 
     (one,) = classes([Rival("offset", ("wm",), 0.0, FrozenMap({"c": 0.1})), gain, limit, deadband])
     assert told_as._names(one, "gain") == ("gain", "offset", "limit")
     assert told_as._others(one, one.members[0][0]) == ", or another effect that does the same in these records (gain)"
+
+
+def test_many_that_do_the_same_do_not_crowd_out_another() -> None:
+    """Looked for at few places or at many, an effect as likely by the data is among the names; one the data refute is not."""
+    lags = [Rival("lag", (f"s{k}",), 0.0, FrozenMap({"T": 0.02}), prior=0.1) for k in range(8)]
+    mean = Rival("window-mean", ("s0",), 1.0, FrozenMap({"T": 0.04}), prior=0.01)
+    delay = Rival("delay", ("s0",), 9.0, FrozenMap({"T": 0.02}), prior=0.1)
+    (one,) = classes([*lags, mean, delay])
+    assert told_as._names(one, "lag") == ("lag", "window-mean")
+
+
+@pytest.mark.parametrize(
+    ("adequate", "matters", "told", "share"),
+    [
+        (True, False, "No effect is missing: Kp is ", 1.0),
+        (True, True, "looks like noise, 1.5 times as loud as supposed.", 1.0),
+        (False, True, "what remains is 1.5 times the noise and does not look like noise", None),
+    ],
+)
+def test_no_effect_is_missing_only_where_nothing_else_is_left(
+    adequate: bool, matters: bool, told: str, share: float | None
+) -> None:
+    right = plain(experiments())
+    last = replace(right, chi2=(1.5**2 if matters else 0.9) * right.rows)
+    found = off_given(last, at_given(last, GIVEN), adequate, matters)
+    assert (
+        found is not None and told in found.text and ("No effect is missing" in found.text) == (adequate or not matters)
+    )
+    before = sum(b.chi2 for b in right.problem.blocks(last.theta_at_given, derivatives=False))
+    expected = 1.0 - (last.chi2 - last.rows) / (before - last.rows) if share is None else share
+    assert found.share == pytest.approx(expected)
 
 
 def test_a_size_that_later_effects_moved_is_told_with_its_interval_there() -> None:
