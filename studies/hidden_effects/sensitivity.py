@@ -38,6 +38,8 @@ CASES = ((100, "single-000"), (100, "single-007"), (100, "clean-001"))
 """Seed and name: a backlash in slow noise whose size is not stated, a gain, and nothing in such noise."""
 OUTSIDE = ((94, "outside-000"),)
 """A cube, for the numbers that only what is outside the catalogue meets."""
+MET = ((103, "single-080"), (103, "single-3014"))
+"""A sampler and a quantiser, for the numbers of the search for sizes that have to be met."""
 FACTORS = (0.5, 2.0)
 
 
@@ -57,7 +59,8 @@ class Number:
     @property
     def cases(self) -> tuple[tuple[int, str], ...]:
         """Seed and name of the cases that it is tried on."""
-        return OUTSIDE if ".outside." in self.module else CASES
+        special = {"outside": OUTSIDE, "size_profile": MET}
+        return next((c for part, c in special.items() if part in self.module.split(".")), CASES)
 
     def times(self, factor: float) -> float:
         """Return the value times a factor; of a share of at least a half its distance from 1 is multiplied, a count is rounded."""
@@ -150,7 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         jobs = [(None, 1.0), *((n, f) for n in numbers() for f in FACTORS if not asked.only or n.label in asked.only)]
         with path.open("a", encoding="utf-8") as file:
             for k, (number, factor) in enumerate(jobs):
-                for seed, name in (*CASES, *OUTSIDE) if number is None else number.cases:
+                for seed, name in (*CASES, *OUTSIDE, *MET) if number is None else number.cases:
                     key = ("" if number is None else number.label, factor, f"{seed} {name}")
                     if key in there:
                         continue
