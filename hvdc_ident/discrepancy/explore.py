@@ -64,18 +64,19 @@ def explored(
     field = sorted((p for p in [*by_score(opened), *more] if max(p.score, p.fall) > chance), key=lambda p: -p.fall)
     taken = _entrants(opened, field)
     trials = refitted(search, opened, taken, f"round {number}")
-    opened, trials = _with_neighbours(search, opened, trials, field, number)
+    asked: set[Hashable] = set()
+    opened, trials = _with_neighbours(search, opened, trials, field, number, asked)
     if not (_noise(search, trials) or search.spent):
         given = _entrants(scored, by_score_elsewhere(search, scored, views))
         if given:
             trials = [*trials, *refitted(search, opened, given, f"round {number}: from the given values", trials)]
-            opened, trials = _with_neighbours(search, opened, trials, [*field, *given], number)
-    opened, trials = _with_sizes_to_be_met(search, opened, trials, field, views, number)
+            opened, trials = _with_neighbours(search, opened, trials, [*field, *given], number, asked)
+    opened, trials = _with_sizes_to_be_met(search, opened, trials, field, views, number, asked)
     if number == 1 and _tells(opened, trials):
         if search.options.fallback and not (_noise(search, trials) or search.spent):
             opened = _outside(search, opened, nominal, trials)
             opened, trials = _in_its_stead(search, opened, trials, field)
-        opened, trials = _with_the_others(search, opened, trials, field, taken)
+        opened, trials = _with_the_others(search, opened, trials, field, taken, asked)
     return opened, tuple(trials)
 
 
@@ -86,6 +87,7 @@ def _with_sizes_to_be_met(
     field: Sequence[Pick],
     views: Callable[[], Sequence[View]],
     number: int,
+    asked: set[Hashable],
 ) -> tuple[Round, list[CandidateFit]]:
     """The trials with sizes that have to be met: where nothing explains the records, and where what does is a kind of delay."""
     far = all_far(opened.before, trials, near=TOLERANCE)
@@ -97,11 +99,16 @@ def _with_sizes_to_be_met(
         return opened, trials
     met = refitted(search, opened, _entrants(opened, more), f"round {number}: sizes to be met", trials)
     trials = once_more(search, opened, best_each([*trials, *met]), f"round {number}: sizes to be met")
-    return _with_neighbours(search, opened, trials, [*field, *more], number)
+    return _with_neighbours(search, opened, trials, [*field, *more], number, asked)
 
 
 def _with_the_others(
-    search: SearchContext, opened: Round, trials: list[CandidateFit], field: Sequence[Pick], taken: Sequence[Pick]
+    search: SearchContext,
+    opened: Round,
+    trials: list[CandidateFit],
+    field: Sequence[Pick],
+    taken: Sequence[Pick],
+    asked: set[Hashable],
 ) -> tuple[Round, list[CandidateFit]]:
     """The trials with proposals that promise less, so many at a time while nothing explains the gap.
 
@@ -117,7 +124,7 @@ def _with_the_others(
         batches -= 1
         done |= {id(p) for p in taken}
         trials = best_each([*trials, *refitted(search, opened, taken, "round 1: the others", trials)])
-        opened, trials = _with_neighbours(search, opened, trials, field, 1)
+        opened, trials = _with_neighbours(search, opened, trials, field, 1, asked)
     return opened, trials
 
 
@@ -192,18 +199,26 @@ def _entrants(opened: Round, field: Sequence[Pick]) -> list[Pick]:
 
 
 def _with_neighbours(
-    search: SearchContext, opened: Round, trials: Sequence[CandidateFit], field: Sequence[Pick], number: int
+    search: SearchContext,
+    opened: Round,
+    trials: Sequence[CandidateFit],
+    field: Sequence[Pick],
+    number: int,
+    asked: set[Hashable],
 ) -> tuple[Round, list[CandidateFit]]:
-    """The trials with the neighbours of the best, again while one of these is better."""
+    """The trials with the neighbours of the best, again while one of these is better.
+
+    asked: what the round has refitted as neighbours before, and from which gains; those asked for now are added.
+    """
     trials = best_each(trials)
     if search.spent:
         return opened, trials
-    asked: set[tuple[int, Hashable]] = set()
+    turned: set[tuple[int, int]] = set()
     for _ in range(TURNS):
         leaders = _leaders(opened, trials)
         if not leaders:
             break
-        opened, picks = _neighbours(opened, leaders, trials, field, asked)
+        opened, picks = _neighbours(opened, leaders, trials, field, turned, asked)
         if not picks:
             break
         before = by_cost(trials)[0]
@@ -225,6 +240,10 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
         if opened.before.chi2 - t.refit.chi2 >= least:
             each.setdefault(opened.candidates[t.pick.candidate].effect, t)
     return list(each.values())[:BEAM]
+
+
+_Asked = tuple[int, int, tuple[float, ...], int]
+"""A leader, a neighbour of it, the leader's gains, and how many sizes were proposed for the neighbour."""
 
 
 @dataclass(frozen=True)
@@ -286,10 +305,12 @@ def _neighbours(
     leaders: Sequence[CandidateFit],
     trials: Sequence[CandidateFit],
     field: Sequence[Pick],
-    asked: set[tuple[int, Hashable]],
+    turned: set[tuple[int, int]],
+    asked: set[Hashable],
 ) -> tuple[Round, list[Pick]]:
-    """The round with the sizes that the neighbours of the leaders begin at, and these, those that were asked for left out.
+    """The round with the sizes that the neighbours of the leaders begin at, and these.
 
+    Left out are those that were asked for beside the same leader in these turns (`turned`), or from the same gains in this round.
     All that may stand in a leader's stead at its place are refitted, whatever their scores, for they are its rivals; of those at
     other places as many as are refitted at a time, and the others may be asked for again.
     """
@@ -300,11 +321,15 @@ def _neighbours(
         own.setdefault(p.candidate, []).append(p)
     extra: dict[int, list[Probe]] = {}
     rivals: list[Pick] = []
-    elsewhere: list[tuple[Pick, tuple[int, int]]] = []
+    elsewhere: list[tuple[Pick, _Asked]] = []
+    taken: set[_Asked] = set()
     for lead in (_Lead.of(opened, t) for t in leaders):
         for n, c in enumerate(found):
             away = lead.is_elsewhere(c)
-            if not (away or lead.is_in_stead(c)) or (lead.number, n) in asked:
+            if not (away or lead.is_in_stead(c)) or (lead.number, n) in turned:
+                continue
+            again = lead.number, n, lead.gains, len(own.get(n, ()))
+            if again in asked:
                 continue
             if c.still or not opened.reaches(c) or opened.bound(c) < LEVEL * opened.bound(lead.candidate):
                 continue
@@ -326,13 +351,15 @@ def _neighbours(
             elif score > opened.scores.threshold(0.5):
                 picks.append(Pick(n, opened.scores.columns[opened.score_p(n)[2]].probe, 1.0, score, lead.gains))
             if away:
-                elsewhere += [(p, (lead.number, n)) for p in picks]
+                elsewhere += [(p, again) for p in picks]
             else:
                 rivals += picks
-                asked.add((lead.number, n))
+                taken.add(again)
         rivals += _other_forms(opened, lead.number, trials, asked)
     nearest = sorted(elsewhere, key=lambda e: -e[0].score)[:FIELD]
-    asked |= {key for _, key in nearest}
+    taken |= {again for _, again in nearest}
+    turned |= {again[:2] for again in taken}
+    asked |= taken
     more = [replace(found[n], probes=tuple(probes)) for n, probes in extra.items()]
     picked = sorted([*rivals, *(p for p, _ in nearest)], key=lambda p: -p.score)
     return replace(opened, candidates=joined(found, more)), picked
@@ -354,9 +381,7 @@ def _as_late(candidate: CandidateEffect, late: float | None) -> tuple[int, float
     return None if near is None else (near, late / delays[near])
 
 
-def _other_forms(
-    opened: Round, number: int, trials: Sequence[CandidateFit], asked: set[tuple[int, Hashable]]
-) -> list[Pick]:
+def _other_forms(opened: Round, number: int, trials: Sequence[CandidateFit], asked: set[Hashable]) -> list[Pick]:
     """Return picks of this effect at this place with other optional parts, each at its best score."""
     c = opened.candidates[number]
     done = {frozenset(c.probes[t.pick.probe].free) for t in trials if t.pick.candidate == number}

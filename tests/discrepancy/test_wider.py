@@ -182,7 +182,7 @@ def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
     names = {c.effect: k for k, c in enumerate(opened.candidates)}
     late = run(beside(first, "delay", "ref", {"T": WINDOW / 2}, {"T": (1e-3, 0.3)}))
     trial = CandidateFit(Pick(names["delay"], 0, 1.0, 0.0), late, 0.0)
-    opened, picks = _neighbours(opened, [trial], [trial], [], set())
+    opened, picks = _neighbours(opened, [trial], [trial], [], set(), set())
     begun = refitted(search, opened, picks, "neighbours")
     assert {opened.candidates[t.pick.candidate].effect for t in begun} == {"window-mean", "lag"}
     best = min(begun, key=lambda t: t.refit.chi2)
@@ -203,7 +203,7 @@ def test_the_same_effect_elsewhere_is_refitted_where_the_best_is_on_a_bound() ->
     places = {(c.at, c.source): k for k, c in enumerate(opened.candidates)}
     seen, told = places[("wm",), "w"], places[("err",), "ref"]
     trials = refitted(search, opened, [Pick(seen, 0, 1.0, 1.0)], "the feedback")
-    opened, picks = _neighbours(opened, trials, trials, [], set())
+    opened, picks = _neighbours(opened, trials, trials, [], set(), set())
     assert told in {p.candidate for p in picks}
     (more,) = refitted(search, opened, [p for p in picks if p.candidate == told][:1], "the set-point")
     assert more.refit.chi2 < 1.2 * more.refit.rows < trials[0].refit.chi2
@@ -236,7 +236,7 @@ def test_a_size_that_was_met_is_carried_to_the_other_places() -> None:
     near = run(beginning(first, "sample-hold", "err", {"Ts": period, "compute": 0.0}))
     near = replace(near, theta=np.array([TRUE["Kp"], TRUE["Ki"], period]))
     lead = CandidateFit(Pick(at[("err",)], 0, 1.0, 0.0), near, 0.0)
-    opened, picks = _neighbours(opened, [lead], [lead], [], set())
+    opened, picks = _neighbours(opened, [lead], [lead], [], set(), set())
     moved = refitted(search, opened, picks, "neighbours")
     best = {opened.candidates[t.pick.candidate].at: t.refit for t in best_each(moved)}
     assert set(best) == {("wm",), ("ref",)}
