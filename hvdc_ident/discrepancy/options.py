@@ -14,6 +14,8 @@ REFUTED = 0.1
 """Share of the squared gap that, left over and no noise, refutes the form of an effect: the form misses a third of the amplitude."""
 SHORTLIST = 6
 """The best by a cheap measure (a score, a regression) that are tried in full: formulas, filters, places, earlier rivals."""
+FIELD = 40
+"""Proposals refitted at a time."""
 BEAM = 2
 """Hypotheses that are followed side by side."""
 

@@ -10,9 +10,10 @@ import numpy as np
 
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, behinds, best_of, evidence_between, objections
-from hvdc_ident.discrepancy.explore import FIELD, explored
+from hvdc_ident.discrepancy.explore import explored
 from hvdc_ident.discrepancy.latent import reach
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import FIELD
 from hvdc_ident.discrepancy.proposals import by_latent, views_of
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.refitted import all_far, excess, like_noise, once_more, refitted

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident import InputSignal
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, explore
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, explore, neighbours
 from hvdc_ident.discrepancy.signatures.candidates import entries
 
 WN, ZETA = 60.0, 0.6
@@ -62,7 +62,8 @@ def test_what_may_stand_at_the_place_of_the_best_is_refitted_however_few_are(
     monkeypatch: pytest.MonkeyPatch, few: int
 ) -> None:
     """Scores of the loop's few sizes are low here; those of a second order elsewhere are higher, and would leave it no turn."""
-    monkeypatch.setattr(explore, "FIELD", few)
+    for stage in (explore, neighbours):
+        monkeypatch.setattr(stage, "FIELD", few)
     found = diagnose(model(), records(looped), FREE, options=DiagnosisOptions(bootstraps=100))
     assert found.verdict == "named" and [e.effect for e in found.effects] == ["inner-loop"]
     assert found.effects[0].at in (("torque",), ("err",))

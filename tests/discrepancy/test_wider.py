@@ -18,7 +18,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.context import Course, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, clear
-from hvdc_ident.discrepancy.explore import _neighbours
+from hvdc_ident.discrepancy.neighbours import _neighbours
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
 from hvdc_ident.discrepancy.refit_jobs import as_given, job
 from hvdc_ident.discrepancy.refitted import best_each, once_more, refitted
