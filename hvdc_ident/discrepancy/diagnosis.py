@@ -16,6 +16,7 @@ from hvdc_ident.discrepancy.candidate_table import detectable, lines
 from hvdc_ident.discrepancy.classes import compared
 from hvdc_ident.discrepancy.clocks import clocks, told
 from hvdc_ident.discrepancy.context import Course, SearchContext
+from hvdc_ident.discrepancy.evidence import louder_than_noise
 from hvdc_ident.discrepancy.explain import at_given, found_of, gap, off_given
 from hvdc_ident.discrepancy.findings import separating
 from hvdc_ident.discrepancy.latent import Reach
@@ -228,6 +229,6 @@ def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: Sear
         "explained_share": float(np.clip(1.0 - left / excess, 0.0, 1.0)) if excess > 0 else None,
         "band_hz": place["band_hz"],
         "block": next(iter(place["outputs"]), None),
-        "material": left / max(last.rows, 1) > (1.0 + search.options.holdout_share) ** 2 - 1.0,
+        "material": louder_than_noise(last, search.options.holdout_share),
         "tests": [{"bins": b.name, "statistic": b.statistic, "expected": b.expected, "p": b.p} for b in tests],
     }

@@ -153,6 +153,11 @@ def material_gap(
     return before is not None and after is not None and before - after > share
 
 
+def louder_than_noise(refit: Refit, share: float) -> bool:
+    """Return True where the fitted residual is larger than the noise by more than a share of it, in amplitude."""
+    return refit.chi2 > (1.0 + share) ** 2 * refit.rows
+
+
 STEP = 0.05
 """Share of the gap that a second effect has to take away at least."""
 

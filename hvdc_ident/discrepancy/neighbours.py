@@ -141,8 +141,9 @@ def _neighbours(
     """The round with the sizes that the neighbours of the leaders begin at, and these.
 
     Left out are those that were asked for beside the same leader in these turns (`turned`), or from the same gains in this round.
-    All that may stand in a leader's stead at its place are refitted, whatever their scores, for they are its rivals; of those at
-    other places as many as are refitted at a time, and the others may be asked for again.
+    All that may stand in a leader's stead at its place, and have a size to begin at, are refitted however many score higher
+    elsewhere, for they are its rivals; of those at other places as many as are refitted at a time, and the others may be asked for
+    again.
     """
     found = opened.candidates
     far = all_far(opened.before, trials)

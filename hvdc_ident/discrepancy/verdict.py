@@ -13,7 +13,7 @@ from hvdc_ident.data import Array, event_time
 from hvdc_ident.discrepancy.alternatives import beyond
 from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, formula_rivals, likely, rivals
 from hvdc_ident.discrepancy.context import SearchContext
-from hvdc_ident.discrepancy.evidence import material_gap, worst
+from hvdc_ident.discrepancy.evidence import louder_than_noise, material_gap, worst
 from hvdc_ident.discrepancy.explain import moved_parameters
 from hvdc_ident.discrepancy.findings import finding
 from hvdc_ident.discrepancy.formula import Law
@@ -255,8 +255,9 @@ def leaves_a_gap(search: SearchContext, last: Refit) -> bool:
     """Return True where a model leaves more than the tolerance, or where none is stated clearly more than the noise."""
     share, tolerance = search.options.holdout_share, search.tolerance
     beyond_tolerance = worst(last), dict.fromkeys(tolerance, 0.0)
-    fitted = float(np.sqrt(last.chi2 / last.rows)) > 1.0 + share
-    return material_gap(unseen(last), 1.0, share, tolerance, beyond_tolerance) or (fitted and not tolerance)
+    if not tolerance and louder_than_noise(last, share):
+        return True
+    return material_gap(unseen(last), 1.0, share, tolerance, beyond_tolerance)
 
 
 def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Judgement:
@@ -267,7 +268,7 @@ def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: 
         return Judgement("unnameable", text, tests, instead=found.law)
     refused = any(b.p <= options.significance and b.excess > STRONG * last.rows for b in tests)
     strong = found.significant and float(found.scores.t.max(initial=0.0)) > STRONG * last.rows
-    if leaves_a_gap(search, last) and (strong or refused):
+    if (strong or refused) and leaves_a_gap(search, last):
         why = found.why or "the residuals are not noise"
         return Judgement(
             "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
