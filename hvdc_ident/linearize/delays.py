@@ -109,10 +109,21 @@ def response_slopes(kind: str, time: float, compute: float, s: Array) -> tuple[A
     value = response(kind, time, compute, s)
     if kind == "delay":
         return -s * value, np.zeros_like(value)
-    x = s * time
+    return np.asarray(s * _hold_slope(s * time) * np.exp(-s * compute)), np.asarray(-s * value)
+
+
+def response_by_s(kind: str, time: float, compute: float, s: Array) -> Array:
+    """Return the derivative of `response` by s."""
+    value = response(kind, time, compute, s)
+    if kind == "delay":
+        return -time * value
+    return np.asarray(time * _hold_slope(s * time) * np.exp(-s * compute) - compute * value)
+
+
+def _hold_slope(x: Array) -> Array:
+    """Return the derivative of (1 - exp(-x))/x."""
     small = np.abs(x) < 1e-4
-    inner = np.where(small, -0.5 + x / 3, (np.exp(-x) * (1.0 + x) - 1.0) / np.where(small, 1.0, x * x))
-    return np.asarray(s * inner * np.exp(-s * compute)), np.asarray(-s * value)
+    return np.asarray(np.where(small, -0.5 + x / 3, (np.exp(-x) * (1.0 + x) - 1.0) / np.where(small, 1.0, x * x)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +191,8 @@ class DelayFree:
         rows, columns = _order(size, inputs)
         n_r, n_c = size.nx + size.no + size.ne, size.nx + len(inputs) + size.ne
         reduced = eliminate(jac[np.ix_(rows, columns)], n_r, n_c)
+        if not np.isfinite(reduced.condition):
+            raise LinearizationError("the algebraic part is singular", got="no solution for its unknowns")
         return cls(reduced.result, size.nx, size.no, len(inputs), found)
 
     @staticmethod

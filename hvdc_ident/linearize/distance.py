@@ -22,6 +22,7 @@ from hvdc_ident.linearize.reduction import (
     visible,
     without_sliding_means,
 )
+from hvdc_ident.linearize.stability import Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array
 
 Complex = NDArray[np.complex128]
@@ -264,12 +265,15 @@ def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Pea
             got=f"{len(controller.input_names)} inputs and {len(controller.output_names)} outputs",
         )
     closed = _four_blocks(plant, controller)
-    poles = closed.poles()
-    if (poles.real >= 0).any():
-        return Peak(0.0, float(abs(poles[np.argmax(poles.real)].imag)))
     if plant.delay_free is None and controller.delay_free is None:
+        poles = closed.poles()
+        if (poles.real >= 0).any():
+            return Peak(0.0, float(abs(poles[np.argmax(poles.real)].imag)))
         peak = linf_norm(closed)
     else:
+        found = _closed_with_delays(plant, controller)
+        if found.verdict != "stable":
+            return Peak(0.0, float("nan") if found.rightmost is None else abs(found.rightmost.imag))
         peak = _exact_peak(plant, controller)
     return Peak(1.0 / peak.value, peak.omega)
 
@@ -297,6 +301,29 @@ def _four_blocks(plant: LinearModel, controller: LinearModel) -> LinearModel:
         output_names=tuple(f"z{k + 1}" for k in range(p + m)), output_units=(), y0=(0.0,) * (p + m),
         point=None, name=f"loop of {plant.name} and {controller.name}",
     )  # fmt: skip
+
+
+def _closed_with_delays(plant: LinearModel, controller: LinearModel) -> Stability:
+    """Return whether plant and controller are stable together, delays exact. Raises LinearizationError where it cannot be told."""
+    both = _equation(plant).beside(_equation(controller))
+    p, m = len(plant.output_names), len(plant.input_names)
+    # The plant's inputs are the controller's outputs with a negative sign, and the controller's inputs the plant's outputs.
+    feedback = np.block([[np.zeros((m, p)), -np.eye(m)], [np.eye(p), np.zeros((p, m))]])
+    found = stability(both.fed_back(feedback))
+    if found.verdict == "not decided":
+        raise LinearizationError(
+            "whether the loop is stable cannot be told",
+            where=f"'{plant.name}' with '{controller.name}'",
+            got=found.reason,
+        )
+    return found
+
+
+def _equation(model: LinearModel) -> Characteristic:
+    if model.delay_free is not None:
+        return Characteristic.of(model.delay_free).visible()
+    a, b, c, d = visible(model)
+    return Characteristic(a, a.shape[0], (), b, c, d)
 
 
 def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:

@@ -136,12 +136,15 @@ def transfer(model: LinearModel, s: Array) -> Array:
 
 def default_omega(model: LinearModel, points: int = 400) -> Array:
     """Return (n,) rad/s: logarithmic from a decade below the slowest to a decade above the fastest pole and zero."""
-    sizes = np.abs(model.poles())
+    from hvdc_ident.linearize.modal import approximate_poles
+
+    own = approximate_poles(model)
+    sizes = np.abs(own)
     fastest = sizes.max(initial=1.0)
     sizes = sizes[(sizes > 1e-6 * max(fastest, 1e-12)) & (sizes > 1e-6)]
     low, high = (sizes.min(), sizes.max()) if sizes.size else (1.0, 1.0)
     grid = np.logspace(np.log10(low) - 1.5, np.log10(high) + 1.5, points)
-    inside = np.abs(model.poles().imag)
+    inside = np.abs(own.imag)
     return np.unique(np.concatenate([grid, inside[(inside > grid[0]) & (inside < grid[-1])]]))
 
 

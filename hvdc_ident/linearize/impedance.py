@@ -462,8 +462,11 @@ def _sine(omega: float, phase: float) -> Any:
 def _settling(model: Model, values: Mapping[str, float]) -> float:
     """Seconds until the slowest stable mode has decayed by 1e-9; LinearizationError for an unstable point."""
     point = find_operating_point(model, dict(values))
-    rates = linearize(model, point).poles().real
-    if (rates > 1e-6).any():
-        raise LinearizationError("the operating point is unstable: nothing to measure", where=f"model '{model.name}'")
+    linear = linearize(model, point)
+    rates = linear.poles().real
+    if linear.stability().verdict in ("unstable", "not decided"):
+        raise LinearizationError(
+            f"the operating point is {linear.stability().verdict}: nothing to measure", where=f"model '{model.name}'"
+        )
     slow = np.abs(rates[np.abs(rates) > 1e-6])
     return float(np.log(1e9) / slow.min()) if slow.size else 0.0

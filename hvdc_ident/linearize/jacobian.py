@@ -13,6 +13,7 @@ from hvdc_ident.linearize.delays import Blocks, DelayFree, Eliminated, channels,
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
+from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array, CompiledSystem, system
 from hvdc_ident.model import AnyModel, Model
 
@@ -99,6 +100,19 @@ def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, 
             hint="use linearize(), which keeps it as a descriptor",
         )
     return np.asarray(reduced.result[: parts.n, : parts.n])
+
+
+def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Characteristic:
+    """Return the characteristic equation at a point given by its vectors, delays exact, with all inputs and outputs.
+
+    Raises as `linearize` does.
+    """
+    modes = modes_at(s, y, w, p, "refuse")
+    jac = s.jacobian(y, w, p, modes)[: s.layout.main]
+    if not np.isfinite(jac).all():
+        raise _not_finite(s, jac, model.name)
+    _refuse_flat_roots(s, y, w, p, modes, model.name)
+    return Characteristic.of(DelayFree.of(s.layout, jac, list(range(s.layout.nu)), channels(model, s, p)))
 
 
 def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize.loops import LoopMargins, Margins
     from hvdc_ident.linearize.modal import Mode
     from hvdc_ident.linearize.reduction import Reduction
+    from hvdc_ident.linearize.stability import Stability
     from hvdc_ident.linearize.transfer_function import TransferFunction
 
 
@@ -243,10 +244,19 @@ class LinearModel(Shown):
     # --- analysis ---
 
     def poles(self) -> Array:
-        """Return (states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor."""
+        """Return (states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor.
+
+        With delays: the rightmost roots of the exact characteristic equation, at least as many as there are states.
+        """
         from hvdc_ident.linearize.modal import poles
 
         return poles(self)
+
+    def stability(self) -> Stability:
+        """Whether the model is stable, delays exact, with the number of roots right of the imaginary axis."""
+        from hvdc_ident.linearize.modal import stability_of
+
+        return stability_of(self)
 
     def zeros(self) -> Array:
         """Complex invariant zeros of the whole system, rad/s."""
@@ -355,8 +365,7 @@ class LinearModel(Shown):
         def listed(names: tuple[str, ...]) -> str:
             return ", ".join(names[:8]) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
 
-        stable = "stable" if (self.poles().real < 0).all() else "not stable"
-        yield f"Linear model of {self.name}: {len(self.state_names)} states, {stable}"
+        yield f"Linear model of {self.name}: {len(self.state_names)} states, {self.stability().verdict}"
         lines = [f"inputs {listed(self.input_names)}; outputs {listed(self.output_names)}"]
         if "values" in self.provenance:
             lines.append(f"at the {self.provenance['values']}")

@@ -16,14 +16,20 @@ from scipy.optimize import linear_sum_assignment
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.linearize.delayed_locus import crossings, followed
 from hvdc_ident.linearize.equilibrium import EquilibriumSearch
-from hvdc_ident.linearize.jacobian import state_matrix
+from hvdc_ident.linearize.jacobian import characteristic, state_matrix
 from hvdc_ident.linearize.operating_point import ZERO, steady
-from hvdc_ident.linearize.system import Array
+from hvdc_ident.linearize.stability import Characteristic, Stability, stability
+from hvdc_ident.linearize.system import Array, CompiledSystem
 from hvdc_ident.model import Model
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize.linear_model import Gradient, LinearModel
+
+
+ON_AXIS = (1e-9, 1e-6)
+"""1/s left and right of the imaginary axis within which an eigenvalue of A counts as on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,13 +75,37 @@ class Mode:
 
 
 def poles(model: LinearModel) -> Array:
-    """Return (n,) complex eigenvalues, rad/s; for a descriptor those of the pencil without the infinite ones."""
+    """Return (n,) complex eigenvalues, rad/s; for a descriptor those of the pencil without the infinite ones.
+
+    Of a model with delays the rightmost roots of its exact characteristic equation, by falling real part.
+    """
+    if model.delay_free is not None:
+        return Characteristic.of(model.delay_free).roots.values
+    return approximate_poles(model)
+
+
+def approximate_poles(model: LinearModel) -> Array:
+    """Return (n,) complex eigenvalues of the state space, rad/s, in which a delay stands as its Pade approximant."""
     if model.A.shape[0] == 0:
         return np.zeros(0, dtype=complex)
     if not model.is_descriptor:
         return np.asarray(np.linalg.eigvals(model.A), dtype=complex)
     alpha, beta = scipy.linalg.eigvals(model.A, model.E, homogeneous_eigvals=True)
     return np.asarray(alpha[finite(alpha, beta)] / beta[finite(alpha, beta)], dtype=complex)
+
+
+def stability_of(model: LinearModel) -> Stability:
+    """Return whether a model is stable: with delays by its characteristic equation, else by its eigenvalues."""
+    if model.delay_free is not None:
+        return stability(Characteristic.of(model.delay_free))
+    values = approximate_poles(model)
+    if not values.size:
+        return Stability("stable", 0, None)
+    first = complex(values[np.argmax(values.real + 1e-300 * values.imag)])
+    verdict = (
+        "stable" if first.real < -ON_AXIS[0] else "on the limit of stability" if first.real < ON_AXIS[1] else "unstable"
+    )
+    return Stability(verdict, int((values.real >= ON_AXIS[1]).sum()), first)
 
 
 def finite(alpha: Array, beta: Array) -> Array:
@@ -100,7 +130,14 @@ def eigen(a: Array) -> tuple[Array, Array, Array]:
 
 
 def modes(model: LinearModel) -> tuple[Mode, ...]:
-    """Every mode of a model, by falling real part; conjugates follow each other, the upper one first."""
+    """Every mode of a model, by falling real part; conjugates follow each other, the upper one first.
+
+    A model with delays has infinitely many; these are the rightmost ones, at least as many as it has states.
+    """
+    if model.delay_free is not None:
+        from hvdc_ident.linearize.delayed_modes import modes as delayed
+
+        return delayed(model)
     names = model.state_names
     if model.is_descriptor:
         a, b, c, d = model.standard()
@@ -143,8 +180,6 @@ def _kind(model: LinearModel, value: complex, right: Array, left: Array, zero: f
         )
         if driven and seen:
             return "free integrator"
-        if model.delay_free is not None:
-            return "sliding mean (cancelled by its delay)"
         return _hidden(model, right, bool(driven), bool(seen))
     if value.imag:
         return "oscillation" if value.real <= 0 else "growing oscillation"
@@ -254,7 +289,8 @@ class StabilityLimit:
 class RootLocus:
     """Eigenvalues (points, modes) in rad/s along values of a parameter; column k is one mode throughout.
 
-    limits: where stability is lost or won between the values.
+    limits: where stability is lost or won between the values. With delays, the columns are the rightmost roots of the exact
+    characteristic equation, and unstable is the number of all roots right of the imaginary axis, None where it is unknown.
     """
 
     parameter: str
@@ -262,10 +298,13 @@ class RootLocus:
     values: Array
     eigenvalues: Array
     limits: tuple[StabilityLimit, ...]
+    unstable: tuple[float | None, ...] | None = None
 
     @property
     def stable(self) -> Array:
         """(points,) True where every eigenvalue lies left of the imaginary axis, those that stay at 0 apart."""
+        if self.unstable is not None:
+            return np.array([n == 0 for n in self.unstable])
         return np.asarray(((self.eigenvalues.real < 0) | at_zero(self.eigenvalues)).all(axis=1))
 
     def plot(self, ax: Any = None) -> Any:
@@ -287,6 +326,7 @@ class RootLocus:
             "values": self.values.tolist(),
             "eigenvalues": pairs,
             "limits": limits,
+            **({} if self.unstable is None else {"unstable_roots": list(self.unstable)}),
         }
 
 
@@ -308,6 +348,14 @@ def root_locus(
             "a locus needs finite values", where=f"locus of '{parameter}'", expected="at least one"
         )
     at = _Along(model, parameter, fixed or {})
+    unit = (model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]).unit
+    if model.delays or model.sampled:
+        table, unstable = followed(at.equation, along)
+        ends = tuple(
+            StabilityLimit(v, root, "lost" if lost else "won")
+            for v, root, lost in crossings(at.equation, along, unstable)
+        )
+        return RootLocus(parameter, unit, along, table, ends, unstable)
     found: list[Array] = []
     left: Array | None = None
     for value in along:
@@ -318,7 +366,6 @@ def root_locus(
         found.append(eigenvalues)
         left = left_new
     table = np.array(found)
-    unit = (model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]).unit
     return RootLocus(parameter, unit, along, table, _limits(at, along, table))
 
 
@@ -340,14 +387,24 @@ class _Along:
         values[self._place] = value
         return replace(self._search, **{key: values})
 
-    def matrix(self, value: float) -> Array:
-        """Return A, (states, states), at the value's own operating point: the steady state that a simulation starts from there."""
+    def _rest(self, value: float) -> tuple[CompiledSystem, tuple[Array, Array, Array]]:
+        """Return the system and its vectors at the value's own operating point: where a simulation starts from there."""
         search = self._at(value)
         try:
             root, _ = steady(self.model, search)
         except SteadyStateError as e:
             raise e.at(f"{self.parameter} = {value:g}") from None
-        return state_matrix(self.model, search.system, *search.vectors(root.v))
+        return search.system, search.vectors(root.v)
+
+    def matrix(self, value: float) -> Array:
+        """Return A, (states, states), at the value's own operating point."""
+        system, vectors = self._rest(value)
+        return state_matrix(self.model, system, *vectors)
+
+    def equation(self, value: float) -> Characteristic:
+        """Return the characteristic equation at the value's own operating point, delays exact."""
+        system, vectors = self._rest(value)
+        return characteristic(self.model, system, *vectors)
 
 
 def at_zero(table: Array) -> Array:

@@ -15,6 +15,7 @@ from hvdc_ident.errors import LinearizationError, SteadyStateError, require_know
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import At, Equations, EquilibriumSearch, Root, homotopy, newton, weights
 from hvdc_ident.linearize.limits import Limit, limits
+from hvdc_ident.linearize.stability import Characteristic, stability
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import ACCURACY, Equilibria, equilibria, resting
@@ -69,7 +70,10 @@ class OperatingPoint(Shown):
 
     @cached_property
     def stable(self) -> bool | None:
-        """True where no eigenvalue of the linear model lies right of the imaginary axis; None for an FMU and on a kink."""
+        """True where no eigenvalue of the linear model lies right of the imaginary axis, delays exact.
+
+        None for an FMU, on a kink, and where a gain around a delay leaves it undecided.
+        """
         return None if self.search is None else _stable(self, self.y, self.w)
 
     @cached_property
@@ -364,40 +368,52 @@ def _notes(point: OperatingPoint) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _matrix(point: OperatingPoint, y: Array, w: Array) -> Array | None:
-    from hvdc_ident.linearize.jacobian import state_matrix
+def _equation(point: OperatingPoint, y: Array, w: Array) -> Characteristic | None:
+    from hvdc_ident.linearize.jacobian import characteristic
 
     assert point.search is not None and isinstance(point.model, Model)
     try:
-        return state_matrix(point.model, point.search.system, y, w, point.p)
+        return characteristic(point.model, point.search.system, y, w, point.p)
     except LinearizationError:
         return None
 
 
 def _stable(point: OperatingPoint, y: Array, w: Array) -> bool | None:
-    matrix = _matrix(point, y, w)
-    if matrix is None or not matrix.size:
-        return None if matrix is None else True
-    values = np.linalg.eigvals(matrix)
+    """Return whether no root lies right of the imaginary axis; None where there is no linear model, or it cannot be told."""
+    equation = _equation(point, y, w)
+    if equation is None:
+        return None
+    if equation.channels:
+        unstable = stability(equation).unstable
+        return None if unstable is None else unstable == 0
+    values = np.linalg.eigvals(equation.matrix) if equation.nx else np.zeros(1)
     return bool(values.real.max() <= ZERO * max(1.0, float(np.abs(values).max())))
 
 
 def _fastest(point: OperatingPoint) -> str:
-    matrix = _matrix(point, point.y, point.w)
-    assert matrix is not None
-    values = np.linalg.eigvals(matrix)
-    worst = values[np.argmax(values.real)]
-    turning = f" +- {abs(worst.imag):.3g}j" if worst.imag else ""
-    return f"the eigenvalue {worst.real:.3g}{turning} 1/s grows"
+    equation = _equation(point, point.y, point.w)
+    assert equation is not None
+    worst = equation.roots.values[:1]
+    if not worst.size or worst[0].real <= 0:
+        return "roots of its characteristic equation grow"
+    turning = f" +- {abs(worst[0].imag):.3g}j" if worst[0].imag else ""
+    return f"the eigenvalue {worst[0].real:.3g}{turning} 1/s grows"
+
+
+def _direction(equation: Characteristic) -> Array:
+    """Return (states,) the shape of the rightmost mode, a delay's share in it left out."""
+    root = equation.roots.values[:1]
+    if not root.size:
+        return np.ones(equation.nx)
+    return np.asarray(np.linalg.svd(equation.whole.pencil(root)[0])[2][-1].conj()[: equation.nx].real)
 
 
 def _elsewhere(at: Equilibria, point: OperatingPoint, v: Array) -> str:
     """Return a sentence on the nearest stable steady state that the model runs to from here, or that its guesses lead to."""
-    matrix = _matrix(point, point.y, point.w)
-    assert matrix is not None
-    values, vectors = np.linalg.eig(matrix)
+    equation = _equation(point, point.y, point.w)
+    assert equation is not None
     nx = len(point.states)
-    direction = vectors[:nx, np.argmax(values.real)].real
+    direction = _direction(equation)
     size = np.maximum(np.abs(point.y[:nx]), 1e-2)
     direction = 1e-2 * direction / max(float(np.abs(direction / size).max()), 1e-300)
     u = point.w[1 : 1 + len(point.inputs)]

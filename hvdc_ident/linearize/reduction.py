@@ -17,6 +17,7 @@ from scipy.optimize import minimize_scalar
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.stability import Characteristic, sliding_means, stability
 from hvdc_ident.linearize.system import Array
 
 TOLERANCE = 1e-10
@@ -305,6 +306,8 @@ def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     no stability; a model with delays is searched on its exact response instead. Raises LinearizationError where a pole
     that the inputs reach and the outputs see lies on the imaginary axis: the norm is infinite.
     """
+    if model.delay_free is not None:
+        return _linf_of_delays(model)
     a, b, c, d = visible(model)
     poles = np.linalg.eigvals(a) if a.shape[0] else np.zeros(0)
     axis = poles[on_axis(poles, a)]
@@ -315,9 +318,6 @@ def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
             got=f"eigenvalue {axis[0]:.6g}",
             hint="compare with nu_gap, which takes integrators",
         )
-    if model.delay_free is not None:
-        grid = np.concatenate([[0.0], default_omega(model, 4000)])
-        return peak_over(lambda w: np.linalg.svd(transfer(model, 1j * w), compute_uv=False)[:, 0], grid)
 
     def gain(w: float) -> float:
         value = c @ np.linalg.solve(1j * w * np.eye(a.shape[0]) - a, b) + d if a.shape[0] else d
@@ -348,6 +348,9 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
 
     Raises LinearizationError where a pole that inputs reach and outputs see is not stable.
     """
+    if model.delay_free is not None:
+        _refuse_unstable(model, "an unstable model has no H-infinity norm")
+        return linf_norm(model, tolerance)
     a = visible(model)[0]
     poles = np.linalg.eigvals(a) if a.shape[0] else np.zeros(0)
     if ((poles.real >= 0) | on_axis(poles, a)).any():
@@ -360,8 +363,35 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     return linf_norm(model, tolerance)
 
 
+def _refuse_unstable(model: LinearModel, what: str) -> None:
+    """Raise LinearizationError where a model with delays is not stable, or cannot be told to be, between inputs and outputs."""
+    assert model.delay_free is not None
+    found = stability(Characteristic.of(model.delay_free).visible())
+    if found.verdict != "stable":
+        raise LinearizationError(
+            what, where=f"linear model '{model.name}'", got=f"{found.verdict}: {found.reason or found.count_text}"
+        )
+
+
+def _linf_of_delays(model: LinearModel) -> Peak:
+    """Return the L-infinity norm of a model with delays, on a grid of its exact response and beside the largest value."""
+    assert model.delay_free is not None
+    equation = Characteristic.of(model.delay_free).visible()
+    if equation.roots.axis > sliding_means(equation):
+        raise LinearizationError(
+            "the L-infinity norm is infinite: a pole lies on the imaginary axis", where=f"linear model '{model.name}'"
+        )
+    grid = np.concatenate([[0.0], default_omega(model, 4000)])
+    return peak_over(lambda w: np.linalg.svd(transfer(model, 1j * w), compute_uv=False)[:, 0], grid)
+
+
 def h2_norm(model: LinearModel) -> float:
-    """Return the H2 norm, by a Gramian. Raises LinearizationError where it is infinite: unstable, or D not 0."""
+    """Return the H2 norm, by a Gramian. Raises LinearizationError where it is infinite: unstable, or D not 0.
+
+    Delays stand as their Pade approximants in the value, not in the verdict on stability.
+    """
+    if model.delay_free is not None:
+        _refuse_unstable(model, "the H2 norm is infinite: the model is not stable")
     a, b, c, d = visible(model)
     if np.any(d):
         raise LinearizationError("the H2 norm is infinite: D is not 0", where=f"linear model '{model.name}'")
@@ -370,7 +400,10 @@ def h2_norm(model: LinearModel) -> float:
     poles = np.linalg.eigvals(a)
     if ((poles.real >= 0) | on_axis(poles, a)).any():
         raise LinearizationError(
-            "the H2 norm is infinite: the model is not stable", where=f"linear model '{model.name}'"
+            "the H2 norm is infinite: the model is not stable"
+            if model.delay_free is None
+            else "the H2 norm is not known: the model is stable, and its delays' Pade approximants are not",
+            where=f"linear model '{model.name}'",
         )
     gramian = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
     return float(np.sqrt(max(np.trace(c @ gramian @ c.T), 0.0)))

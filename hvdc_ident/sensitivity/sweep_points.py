@@ -251,6 +251,8 @@ class PointTask:
         parts = []
         if self.poles:
             poles = np.asarray(linear.poles(), dtype=complex)
+            if linear.delay_free is not None:  # infinitely many: the rightmost ones
+                poles = poles[: self.poles]
             if poles.size != self.poles:
                 raise SimulationError(
                     "the number of poles changed", expected=str(self.poles), got=str(poles.size)
@@ -395,7 +397,8 @@ def task_of(
                 e.what, where=f"sweep, {e.where}", expected=e.expected, got=e.got, hint=hint
             ) from None
         at = linearize(model, point, inputs=quantities.inputs, outputs=quantities.outputs)
-        poles = int(np.size(at.poles())) if "poles" in want else 0
+        if "poles" in want:
+            poles = int(np.size(at.poles())) if at.delay_free is None else at.delay_free.nx
         channels = tuple(at.input_names), tuple(at.output_names)
         if "bode" in want:
             frequencies = np.asarray(omega if omega is not None else at.bode().omega, dtype=float)

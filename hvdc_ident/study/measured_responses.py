@@ -220,8 +220,8 @@ def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[dict
             except (SteadyStateError, LinearizationError) as e:
                 line["models"][name] = {"reason": str(e)}
             else:
-                right = float(linear.poles().real.max(initial=-np.inf))
-                line["models"][name] = {**_parts(curve), "errors": r.errors(curve), "stable": right < 1e-6}
+                stable = linear.stability().verdict in ("stable", "on the limit of stability")
+                line["models"][name] = {**_parts(curve), "errors": r.errors(curve), "stable": stable}
         found.append(line)
     return found
 

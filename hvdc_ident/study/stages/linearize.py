@@ -62,6 +62,7 @@ def _described(
         **model.to_dict(),
         "operating_point": point.to_dict(),
         "stable": point.stable,
+        "stability": model.stability().to_dict(),
         "branch": point.branch,
         "notes": list(point.notes),
         "modes": _ordered(modes_of(study, model), like),

@@ -1,0 +1,386 @@
+"""Stability of linear models with delays, decided on the exact characteristic equation.
+
+The equation falls into parts that act on one another only one way. Of each part the roots are found and counted
+(`characteristic`); a discretisation of the delays is refined until the roots found are as many as are counted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from scipy.sparse.csgraph import connected_components
+
+from hvdc_ident.linearize.characteristic import NEUTRAL, Part, Undecided, spectral_radius
+from hvdc_ident.linearize.delays import Channel, DelayFree
+from hvdc_ident.linearize.sampling import multipliers
+from hvdc_ident.linearize.system import Array
+
+EIGENVALUES = "eigenvalues of A"
+COUNTED = "roots of the exact characteristic equation, counted by the argument principle"
+MULTIPLIERS = "multipliers over the period of the sampled blocks (modes: without aliases)"
+TOLERANCES = (1e-12, 1e-10, 1e-8)
+"""Distances from the imaginary axis, relative to the radius that bounds the roots, within which one counts as on it."""
+ON_CIRCLE = 1e-9
+"""Distance from the unit circle within which rounding hides on which side a multiplier lies."""
+CERTAIN = 1e-4
+"""Share of the first root's real part by which another one may lie right of it unseen."""
+ORDERS = (12, 24, 48, 96, 192)
+"""Collocation points of a delay that are tried one after the other until the roots found are as many as are counted."""
+LARGEST = 900
+"""Rows of the largest discretisation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Roots:
+    """Roots of a characteristic equation, by falling real part, with the numbers counted for it.
+
+    unstable: right of the imaginary axis, None where it cannot be told and infinite for a neutral equation past its
+    limit. axis: on it, as far as rounding errors tell. reason: why `unstable` is None or infinite. certain: whether it is
+    shown that no root lies right of the first one. averaged: the roots with sampled blocks as their transfer functions, without
+    aliases, where `values` has the logarithms of their multipliers.
+    """
+
+    values: Array
+    unstable: float | None
+    axis: int
+    reason: str = ""
+    certain: bool = True
+    averaged: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Characteristic:
+    """The characteristic equation of a model.
+
+    matrix: as in `Part`, whole. given: (rows, inputs) what the inputs add to its rows; read: (outputs, columns) and
+    through: (outputs, inputs) the outputs.
+    """
+
+    matrix: Array
+    nx: int
+    channels: tuple[Channel, ...]
+    given: Array
+    read: Array
+    through: Array
+
+    @classmethod
+    def of(cls, core: DelayFree) -> Characteristic:
+        """Return the equation of a linear model before its delays are approximated."""
+        n, o, u, m = core.nx, core.no, core.nu, core.matrix
+        rows = [*range(n), *range(n + o, m.shape[0])]
+        columns = [*range(n), *range(n + u, m.shape[1])]
+        outputs, inputs = slice(n, n + o), slice(n, n + u)
+        return cls(m[np.ix_(rows, columns)], n, core.channels, m[rows, inputs], m[outputs, columns], m[outputs, inputs])
+
+    def closed(self, gains: Array) -> Characteristic:
+        """Return the equation with every output fed back to the input of its place, with a gain and negative sign."""
+        return self.fed_back(-np.diag(gains))
+
+    def fed_back(self, feedback: Array) -> Characteristic:
+        """Return the equation with `feedback`, (inputs, outputs), times the outputs added to the inputs."""
+        through = np.eye(self.through.shape[0]) - self.through @ feedback
+        read, direct = np.linalg.solve(through, self.read), np.linalg.solve(through, self.through)
+        given = self.given + self.given @ feedback @ direct
+        return replace(self, matrix=self.matrix + self.given @ feedback @ read, given=given, read=read, through=direct)
+
+    def beside(self, other: Characteristic) -> Characteristic:
+        """Return the equation of both side by side, inputs and outputs of this one first."""
+        n, k = self.nx, self.matrix.shape[0]
+        places = [*range(n), *range(k, k + other.nx), *range(n, k), *range(k + other.nx, k + other.matrix.shape[0])]
+
+        def both(first: Array, second: Array) -> Array:
+            return scipy.linalg.block_diag(first, second)
+
+        return Characteristic(
+            both(self.matrix, other.matrix)[np.ix_(places, places)], n + other.nx, (*self.channels, *other.channels),
+            both(self.given, other.given)[places], both(self.read, other.read)[:, places],
+            both(self.through, other.through),
+        )  # fmt: skip
+
+    def visible(self) -> Characteristic:
+        """Return the equation of what the inputs reach and the outputs see, by structure."""
+        links = self.matrix != 0
+        reached, seen = (self.given != 0).any(axis=1), (self.read != 0).any(axis=0)
+        for _ in range(links.shape[0]):
+            reached, seen = reached | (links & reached).any(axis=1), seen | (links & seen[:, None]).any(axis=0)
+        keep = np.flatnonzero(reached & seen)
+        found = tuple(self.channels[i - self.nx] for i in keep if i >= self.nx)
+        return Characteristic(
+            self.matrix[np.ix_(keep, keep)],
+            len(keep) - len(found),
+            found,
+            self.given[keep],
+            self.read[:, keep],
+            self.through,
+        )
+
+    def response(self, s: Array) -> Array:
+        """Return (frequencies, outputs, inputs) exact transfer matrix at complex frequencies s, rad/s; at 0 its limit."""
+        part = self.whole
+        if self.channels and (s == 0).any() and sliding_means(self):
+            # A sliding mean is 0/0 at 0: the even part of the response beside it is its limit there, to 1e-10.
+            beside = self.response(np.where(s == 0, 1e-5j / float(part.lengths.max()), s))
+            return np.where((s == 0)[:, None, None], beside.real, beside)
+        factors = np.concatenate([np.ones((s.size, self.nx)), part.factors(s)], axis=1)
+        return np.asarray(self.through + self.read @ np.linalg.solve(part.pencil(s), factors[:, :, None] * self.given))
+
+    @property
+    def whole(self) -> Part:
+        """All of it as one part, for the pencil."""
+        return Part(self.matrix, self.nx, self.channels)
+
+    def parts(self) -> Iterator[tuple[Part, Array]]:
+        """Return the parts that determine one another's unknowns only one way, balanced, with the places of their unknowns."""
+        m = self.matrix
+        links = np.abs(m) > 0
+        _, label = connected_components(links, directed=True, connection="strong")
+        for k in range(label.max(initial=-1) + 1):
+            places = np.flatnonzero(label == k)
+            own = m[np.ix_(places, places)]
+            if own.shape[0] > 1:
+                _, (scale, _) = scipy.linalg.matrix_balance(own, permute=False, separate=True)
+                own = own * scale[None, :] / scale[:, None]
+            found = tuple(self.channels[i - self.nx] for i in places if i >= self.nx)
+            yield Part(own, len(places) - len(found), found), places
+
+    @cached_property
+    def roots(self) -> Roots:
+        """The rightmost roots, at least as many as there are states, and the number that is unstable."""
+        found = [_roots_of(part) for part, _ in self.parts()]
+        unstable: float | None = 0.0
+        for r in found:
+            unstable = _sum(unstable, r.unstable)
+        axis = sum(r.axis for r in found)
+        reasons = dict.fromkeys(r.reason for r in found if r.reason)
+        grows = 0.0 if unstable is None else unstable
+        least = max(self.nx, axis + int(grows)) if np.isfinite(grows) else None
+        averaged = _first([r.values if r.averaged is None else r.averaged for r in found], least)
+        values = _first([r.values for r in found], least)
+        return Roots(values, unstable, axis, "; ".join(reasons), all(r.certain for r in found), averaged)
+
+    def counts(self) -> tuple[float | None, int]:
+        """Return the numbers of roots right of the imaginary axis and on it, as in `Roots`, without looking for the roots."""
+        found = [_counts_of(part) for part, _ in self.parts()]
+        total: float | None = 0.0
+        for unstable, _ in found:
+            total = _sum(total, unstable)
+        return total, sum(axis for _, axis in found)
+
+    def is_stable(self) -> bool:
+        """Return whether `stability` says "stable", without looking for the roots."""
+        unstable, axis = self.counts()
+        return unstable == 0 and axis <= sliding_means(self)
+
+
+def _first(values: list[Array], least: int | None) -> Array:
+    """Return so many values by falling real part, conjugates together and the upper one first; all of them for None."""
+    found = np.concatenate([np.zeros(0, dtype=complex), *values])
+    found = found[np.lexsort((-found.imag, np.abs(found.imag), -found.real))]
+    count = found.size if least is None else least
+    if 0 < count < found.size and found[count - 1].imag > 0:
+        count += 1
+    return found[:count]
+
+
+def _counts_of(part: Part) -> tuple[float | None, int]:
+    if any(c.kind == "sampled" for c in part.channels):
+        found = multipliers(part.matrix, part.nx, part.channels) if part.matrix.any() else (np.zeros(0), 1.0)
+        return (None, 0) if isinstance(found, str) else _on_circle(found[0])
+    if not part.channels or not part.matrix.any() or spectral_radius(part.direct) >= 1.0 - NEUTRAL:
+        roots = _roots_of(part)
+        return roots.unstable, roots.axis
+    try:
+        _, total, right = _counted(part)
+    except Undecided:
+        return None, 0
+    return right, total - right
+
+
+def _on_circle(z: Array) -> tuple[int, int]:
+    """Return the numbers of multipliers outside the unit circle and on it."""
+    growth = np.abs(z) - 1.0
+    return int((growth > ON_CIRCLE).sum()), int((np.abs(growth) <= ON_CIRCLE).sum())
+
+
+def _sum(first: float | None, second: float | None) -> float | None:
+    """Return the sum of two counts; one that is known to be positive makes an unknown one a number from below."""
+    if first is None or second is None:
+        known = (first or 0.0) + (second or 0.0)
+        return known if known > 0 else None
+    return first + second
+
+
+def _roots_of(part: Part) -> Roots:
+    if not part.channels:
+        return _eigenvalues(part)
+    if not part.matrix.any():  # a delay outside any loop
+        return Roots(np.zeros(0, dtype=complex), 0, 0)
+    if any(c.kind == "sampled" for c in part.channels):
+        return _sampled(part)
+    return _delayed(part)
+
+
+def _sampled(part: Part) -> Roots:
+    """The multipliers over the sampling period decide; where there are none, it is said what the averaged equation has."""
+    averaged = _delayed(part)
+    found = multipliers(part.matrix, part.nx, part.channels)
+    if isinstance(found, str):
+        said = "an unknown number of" if averaged.unstable is None else f"{averaged.unstable:.0f}"
+        reason = f"{found}; without their aliases the loop has {said} unstable roots"
+        return Roots(averaged.values, None, 0, reason, False)
+    z, period = found
+    unstable, axis = _on_circle(z)
+    values = np.log(z[np.abs(z) > 1e-12].astype(complex)) / period
+    return Roots(values, unstable, axis, averaged=averaged.values)
+
+
+def _delayed(part: Part) -> Roots:
+    n = part.nx
+    direct = spectral_radius(part.direct)
+    if direct >= 1.0 - NEUTRAL:
+        return _neutral(part, direct)
+    try:
+        tolerance, total, right = _counted(part)
+    except Undecided as e:
+        found = part.refined(np.linalg.eigvals(part.discretised(_orders(part)[-1])))
+        grows = int((found.real > 1e-9 * part.unit).sum())
+        return Roots(found, grows or None, 0, f"{e.what} ({e.got})", False)
+    found = np.zeros(0, dtype=complex)
+    for order in _orders(part):
+        found = part.refined(np.concatenate([np.linalg.eigvals(part.discretised(order)), found]))
+        near = found[found.real > -tolerance]
+        if near.size < total:
+            times = [part.multiplicity(v, found) for v in near]
+            found = np.concatenate([found, *(np.full(k - 1, v) for v, k in zip(near, times, strict=True))])
+        if (found.real > tolerance).sum() != right or (found.real > -tolerance).sum() != total or found.size < n:
+            continue
+        if total or not found.size:
+            return Roots(found, right, total - right)
+        first = float(found.real.max())
+        try:
+            if part.count(first + CERTAIN * abs(first)) == 0:
+                return Roots(found, 0, 0)
+        except Undecided:
+            return Roots(found, 0, 0, certain=False)
+    return Roots(found, right, total - right, certain=False)
+
+
+def _counted(part: Part) -> tuple[float, int, int]:
+    """Return a distance from the imaginary axis, and the numbers of roots right of the axis less it, and plus it.
+
+    The distance is as small as rounding errors of the pencil and roots on the axis let the contour be.
+    """
+    size = max(part.bound(0.0), part.nx * part.size)
+    for share in TOLERANCES:
+        try:
+            total = part.count(-share * size)
+            return share * size, total, part.count(share * size) if total else 0
+        except Undecided:
+            if share == TOLERANCES[-1]:
+                raise
+    raise AssertionError  # TOLERANCES is not empty
+
+
+def _orders(part: Part) -> Sequence[int]:
+    return [k for k in ORDERS if k == ORDERS[0] or part.nx + k * len(part.channels) <= LARGEST]
+
+
+def _eigenvalues(part: Part) -> Roots:
+    values = np.linalg.eigvals(part.matrix).astype(complex)
+    on_it = np.abs(values.real) <= 1e-9 * np.abs(values) + 10 * part.nx * np.finfo(float).eps * part.size
+    return Roots(values, int(((values.real > 0) & ~on_it).sum()), int(on_it.sum()))
+
+
+def _neutral(part: Part, direct: float) -> Roots:
+    """What can be said where the gain around delays, without a state on the way, reaches 1.
+
+    Around a single ring of delays a gain above 1 leaves infinitely many roots right of the axis, near Re s = ln gain / T. In
+    other cases the phases decide, which delays that are a little different turn (Hale and Verduyn Lunel 1993, 9.6).
+    """
+    found = part.refined(np.linalg.eigvals(part.discretised(_orders(part)[-1])))
+    links = part.direct > 0
+    _, label = connected_components(links, directed=True, connection="strong")
+    rings = [np.ix_(label == k, label == k) for k in range(label.max() + 1)]
+    reached = [r for r in rings if spectral_radius(part.direct[r]) >= 1.0 - NEUTRAL]
+    ring = any((links[r].sum(axis=1) == 1).all() and spectral_radius(part.direct[r]) > 1.0 + NEUTRAL for r in reached)
+    said = f"the gain around a delay without a state on the way is {direct:.6g}"
+    if ring:
+        return Roots(found, np.inf, 0, f"{said}, above 1: infinitely many roots grow", False)
+    grows = int((found.real > 1e-9 * part.unit).sum())
+    return Roots(found, grows or None, 0, f"{said}, and must be below 1 for a count of the roots", False)
+
+
+@dataclass(frozen=True, eq=False)
+class Stability:
+    """Whether a model is stable: without delays by its eigenvalues, with delays by its characteristic equation.
+
+    verdict: "stable", "on the limit of stability", "unstable" or "not decided". unstable: roots right of the axis, None
+    where not decided, infinite where there are infinitely many; from below where there is a reason. rightmost: the first
+    root, None where there is none or none was found.
+    """
+
+    verdict: str
+    unstable: float | None
+    rightmost: complex | None
+    reason: str = ""
+    method: str = EIGENVALUES
+
+    @property
+    def count_text(self) -> str:
+        """How many roots lie right of the imaginary axis, in words."""
+        if self.unstable is None:
+            return "an unknown number of roots right of the imaginary axis"
+        if np.isinf(self.unstable):
+            return "infinitely many roots right of the imaginary axis"
+        number = f"{self.unstable:.0f} root{'' if self.unstable == 1 else 's'} right of the imaginary axis"
+        return f"at least {number}" if self.reason else number
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict as plain text and numbers; the number of roots is infinite where that is so."""
+        return {
+            "verdict": self.verdict,
+            "unstable_roots": self.unstable,
+            "rightmost": [] if self.rightmost is None else [self.rightmost.real, self.rightmost.imag],
+            "method": self.method,
+            "reason": self.reason,
+        }
+
+
+def stability(equation: Characteristic) -> Stability:
+    """Return whether the model is stable; what a sliding mean keeps for ever does not count."""
+    roots, values = equation.roots, equation.roots.values
+    hidden = sliding_means(equation)
+    if hidden:
+        values = np.delete(values, np.argsort(np.abs(values), kind="stable")[:hidden])
+    first = complex(values[0]) if values.size else None
+    sampled = any(c.kind == "sampled" for c in equation.channels)
+    method = MULTIPLIERS if sampled else COUNTED if equation.channels else EIGENVALUES
+    if roots.unstable is None:
+        return Stability("not decided", None, first, roots.reason, method)
+    if roots.unstable > 0:
+        return Stability("unstable", roots.unstable, first, roots.reason, method)
+    verdict = "on the limit of stability" if roots.axis > hidden else "stable"
+    return Stability(verdict, 0, first if roots.certain else None, roots.reason, method)
+
+
+def sliding_means(equation: Characteristic) -> int:
+    """Return how many roots at 0 are sliding means: what stays is a state less what a delay holds, and no input moves it.
+
+    y' = (u - u(t - T))/T keeps y less the mean of u, which is 0 for ever where it is at the start.
+    """
+    n, m = equation.nx, equation.matrix
+    _, (scale, _) = scipy.linalg.matrix_balance(m, permute=False, separate=True)
+    at_rest = np.diag([0.0] * n + [1.0] * (m.shape[0] - n)) - m * scale[None, :] / scale[:, None]
+    rows = scipy.linalg.null_space(at_rest.T, rcond=1e-13).T
+    if rows.shape[0] == 0:
+        return 0
+    given = equation.given / scale[:, None]
+    u, sizes, _ = np.linalg.svd(rows @ given, full_matrices=True)
+    rank = int((sizes > 1e-9 * max(float(np.linalg.norm(given)), 1e-300)).sum())
+    free = u[:, rank:].T @ rows
+    return int(np.linalg.matrix_rank(free[:, n:], tol=1e-9)) if free.size else 0
