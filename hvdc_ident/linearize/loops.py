@@ -19,10 +19,12 @@ from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, transfer
+from hvdc_ident.linearize.gain_limits import FLOOR, NONE, Closing, Crossing, crossing_frequencies, refined
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point, point_at
 from hvdc_ident.linearize.reduction import without_sliding_means
+from hvdc_ident.linearize.stability import Characteristic, Stability, sliding_means, stability
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import Model, Output, State, driven, fresh
 from hvdc_ident.parameters import Input
@@ -43,19 +45,17 @@ class Loop:
         return self.open.bode(omega)
 
     def closed_poles(self) -> Array:
-        """Poles with the loop closed, delays in their Pade form, sliding means without their hidden zero.
+        """Poles with the loop closed, rad/s, sliding means without their hidden zero.
 
+        With delays: the rightmost roots of the exact characteristic equation, at least as many as there are states.
         Raises LinearizationError for an ill-posed loop.
         """
-        a, b, c, d = without_sliding_means(self.open)
-        through = np.eye(d.shape[0]) + d
-        if np.linalg.cond(through) > 1e12 or np.abs(np.linalg.det(through)) < 1e-12:
-            raise LinearizationError(
-                "the loop is ill-posed: its direct part is -1",
-                where=f"loop at '{self.signal}'",
-                hint="add the lag that is there",
-            )
-        return np.asarray(np.linalg.eigvals(a - b @ np.linalg.solve(through, c)), dtype=complex)
+        equation = open_equation(self.open)
+        closed = equation.closed(np.ones(len(self.open.input_names)))
+        if not equation.channels:
+            return np.asarray(np.linalg.eigvals(closed.matrix), dtype=complex)
+        values, means = closed.roots.values, sliding_means(closed)
+        return np.delete(values, np.argsort(np.abs(values), kind="stable")[:means])
 
     def sensitivity(self, omega: Array | None = None) -> FrequencyResponse:
         """S = (1 + L)^-1."""
@@ -207,39 +207,35 @@ Curves = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class Crossing:
-    """A frequency in rad/s and the margin there."""
-
-    omega: float
-    value: float
-
-
-@dataclass(frozen=True)
 class Margins:
-    """Margins of 1 + L = 0. Infinite where the curve has no such crossing.
+    """Margins of 1 + L = 0. Infinite where the curve has no such crossing, nan where the closed loop is not stable.
 
-    gain: factors on L that reach -1, nearest to 1 first (as 1/|L|; below 1 for a loop that must not be weakened).
-    phase: degrees at |L| = 1. delay: s that the loop stands, at its frequency. modulus: the smallest |1 + L|, the
-    stability margin, 1 over the peak of S. disk: alpha of the balanced disk |(S - T)/2| < 1/alpha, with the gain and
-    phase it guarantees together. stable: whether the closed loop is (delays in Pade form).
+    gain: factors on L that reach -1, nearest to 1 first, those at 0 and infinite frequency among them. gain_margin: the
+    smallest factor above 1 at which stability is lost, infinite where there is none; lower_gain_margin: the largest below 1,
+    0 where the gain may fall to nothing. phase: degrees at |L| = 1. delay: s that the loop stands, at its frequency.
+    modulus: the smallest |1 + L|, the stability margin, 1 over the peak of S. disk: alpha of the balanced disk
+    |(S - T)/2| < 1/alpha, with the gain and phase it guarantees together. stability: of the closed loop, delays exact.
     """
 
     gain: tuple[Crossing, ...]
+    gain_margin: Crossing
+    lower_gain_margin: Crossing
     phase: tuple[Crossing, ...]
     delay: Crossing
     modulus: Crossing
     disk: Crossing
-    stable: bool
+    stability: Stability
 
     @property
-    def gain_margin(self) -> Crossing:
-        """The smallest factor above 1 that reaches the limit of stability."""
-        above = [c for c in self.gain if c.value > 1.0]
-        return min(above, key=lambda c: c.value, default=Crossing(float("inf"), float("inf")))
+    def stable(self) -> bool | None:
+        """Whether the closed loop is stable, delays exact; None where it cannot be told."""
+        return _stable(self.stability)
 
     @property
     def phase_margin(self) -> Crossing:
-        """The phase margin of the smallest size, degrees."""
+        """The phase margin of the smallest size, degrees; negative where a phase lead is what the loop stands least."""
+        if not self.stable:
+            return NONE
         return min(self.phase, key=lambda c: abs(c.value), default=Crossing(float("inf"), float("inf")))
 
     @property
@@ -253,13 +249,14 @@ class Margins:
         return disk_phase(self.disk.value)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the margins as plain numbers."""
+        """Return the margins as plain numbers; all of them nan where the closed loop is not stable."""
 
         def pair(c: Crossing) -> dict[str, float]:
-            return {"value": c.value, "omega": c.omega}
+            return {"value": c.value, "omega": c.omega} if self.stable else {"value": NONE.value, "omega": NONE.omega}
 
         return {
             "gain_margin": pair(self.gain_margin),
+            "lower_gain_margin": pair(self.lower_gain_margin),
             "phase_margin_deg": pair(self.phase_margin),
             "delay_margin_s": pair(self.delay),
             "modulus_margin": pair(self.modulus),
@@ -269,16 +266,36 @@ class Margins:
 
     def __str__(self) -> str:
         if not self.stable:
-            return "the closed loop is not stable: it has no margins"
-        gain, phase = self.gain_margin, self.phase_margin
-        hertz = 2 * np.pi
-        first = f"gain {gain.value:.4g} at {gain.omega / hertz:.4g} Hz" if np.isfinite(gain.value) else "gain unlimited"
+            return _without_margins(self.stability, "the closed loop is")
+        phase, hertz = self.phase_margin, 2 * np.pi
         second = (
             f"phase {phase.value:.4g} degrees at {phase.omega / hertz:.4g} Hz, delay {1e3 * self.delay.value:.4g} ms"
             if np.isfinite(phase.value)
             else "phase unlimited"
         )
-        return f"{first}, {second}, modulus {self.modulus.value:.3g}, {_disk_text(self.disk)}"
+        return f"{self._gain_text()}, {second}, modulus {self.modulus.value:.3g}, {_disk_text(self.disk)}"
+
+    def _gain_text(self) -> str:
+        upper, lower, hertz = self.gain_margin, self.lower_gain_margin, 2 * np.pi
+        first = (
+            f"gain {upper.value:.4g} at {upper.omega / hertz:.4g} Hz" if np.isfinite(upper.value) else "gain unlimited"
+        )
+        if lower.value > 0:
+            first += f" and not below {lower.value:.4g} at {lower.omega / hertz:.4g} Hz"
+        return first
+
+
+def _stable(found: Stability) -> bool | None:
+    return None if found.verdict == "not decided" else found.verdict == "stable"
+
+
+def _without_margins(found: Stability, what: str) -> str:
+    """Return the sentence on closed loops that are not stable, or of which it cannot be told."""
+    if found.verdict == "not decided":
+        return f"whether {what} stable cannot be told, so that no margins are given: {found.reason}"
+    if found.verdict != "unstable":
+        return f"{what} on the limit of stability: there are no margins"
+    return f"{what} not stable ({found.count_text}): there are no margins"
 
 
 @dataclass(frozen=True, eq=False)
@@ -286,12 +303,17 @@ class LoopMargins:
     """Margins of several loops of one plant. each: of every loop alone, by signal, the others closed.
 
     disk: alpha of the balanced disk in which every loop's gain and phase may vary at once, independently of each other
-    (multi-loop disk margin); a bound from below, exact for up to three loops. stable: whether the closed loops are.
+    (multi-loop disk margin); a bound from below, exact for up to three loops. stability: of the closed loops, delays exact.
     """
 
     each: FrozenMap[Margins]
     disk: Crossing
-    stable: bool
+    stability: Stability
+
+    @property
+    def stable(self) -> bool | None:
+        """Whether the closed loops are stable, delays exact; None where it cannot be told."""
+        return _stable(self.stability)
 
     @property
     def disk_gain(self) -> float:
@@ -311,9 +333,18 @@ class LoopMargins:
             "gain": self.disk_gain,
             "phase_deg": self.disk_phase,
         }
-        return {"loops": {n: m.to_dict() for n, m in self.each.items()}, "disk_margin": disk, "stable": self.stable}
+        return {
+            "loops": {n: m.to_dict() for n, m in self.each.items()},
+            "disk_margin": disk,
+            "stable": self.stable,
+            "stability": self.stability.to_dict(),
+        }
 
     def __str__(self) -> str:
+        if not self.stable:
+            return _without_margins(
+                self.stability, "the closed loop is" if len(self.each) == 1 else "the closed loops are"
+            )
         lines = [f"{name}: {m}" for name, m in self.each.items()]
         if len(self.each) > 1:
             lines.append(f"all loops at once: {_disk_text(self.disk)}")
@@ -321,12 +352,16 @@ class LoopMargins:
 
 
 def disk_gain(alpha: float) -> float:
-    """Return the factor either way of a balanced disk margin alpha."""
+    """Return the factor either way of a balanced disk margin alpha; nan for one that is nan."""
+    if np.isnan(alpha):
+        return alpha
     return (2.0 + alpha) / (2.0 - alpha) if alpha < 2.0 else float("inf")
 
 
 def disk_phase(alpha: float) -> float:
-    """Return the degrees either way of a balanced disk margin alpha."""
+    """Return the degrees either way of a balanced disk margin alpha; nan for one that is nan."""
+    if np.isnan(alpha):
+        return alpha
     return float(2.0 * np.degrees(np.arctan(alpha / 2.0))) if alpha < 2.0 else 90.0
 
 
@@ -351,8 +386,28 @@ def margins(loop: Loop | LinearModel, omega: Array | None = None) -> Margins:
     def values(w: Array) -> Array:
         return transfer(model, 1j * w)[:, 0, 0]
 
-    closed = Loop("loop", model).closed_poles()
-    return _of_curve(values, _grid(model, omega), bool((closed.real < 0).all()))
+    closing = Closing(open_equation(model), 0)
+    return _of_curve(values, _grid(model, closing, omega), closing)
+
+
+def open_equation(model: LinearModel) -> Characteristic:
+    """Return the characteristic equation of open loops, to be closed; sliding means of models with delays left in it.
+
+    Raises LinearizationError where the direct part is -1.
+    """
+    if model.delay_free is not None:
+        found = Characteristic.of(model.delay_free)
+    else:
+        a, b, c, d = without_sliding_means(model)
+        found = Characteristic(a, a.shape[0], (), b, c, d)
+    through = np.eye(found.through.shape[0]) + found.through
+    if np.linalg.cond(through) > 1e12 or np.abs(np.linalg.det(through)) < 1e-12:
+        raise LinearizationError(
+            "the loop is ill-posed: its direct part is -1",
+            where=f"loop at '{', '.join(model.input_names)}'",
+            hint="add the lag that is there",
+        )
+    return found
 
 
 def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMargins:
@@ -370,15 +425,18 @@ def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMa
             got=f"{len(names)} inputs and {len(model.output_names)} outputs",
             hint="open the model at signals: loop(model, [...])",
         )
-    closed = Loop("loops", model).closed_poles()
-    stable, grid = bool((closed.real < 0).all()), _grid(model, omega)
+    equation = open_equation(model)
+    found = stability(equation.closed(np.ones(len(names))))
     sensitivity = _sensitivity(model)
-    each = {n: _of_curve(_alone(sensitivity, i), grid, stable) for i, n in enumerate(names)}
-    if not stable:
-        return LoopMargins(FrozenMap(each), Crossing(float("nan"), 0.0), False)
+    each = {}
+    for i, n in enumerate(names):
+        closing = Closing(equation, i)
+        each[n] = _of_curve(_alone(sensitivity, i), _grid(model, closing, omega), closing)
+    if found.verdict != "stable":
+        return LoopMargins(FrozenMap(each), NONE, found)
     if len(names) == 1:
-        return LoopMargins(FrozenMap(each), each[names[0]].disk, stable)
-    return LoopMargins(FrozenMap(each), _common_disk(sensitivity, grid), stable)
+        return LoopMargins(FrozenMap(each), each[names[0]].disk, found)
+    return LoopMargins(FrozenMap(each), _common_disk(sensitivity, _grid(model, Closing(equation, 0), omega)), found)
 
 
 def _sensitivity(model: LinearModel) -> Curves:
@@ -407,27 +465,55 @@ def _alone(sensitivity: Curves, i: int) -> Curves:
     return values
 
 
-def _grid(model: LinearModel, omega: Array | None) -> Array:
+def _grid(model: LinearModel, closing: Closing, omega: Array | None) -> Array:
+    """Return the frequencies at which curves are computed first: around open and closed poles, and beside crossings."""
     if omega is not None:
         return np.asarray(omega, dtype=float)
     own = default_omega(model, 4000)
-    return np.unique(np.concatenate([own, own[0] * np.logspace(-4, 0, 200)]))
+    closed = np.abs(closing.open.closed(np.ones(closing.open.through.shape[0])).roots.values)
+    closed = closed[closed > 1e-6 * own[0]]
+    beyond = [np.geomspace(own[-1], 30.0 * v, 200) for v in (closed.max(initial=0.0),) if 30.0 * v > own[-1]]
+    grid = np.concatenate([own, own[0] * np.logspace(-4, 0, 200), *beyond])
+    if not closing.open.channels and closing.open.through.shape == (1, 1):
+        at = crossing_frequencies(closing.open.matrix, closing.open.given, closing.open.read, closing.open.through)
+        grid = np.concatenate([grid, *(at * (1.0 + k) for k in (-1e-3, -1e-6, 1e-6, 1e-3))])
+    return np.unique(grid[grid > 0.0])
 
 
-def _of_curve(values_at: Curves, grid: Array, stable: bool) -> Margins:
+def _of_curve(values_at: Curves, grid: Array, closing: Closing) -> Margins:
     """Return the margins of a loop whose transfer function is given over rad/s."""
+    found = closing.at(1.0)
     values = values_at(grid)
+    if closing.open.channels and found.verdict == "stable":
+        grid, values = refined(values_at, grid, values)
 
     def curve(w: float) -> complex:
         return complex(values_at(np.array([w]))[0])
 
-    gain = tuple(sorted(_gains(grid, values, curve), key=lambda c: abs(np.log(c.value))))
-    phase = tuple(_phases(grid, values, curve))
-    delays = [Crossing(c.omega, float(np.radians(c.value % 360.0) / c.omega)) for c in phase if c.omega > 0]
-    none = Crossing(float("inf"), float("inf"))
+    gain, phase = (
+        _gains(grid, values, curve, FLOOR if closing.open.channels else 0.0),
+        tuple(_phases(grid, values, curve)),
+    )
     modulus = _smallest(grid, np.abs(1 + values), lambda w: abs(1 + curve(w)))
+    if found.verdict != "stable":
+        return Margins(_nearest(gain), NONE, NONE, phase, NONE, modulus, NONE, found)
+    gain += closing.ends()
     disk = _smallest(grid, _disk(values), lambda w: float(_disk(np.array([curve(w)]))[0]))
-    return Margins(gain, phase, min(delays, key=lambda c: c.value, default=none), modulus, disk, stable)
+    upper, lower = closing.limit(gain, 1), closing.limit(gain, -1)
+    return Margins(_nearest(gain), upper, lower, phase, _delay(phase, closing), modulus, disk, found)
+
+
+def _nearest(gain: list[Crossing]) -> tuple[Crossing, ...]:
+    return tuple(sorted(gain, key=lambda c: abs(np.log(c.value))))
+
+
+def _delay(phase: Sequence[Crossing], closing: Closing) -> Crossing:
+    """Return the smallest delay that takes a crossing of the unit circle to -1; none is stood where |L| >= 1 at infinity."""
+    t = closing.open.closed(np.ones(closing.open.through.shape[0])).through[closing.place, closing.place]
+    if abs(t) >= abs(1.0 - t):  # |L| = |T/(1 - T)|
+        return Crossing(float("inf"), 0.0)
+    delays = [Crossing(c.omega, float(np.radians(c.value % 360.0) / c.omega)) for c in phase if c.omega > 0]
+    return min(delays, key=lambda c: c.value, default=Crossing(float("inf"), float("inf")))
 
 
 def _common_disk(sensitivity: Curves, grid: Array) -> Crossing:
@@ -529,12 +615,12 @@ def _disk(values: Array) -> Array:
     return np.asarray(2.0 * np.abs(1 + values) / np.maximum(np.abs(1 - values), 1e-300))
 
 
-def _gains(grid: Array, values: Array, curve: Curve) -> list[Crossing]:
-    """Crossings of the negative real axis."""
+def _gains(grid: Array, values: Array, curve: Curve, floor: float) -> list[Crossing]:
+    """Crossings of the negative real axis, where L is above a floor: with delays there are infinitely many near 0."""
     found = []
-    imag = values.imag
-    for k in np.flatnonzero((imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:])):
-        w = float(brentq(lambda x: curve(x).imag, grid[k], grid[k + 1], xtol=1e-14 * grid[k + 1], rtol=1e-14))
+    imag, large = values.imag, np.maximum(np.abs(values[1:]), np.abs(values[:-1])) > floor
+    for k in np.flatnonzero((imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:]) & large):
+        w = _zero(lambda x: curve(x).imag, grid[k], grid[k + 1])
         real = curve(w).real
         if real < -1e-9 and abs(curve(w).imag) < 1e-6 * abs(real):
             found.append(Crossing(w, -1.0 / real))
@@ -546,10 +632,18 @@ def _phases(grid: Array, values: Array, curve: Curve) -> list[Crossing]:
     found = []
     level = np.abs(values) - 1.0
     for k in np.flatnonzero((level[:-1] * level[1:] <= 0) & (level[:-1] != level[1:])):
-        w = float(brentq(lambda x: abs(curve(x)) - 1.0, grid[k], grid[k + 1], xtol=1e-14 * grid[k + 1], rtol=1e-14))
+        w = _zero(lambda x: abs(curve(x)) - 1.0, grid[k], grid[k + 1])
         angle = float(np.degrees(np.angle(curve(w)))) + 180.0
         found.append(Crossing(w, (angle + 180.0) % 360.0 - 180.0))
     return found
+
+
+def _zero(function: Callable[[float], float], low: float, high: float) -> float:
+    """Return where a function changes sign; the end nearer to 0 where rounding errors alone made it seem to."""
+    first, last = function(low), function(high)
+    if first * last > 0.0:
+        return low if abs(first) < abs(last) else high
+    return float(brentq(function, low, high, xtol=1e-14 * high, rtol=1e-14))
 
 
 def _smallest(grid: Array, values: Array, at: Callable[[float], float]) -> Crossing:

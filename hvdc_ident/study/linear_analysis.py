@@ -250,13 +250,27 @@ def lines(data: Mapping[str, Any]) -> list[str]:
 
 
 def stability(data: Mapping[str, Any]) -> str:
-    """Return whether the operating point is stable, with its rightmost eigenvalue; empty for a model without modes."""
-    values = [complex(*m["eigenvalue"]) for m in data["modes"] if "sliding mean" not in str(m["kind"])]
-    right = max((v.real for v in values), default=None)
-    if right is None:
-        return ""
-    verdict = "stable" if right < -1e-9 else "on the limit of stability" if right < 1e-6 else "unstable"
-    return f"{verdict}, rightmost eigenvalue {right:.4g} 1/s"
+    """Return whether the operating point is stable, with its rightmost eigenvalue; empty for a model without modes.
+
+    Of a model with delays the number of its unstable roots comes along, which is what the verdict rests on.
+    """
+    found = data["stability"]
+    right = f", rightmost eigenvalue {found['rightmost'][0]:.4g} 1/s" if found["rightmost"] else ""
+    if found["method"] == "eigenvalues of A":
+        return f"{found['verdict']}{right}" if right else ""
+    if found["verdict"] == "not decided":
+        return f"stability not decided: {found['reason']}"
+    why = f": {found['reason']}" if found["reason"] else ""
+    return f"{found['verdict']}{right} ({unstable_roots(found)}, delays exact){why}"
+
+
+def unstable_roots(found: Mapping[str, Any]) -> str:
+    """Return how many roots lie right of the imaginary axis, in words."""
+    count = found["unstable_roots"]
+    if count is None or math.isinf(count):
+        return "infinitely many unstable roots"
+    number = f"{count:.0f} unstable root{'' if count == 1 else 's'}"
+    return f"at least {number}" if found["reason"] else number
 
 
 def _point_lines(data: Mapping[str, Any]) -> list[str]:
@@ -310,20 +324,37 @@ def _locus_lines(found: Mapping[str, Any]) -> list[str]:
     return lines or [f"along {span} stability is neither lost nor won"]
 
 
+def without_margins(found: Mapping[str, Any]) -> str:
+    """Return the sentence on closed loops that are not stable, or of which it cannot be told."""
+    s = found["stability"]
+    if s["verdict"] == "not decided":
+        return f"whether the closed loops are stable cannot be told, so that no margins are given: {s['reason']}"
+    if s["verdict"] != "unstable":
+        return "the closed loops are on the limit of stability: they have no margins"
+    return f"the closed loops are not stable: they have no margins ({unstable_roots(s)})"
+
+
+def _at(margin: Mapping[str, float | None], unit: str = "", factor: float = 1.0) -> str:
+    """Return a margin with its frequency; one without a limit (infinite, or a factor of 0) is unlimited."""
+    value, omega = margin["value"], margin["omega"]
+    if value is None or (omega is None and value == 0.0 and not unit) or math.isinf(value):
+        return "unlimited"
+    where = "at infinite frequency" if omega is None or math.isinf(omega) else f"at {omega / math.tau:.4g} Hz"
+    return f"{factor * value:.4g}{unit} {where}"
+
+
 def _margin_lines(found: Mapping[str, Any]) -> list[str]:
     """The margins of each loop, of all together, and of plant and controller."""
     if not found:
         return []
     result = []
     if "stable" in found and not found["stable"]:
-        result.append("the closed loops are not stable: they have no margins")
+        result.append(without_margins(found))
     for name, m in (found.get("loops") or {}).items() if found.get("stable") else ():
-        gain, phase, disk = m["gain_margin"], m["phase_margin_deg"], m["disk_margin"]
-        first = "unlimited" if gain["value"] is None or gain["value"] > 1e12 else f"{gain['value']:.4g}"
-        second = "unlimited" if phase["value"] is None or abs(phase["value"]) > 360 else f"{phase['value']:.4g} degrees"
-        crossover = "" if second == "unlimited" else f" at {phase['omega'] / math.tau:.4g} Hz"
         result.append(
-            f"loop at {name}: gain margin {first}, phase margin {second}{crossover}, disk {disk['value']:.3g}"
+            f"loop at {name}: gain margin {_at(m['gain_margin'])}, lower gain margin {_at(m['lower_gain_margin'])}, phase "
+            f"margin {_at(m['phase_margin_deg'], ' degrees')}, delay margin {_at(m['delay_margin_s'], ' ms', 1e3)}, disk "
+            f"{m['disk_margin']['value']:.3g}"
         )
     if found.get("stable") and len(found["loops"]) > 1:
         disk = found["disk_margin"]

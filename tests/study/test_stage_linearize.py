@@ -260,3 +260,88 @@ def test_screen_ranks_the_candidates(tmp_path):
     path.write_text(path.read_text().replace("b = {min = 0.5, max = 2.5}", "b = {start = 1.0}"))
     refused = run("screen", path, "--out", tmp_path / "q")
     assert refused.exit_code == 2 and "no range" in refused.output
+
+
+# --- verdicts on stability, and margins below 1 ---
+
+LATE = """schema = 1
+name = "late-damping"
+[parameters]
+T = {value = 2.2, unit = "s"}
+[inputs]
+r = {value = 0.0}
+[states]
+x = {derivative = "v"}
+v = {derivative = "49*(e - x) - 0.14*v"}
+[signals]
+e = "r - 0.02*late"
+[delays]
+late = {of = "v", time = "T"}
+[outputs]
+x = "x"
+"""
+
+LEAN = """schema = 1
+name = "leaning"
+[inputs]
+r = {value = 0.0}
+[states]
+x = {derivative = "1.5*x + 6*e"}
+[signals]
+e = "r - x"
+[outputs]
+x = "x"
+"""
+
+
+def answered(tmp_path, card, more=""):
+    (tmp_path / "plant.toml").write_text(card)
+    study = tmp_path / "study.toml"
+    study.write_text(
+        'schema = 1\nname = "s"\n[model]\nsource = "plant.toml"\n[linearize]\ninputs = ["r"]\noutputs = ["x"]\n'
+        f'break_at = ["e"]\n{more}'
+    )
+    result = run("linearize", study, "--out", tmp_path / "r")
+    assert result.exit_code == 0 and run("report", tmp_path / "r").exit_code == 0, result.output
+    data = json.loads((tmp_path / "r/linearization.json").read_text())
+    return data, result.output, (tmp_path / "r/report.html").read_text()
+
+
+def test_a_late_loop_is_unstable_on_the_screen_in_the_json_and_in_the_report(tmp_path):
+    """Of s^2 + 0.14 s + 49 + 0.98 s exp(-2.2 s) two roots grow; with a Pade approximant of order 5 all decay."""
+    s = 7j
+    for _ in range(60):
+        z = 0.98 * np.exp(-2.2 * s)
+        s -= (s * s + 0.14 * s + 49 + s * z) / (2 * s + 0.14 + z * (1 - 2.2 * s))
+    data, shown, page = answered(tmp_path, LATE, 'locus = {parameter = "T", min = 0.1, max = 2.2, points = 4}\n')
+    assert s.real > 0.1 and np.linalg.eigvals(np.array(data["A"])).real.max() < -0.1
+    found = data["stability"]
+    assert data["stable"] is False and found["verdict"] == "unstable" and found["unstable_roots"] == 2
+    assert found["rightmost"] == pytest.approx([s.real, s.imag], rel=1e-9)
+    assert data["modes"][0]["eigenvalue"] == found["rightmost"] and set(data["modes"][0]["participation"]) == {
+        "x",
+        "v",
+        "late",
+    }
+    assert data["margins"]["stable"] is False and data["margins"]["loops"]["e"]["phase_margin_deg"]["value"] is None
+    assert data["locus"]["unstable_roots"][-1] == 2 and data["norms"]["whole"]["hinf"] is None
+    assert f"operating point: unstable, rightmost eigenvalue {s.real:.4g} 1/s (2 unstable roots, delays exact)" in shown
+    assert "the closed loops are not stable: they have no margins (2 unstable roots)" in shown
+    assert "phase margin" not in shown
+    assert "<strong>unstable</strong>" in page and "argument principle: 2 unstable roots" in page
+    assert "The closed loops are unstable (2 unstable roots): they have no margins" in page
+
+
+def test_a_lower_gain_margin_is_shown(tmp_path):
+    """6/(s - 1.5): closed at 1.5 - 6 k, so that the gain must not fall to a quarter; |L| = 1 at sqrt(36 - 2.25) rad/s."""
+    data, shown, page = answered(tmp_path, LEAN)
+    m = data["margins"]["loops"]["e"]
+    assert m["lower_gain_margin"] == {"value": pytest.approx(0.25, rel=1e-12), "omega": 0.0}
+    assert m["gain_margin"] == {"value": None, "omega": None}
+    w = np.sqrt(36 - 2.25)
+    assert m["phase_margin_deg"] == {"value": pytest.approx(np.degrees(np.arctan(w / 1.5))), "omega": pytest.approx(w)}
+    assert (
+        "loop at e: gain margin unlimited, lower gain margin 0.25 at 0 Hz, phase margin 75.52 degrees at 0.9246 Hz"
+        in shown
+    )
+    assert "lower gain" in page and "unlimited" in page

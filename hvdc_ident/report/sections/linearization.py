@@ -58,15 +58,26 @@ def _which(given: dict[str, Any], fit: dict[str, Any]) -> str:
 
 
 def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
-    real = [float(m["eigenvalue"][0]) for m in data["modes"] if "sliding mean" not in str(m.get("kind", ""))]
-    right = max(real, default=0.0)
-    verdict = "stable" if right < -1e-9 else "on the limit of stability" if right < 1e-6 else "unstable"
+    found = data["stability"]
+    right = f", rightmost real part {number(found['rightmost'][0])} 1/s" if found["rightmost"] else ""
+    verdict = "not shown to be stable or unstable" if found["verdict"] == "not decided" else found["verdict"]
+    why = "" if found["method"] == "eigenvalues of A" else f"; {text(found['method'])}{_count(found)}"
     return (
-        f"<p>{len(data['modes'])} modes; the operating point is <strong>{verdict}</strong>, rightmost real part "
-        f"{number(right)} 1/s. Largest scaled residual {number(point.get('residual'), 2)}; the Jacobian differs from "
+        f"<p>{len(data['modes'])} modes; the operating point is <strong>{text(verdict)}</strong>{right}{why}. Largest "
+        f"scaled residual {number(point.get('residual'), 2)}; the Jacobian differs from "
         f"{CHECKS[data.get('method', 'symbolic')]} by {number(data.get('jacobian_error'), 2)}.</p>"
         + "".join(f"<p>{text(note)}</p>" for note in data.get("notes") or ())
     )
+
+
+def _count(found: dict[str, Any]) -> str:
+    """How many roots are unstable, and why that cannot be told where it cannot."""
+    count, why = found["unstable_roots"], f" ({text(found['reason'])})" if found["reason"] else ""
+    if found["verdict"] == "not decided":
+        return f": not decided{why}"
+    if count is None:
+        return f": infinitely many unstable roots{why}"
+    return f": {'at least ' if why else ''}{count:.0f} unstable root{'' if count == 1 else 's'}{why}"
 
 
 def _modes(given: list[dict[str, Any]], fitted: dict[str, Any] | None) -> str:
@@ -163,6 +174,13 @@ def _hertz(omega: Any) -> str:
     return number(omega / (2 * np.pi)) if isinstance(omega, int | float) else number(omega)
 
 
+def _limit(margin: dict[str, Any], factor: float = 1.0) -> tuple[str, str]:
+    """A margin and its frequency as text; no value is no limit, and no frequency an infinite one."""
+    if margin["value"] is None:
+        return "unlimited", ""
+    return number(factor * margin["value"]), "infinite" if margin["omega"] is None else _hertz(margin["omega"])
+
+
 def _margins(data: dict[str, Any]) -> str:
     """The margins of each loop, of all at once, and of plant and controller."""
     found = data.get("margins")
@@ -170,24 +188,32 @@ def _margins(data: dict[str, Any]) -> str:
         return ""
     page = "<h3>Margins</h3>"
     if found.get("stable") is False:
-        page += "<p>The closed loops are not stable: they have no margins.</p>"
+        s = found["stability"]
+        count = f" ({_count(s).removeprefix(': ')})" if s["verdict"] == "unstable" else ""
+        page += f"<p>The closed loops are {text(s['verdict'])}{count}: they have no margins.</p>"
+    elif found.get("stable") is None and found.get("loops"):
+        page += (
+            "<p>Whether the closed loops are stable cannot be told, so that no margins are given: "
+            f"{text(found['stability']['reason'])}.</p>"
+        )
     elif found.get("loops"):
         rows = []
         for name, m in found["loops"].items():
-            gain, phase, disk = m["gain_margin"], m["phase_margin_deg"], m["disk_margin"]
-            delay = m["delay_margin_s"]["value"]
+            gain, lower, phase = m["gain_margin"], m["lower_gain_margin"], m["phase_margin_deg"]
+            delay, disk = m["delay_margin_s"], m["disk_margin"]
             rows.append(
                 [
                     text(name),
-                    number(gain["value"]) if gain["value"] is not None else "unlimited",
-                    number(phase["value"]) if phase["value"] is not None else "unlimited",
-                    _hertz(phase["omega"]),
-                    number(1e3 * delay) if delay is not None else "unlimited",
+                    *_limit(gain),
+                    *(("unlimited", "") if lower["value"] == 0 else _limit(lower)),
+                    *_limit(phase),
+                    _limit(delay, 1e3)[0],
                     number(m["modulus_margin"]["value"], 3),
                     number(disk["value"], 3),
                 ]
             )
-        header = ["loop opened at", "gain", "phase, degrees", "at, Hz", "delay, ms", "modulus", "disk"]
+        header = ["loop opened at", "gain", "at, Hz", "lower gain", "at, Hz", "phase, degrees", "at, Hz", "delay, ms"]
+        header += ["modulus", "disk"]
         page += table(header, rows)
         if len(rows) > 1:
             disk = found["disk_margin"]
