@@ -4,6 +4,7 @@
     ├── InputError              the input is wrong: exit code 2 on the command line
     │   ├── ExpressionError     text that is no expression of the grammar
     │   ├── ModelError          a model or model card that does not hold together
+    │   │   └── TimingError     a delay or sampling period that cannot be simulated at these values of the parameters
     │   ├── UnknownNameError    a name that is not there, with the nearest ones
     │   ├── WaveformError       a data file or signal that cannot be used
     │   ├── StudyError          a study file that asks for the impossible
@@ -73,6 +74,10 @@ class ExpressionError(InputError):
 
 class ModelError(InputError):
     """A model that does not hold together."""
+
+
+class TimingError(ModelError):
+    """A delay or sampling period that cannot be simulated at these values; a search that meets it looks elsewhere."""
 
 
 class UnknownNameError(InputError):

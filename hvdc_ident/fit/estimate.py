@@ -110,6 +110,9 @@ def _result(
     status, message = _status(problem, best, near, outcomes, effective_share, trend, refitted=refitted)
     noise = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
     judged = adequacy(problem, blocks, noise, inner.effective, inner.rho)
+    jump = 0.0 if trend is None else LUCK * trend.roughness
+    doubt = _doubt(problem, outcomes, samples, effective_share, jump)
+    message = f"{doubt}; {message}" if doubt else message
     inner, everything = inner.widened(judged.widening), everything.widened(judged.widening)
     estimates = estimates_of(problem, best.theta, blocks, inner, everything)
     estimates = _with_rivals(problem, estimates, near)
@@ -143,6 +146,7 @@ def _result(
         correlation=inner.correlation(),
         residual_tests=residual_tests(in_time, problem.fitted_experiments),
         starts=outcomes,
+        search_doubt=doubt,
         loss=problem.loss.name,
         whitening={o: m for o, m in problem.treatment.whitening.items() if any(m)},
         dof=float(inner.dof) if np.isfinite(inner.dof) else None,
@@ -263,6 +267,39 @@ def _arrived(
         and (o.cost <= best.cost + slack or (o.status != "failed" and _same_place(problem, best, o)))
     ]
     return [o for _, o in sorted(reached, key=lambda pair: pair[0])]
+
+
+def _doubt(
+    problem: Problem, outcomes: Sequence[StartOutcome], samples: int, effective_share: float, jump: float
+) -> str:
+    """Return in words that one start alone reached the lowest cost of several; "" where another did, or none disagrees.
+
+    Then the starts say nothing of how likely a still lower cost is. The size of the residual is the unit of cost, whether or not the
+    noise is known: costs that differ by less lead to the same estimates. samples: number of residuals.
+    """
+    ends = sorted(((o.cost, o) for o in outcomes if o.cost is not None), key=lambda pair: pair[0])
+    if len(outcomes) < 2 or not ends:
+        return ""
+    lowest, first = ends[0]
+    spread = max(1.0, 2.0 * lowest / max(samples - len(problem.unknowns), 1))
+    slack = max(1e-6 * lowest, spread * SAME / effective_share) + jump
+    best = LocalMinimum(_end(problem, first), lowest)
+    others = [cost for cost, o in ends[1:] if cost > lowest + slack and not _same_place(problem, best, o)]
+    if len(others) < len(ends) - 1:
+        return ""
+    levels = [c for k, c in enumerate(others) if k == 0 or c > others[k - 1] + slack]
+    failed = len(outcomes) - len(ends)
+    parts = []
+    if levels:
+        costs = f"{len(levels)} higher costs" if len(levels) > 1 else "a higher cost"
+        between = f" from {levels[0]:.4g} to {levels[-1]:.4g}" if len(levels) > 1 else f" of {levels[0]:.4g}"
+        parts.append(f"{len(others)} ended at {costs}{between}")
+    if failed:
+        parts.append(f"{failed} failed")
+    return (
+        f"one start of {len(outcomes)} alone reached the lowest cost, {lowest:.4g} ({', '.join(parts)}): a lower one may exist, "
+        "and [fit] starts = ... searches from more"
+    )
 
 
 def _end(problem: Problem, outcome: StartOutcome) -> Array:

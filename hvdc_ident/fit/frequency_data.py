@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, Trajectory
-from hvdc_ident.errors import LinearizationError, SimulationError, SteadyStateError
+from hvdc_ident.errors import LinearizationError, SimulationError, SteadyStateError, TimingError
 from hvdc_ident.fit.simulator import SimulationRun, Simulator
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import MeasuredResponse
@@ -115,7 +115,7 @@ class WithResponses:
         response = self.responses[experiment.name]
         try:
             answer, slopes = response.of_model(self.model, values, sensitivities)
-        except (SteadyStateError, LinearizationError) as e:
+        except (SteadyStateError, LinearizationError, TimingError) as e:
             where = f"response '{response.name}': {e.where}".removesuffix(": ")
             raise SimulationError(e.what, where=where, expected=e.expected, got=e.got, hint=e.hint) from None
         names = [output_name(response, label, part) for label in response.labels for part in ("re", "im")]

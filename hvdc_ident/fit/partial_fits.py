@@ -150,6 +150,7 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
         effective_samples=FrozenMap({k: v for r in results for k, v in r.effective_samples.items()}),
         correlation={k: v for r in results for k, v in r.correlation.items()},
         starts=tuple(replace(s, group=i) for i, r in enumerate(results) for s in r.starts),
+        search_doubt="; ".join(f"group {i + 1}: {r.search_doubt}" for i, r in enumerate(results) if r.search_doubt),
         loss=problem.loss.name,
         whitening={o: m for r in results for o, m in r.whitening.items()},
         dof=min((r.dof for r in results if r.dof is not None), default=None),

@@ -89,6 +89,7 @@ class FitResult(Shown):
     noise_source: by output, in words. sigma: standard deviation by experiment and output, in the output's unit.
     rho, effective_samples: AR(1) coefficient of the residuals and independent samples, by output.
     correlation: between the estimates. residual_tests: by output and experiment. starts: outcomes of the multistart.
+    search_doubt: in words, that one start alone reached the lowest cost; the message begins with it. Empty otherwise.
     per_experiment: statistics over fits to single experiments, where they were made.
     loss, whitening: what residuals cost, and the AR coefficients they were whitened with, by output.
     dof: degrees of freedom of Student's t behind the intervals, None where the noise is known and white (its square is
@@ -117,6 +118,7 @@ class FitResult(Shown):
     correlation: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     residual_tests: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     starts: tuple[StartOutcome, ...] = ()
+    search_doubt: str = ""
     per_experiment: Mapping[str, Any] = field(default_factory=dict)
     loss: str = "linear"
     whitening: Mapping[str, tuple[float, ...]] = field(default_factory=dict)

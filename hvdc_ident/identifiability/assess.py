@@ -129,7 +129,7 @@ def _data_notes(assessment: Assessment, optimum: LocalAnalysis, result: FitResul
         reasons = unknown_noise(assessment.problem.fitted_experiments, result.noise_source)
         assessment.notes += [f"{o}: {why}; its standard deviation is that of the misfit." for o, why in reasons.items()]
         assessment.remark = f"The noise is that of the misfit ({'; '.join(dict.fromkeys(reasons.values()))})."
-    if result.status in ("two-optima", "not-converged"):
+    if result.search_doubt or result.status in ("two-optima", "not-converged"):
         assessment.notes.append(f"Pilot fit: {result.status}, {result.message}.")
 
 
@@ -183,6 +183,7 @@ def _assembled(
         pilot={
             "status": result.status,
             "message": result.message,
+            "search_doubt": result.search_doubt,
             "starts": len(result.starts),
             "cost": first.cost,
             "chi2_per_dof": first.misfit,

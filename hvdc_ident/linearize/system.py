@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.errors import ModelError
+from hvdc_ident.errors import TimingError
 from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.linearize.limits import Condition, conditions
 from hvdc_ident.model import Model
@@ -254,11 +254,11 @@ class CompiledSystem:
         t = self._run("timing", nd + 2 * nq, zero, zero, p, zero)
         for name, value in zip((*model.delays, *model.sampled), t[: nd + nq], strict=True):
             if not value > 0.0:
-                raise ModelError(
+                raise TimingError(
                     f"the delay or sampling period of '{name}' is not above 0",
                     where=f"model '{model.name}'",
                     got=f"{value:g} s",
-                    hint="leave the effect out, or give it a positive time",
+                    hint="give it a positive time, or leave the effect out; where it is estimated, `min` above 0",
                 )
         return t
 

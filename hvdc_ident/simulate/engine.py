@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hvdc_ident.data import Array, InputSignal
-from hvdc_ident.errors import ModelError, SimulationError
+from hvdc_ident.errors import ModelError, SimulationError, TimingError
 from hvdc_ident.model import Model
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.equations import ModelEquations, by_structure, padded
@@ -76,22 +76,34 @@ class Engine:
             for k, name in enumerate(names):
                 if not values[k] > 0.0:
                     kind = "delay" if k < s.nd else "sampling period"
-                    raise ModelError(
+                    raise TimingError(
                         f"the {kind} of '{name}' is not above 0",
                         where=f"model '{m.name}'",
                         got=f"{values[k]:g} s",
-                        hint="leave the effect out, or give it a positive time",
+                        hint="give it a positive time, or leave the effect out; where it is estimated, `min` above 0",
                     )
             for k, name in enumerate(m.sampled):
                 period, compute = values[s.nd + k], values[s.nd + s.nq + k]
                 if not 0.0 <= compute <= period:
-                    raise ModelError(
+                    raise TimingError(
                         f"the compute time of '{name}' does not fit its period",
                         where=f"model '{m.name}'",
                         expected=f"between 0 and {period:g} s",
                         got=f"{compute:g} s",
                     )
         return values
+
+    def _check_steps(self, delays: Array, span: float, most: int) -> None:
+        """Raise SimulationError where a delay is so short that the run cannot end: no step is longer than a delay."""
+        for name, delay in zip(self.structure.model.delays, delays, strict=True):
+            if delay * most < span:
+                raise SimulationError(
+                    f"the delay of '{name}' is too short to be simulated over {span:g} s",
+                    where=f"model '{self.structure.model.name}'",
+                    expected=f"at least {span / most:.3g} s, for no step is longer than a delay and a run has {most} at most",
+                    got=f"{delay:.6g} s",
+                    hint="leave the delay out; where it is estimated, a `min` well above this",
+                )
 
     # --- the run ---
 
@@ -116,6 +128,7 @@ class Engine:
         u, *tables = _tables(tuple(inputs), begin, end)
         y, w = self.start(p, u, begin, search=tolerance.search, model=model)
         constants = self.constants(p)
+        self._check_steps(constants[: s.nd], end - begin, tolerance.max_steps)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
         sizes = np.ones(max(s.np, 1)) if scale is None else np.ascontiguousarray(scale, dtype=float)
         allowed = np.array([tolerance.rtol, tolerance.atol])

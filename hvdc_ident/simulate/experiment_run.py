@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hvdc_ident.data import Experiment, InputSignal, Trajectory
-from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, require_known
+from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, TimingError, require_known
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, State, fresh, rewritten
@@ -112,13 +112,16 @@ class ModelSimulator:
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
     ) -> Simulation:
-        """Return a run of the experiment. Raises SimulationError; values without a steady state are a run that failed."""
+        """Return a run of the experiment.
+
+        Raises SimulationError; values without a steady state, or with a delay of 0, are a run that failed.
+        """
         try:
             return simulate(
                 self.model, experiment, values, sensitivities,
                 outputs=experiment.outputs or None, tolerance=self.tolerance,
             )  # fmt: skip
-        except SteadyStateError as e:
+        except (SteadyStateError, TimingError) as e:
             raise SimulationError(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None
 
 

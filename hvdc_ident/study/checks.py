@@ -14,8 +14,11 @@ from typing import TYPE_CHECKING, Any
 from hvdc_ident.errors import (
     ComputationError,
     HvdcIdentError,
+    InputError,
+    SimulationError,
     SteadyStateError,
     StudyError,
+    TimingError,
     located,
     require_known,
 )
@@ -23,6 +26,7 @@ from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.study import schema
 
 if TYPE_CHECKING:
+    from hvdc_ident.data import Experiment
     from hvdc_ident.study.study import Study
 
 
@@ -196,34 +200,54 @@ def need_candidates(study: Study, stage: str) -> None:
 
 
 def need_start(study: Study) -> None:
-    """Raise SteadyStateError where an experiment has no steady state at the start values: the study is then wrong.
+    """Raise SteadyStateError where some experiment has no steady state, or TimingError, wherever a search may begin.
 
-    LinearizationError where a measured response has no counterpart there.
+    A start without one is a start that fails, among others that do not; where all are like that the study is wrong.
+    LinearizationError where a measured response has no counterpart at the start values.
     """
-    from contextlib import suppress
-
-    from hvdc_ident.errors import SimulationError
-    from hvdc_ident.simulate import simulate
-
     for experiment in study.experiments:
-        with suppress(SimulationError):
-            simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), study.start)
+        error = _no_start(study, experiment, study.start)
+        if error is not None and not _starts_elsewhere(study, experiment):
+            raise error
     for response in study.responses:
         with located(f"response '{response.name}'"):
             response.of_model(study.model, study.start)
+
+
+def _no_start(study: Study, experiment: Experiment, values: Mapping[str, float]) -> InputError | None:
+    """Return why an experiment cannot begin at these values; None where it can, or fails later."""
+    from hvdc_ident.simulate import simulate
+
+    try:
+        simulate(study.model, experiment.with_(time=experiment.time[:1], measured=None), values)
+    except (SteadyStateError, TimingError) as error:
+        return error
+    except SimulationError:
+        return None
+    return None
+
+
+def _starts_elsewhere(study: Study, experiment: Experiment) -> bool:
+    """Return whether an experiment can begin at one of the points from which a multistart searches the candidates' ranges."""
+    from hvdc_ident.fit.multistart import STARTS, starting_points
+
+    candidates = tuple(study.candidates.values())
+    points = starting_points(candidates, (), STARTS - 1, seed=0)
+    trials = [study.start | {f.name: float(v) for f, v in zip(candidates, p, strict=True)} for p in points]
+    return bool(candidates) and any(_no_start(study, experiment, values) is None for values in trials)
 
 
 @contextmanager
 def at_given(study: Study) -> Iterator[None]:
     """Run what is inside at the given values.
 
-    A model that has no steady state there is wrong input (SteadyStateError). Where the study's search begins elsewhere it
-    is a finding about the vendor's values, a ComputationError, which ends this stage and not those that fit.
+    A model that has no steady state there is wrong input (SteadyStateError). Where the study's search begins, or may go,
+    elsewhere it is a finding about the vendor's values, a ComputationError, which ends this stage and not those that fit.
     """
     try:
         yield
     except SteadyStateError as e:
-        if study.start == study.given:
+        if study.start == study.given and not all(_starts_elsewhere(study, x) for x in study.experiments):
             raise
         raise ComputationError(
             f"at the given values {e.what}",

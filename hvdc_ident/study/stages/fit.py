@@ -177,12 +177,13 @@ def _searched(data: Mapping[str, Any]) -> list[str]:
 
 
 def verdict(data: Mapping[str, Any]) -> str:
-    """Return the fit's status, and the verdict on its residuals."""
+    """Return any doubt about the search, the fit's status, and the verdict on its residuals."""
     from hvdc_ident.fit.result import FIT_WORDS
 
     judged = (data.get("adequacy") or {}).get("verdict")
     words = FIT_WORDS[judged] if judged else ""
-    return f"{data['status']}; {words[:1].lower()}{words[1:]}" if words else str(data["status"])
+    parts = (data.get("search_doubt"), data["status"], f"{words[:1].lower()}{words[1:]}")
+    return "; ".join(str(part) for part in parts if part)
 
 
 STAGE = Stage(

@@ -104,7 +104,8 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     A misfit comes first and its size stands beside every interval: what is read alone is to be believed alone.
     """
     width = max(map(len, data["parameters"]), default=0)
-    lines = []
+    doubt = (data.get("pilot") or {}).get("search_doubt")
+    lines = [f"{doubt[:1].upper()}{doubt[1:]}."] if doubt else []
     beside = ""
     if data["misspecified"]:
         signs = data["misspecification"]
@@ -127,6 +128,8 @@ def verdict(data: Mapping[str, Any]) -> str:
     for name, v in data["parameters"].items():
         groups.setdefault(v["verdict"], []).append(name)
     found = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
+    doubt = (data.get("pilot") or {}).get("search_doubt")
+    found = f"{doubt}; {found}" if doubt else found
     return f"{found}; the model does not explain these data" if data["misspecified"] else found
 
 

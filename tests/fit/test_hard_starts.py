@@ -1,0 +1,183 @@
+"""Searches that meet values at which nothing can be simulated, or many optima."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import hvdc_ident as hi
+from hvdc_ident.errors import SimulationError, SteadyStateError, TimingError
+from hvdc_ident.model import parse_card
+
+LATE = """
+schema = 1
+name = "late"
+[parameters]
+T = {value = 0.02, unit = "s"}
+k = {value = 0.8}
+[inputs]
+u = {value = 0.0}
+[states]
+x = {derivative = "2*(k*late - x)"}
+[delays]
+late = {of = "u", time = "T"}
+[outputs]
+x = "x"
+"""
+TIME = np.linspace(0.0, 4.0, 401)
+STEP = hi.step(0.0, 1.0, at=0.5)
+
+TANK = """
+schema = 1
+name = "tank"
+[parameters]
+k = {value = 0.2, min = 0.05, max = 3.0}
+area = {value = 1.0, min = 0.2, max = 4.0}
+[inputs]
+q = {value = 0.3}
+[states]
+h = {derivative = "(q - k*h/(1 + h))/area", guess = 0.5}
+[outputs]
+h = "h"
+"""
+"""The level rests only where the outflow can become as large as the inflow: k > q."""
+TANK_STUDY = """
+schema = 1
+[model]
+source = "tank.toml"
+[parameters]
+k = {}
+area = {}
+[[experiment]]
+name = "more"
+data = "more.csv"
+inputs = ["q"]
+outputs = ["h"]
+noise = {h = 1e-3}
+[fit]
+"""
+
+WAVE = """
+schema = 1
+name = "wave"
+[parameters]
+f = {value = 7.1, unit = "Hz", min = 1.0, max = 60.0}
+a = {value = 1.0, min = 0.2, max = 3.0}
+[states]
+x = {derivative = "0", start = 0}
+[outputs]
+y = "a*sin(2*pi*f*time) + x"
+"""
+
+
+def late_record(true: float) -> hi.Experiment:
+    """x of a first-order lag of 0.5 s behind the delay, in closed form, with noise."""
+    since = np.maximum(TIME - 0.5 - true, 0.0)
+    y = 0.8 * (1.0 - np.exp(-2.0 * since)) + 1e-3 * np.random.default_rng(4).standard_normal(TIME.size)
+    return hi.Experiment(TIME, inputs={"u": STEP}, outputs={"x": y}, noise={"x": 1e-3}, role="fit")
+
+
+@pytest.mark.parametrize("bounds", [{"T": (0.0, 1.0), "k": (0.2, 3.0)}, {"T": {}, "k": (0.2, 3.0)}])
+def test_a_delay_is_estimated_though_its_range_reaches_0(bounds):
+    found = hi.fit(parse_card(LATE), late_record(0.3), bounds, starts=3)
+    low, high = found.estimates["T"].ci95
+    assert low < 0.3 < high and high - low < 0.01
+
+
+def test_a_delay_of_0_is_refused_where_it_is_asked_for():
+    with pytest.raises(TimingError, match="the delay of 'late' is not above 0; got 0 s"):
+        hi.simulate(parse_card(LATE), TIME, inputs={"u": STEP}, parameters={"T": 0.0})
+
+
+def test_a_delay_too_short_for_the_record_fails_before_its_steps_are_taken():
+    with pytest.raises(SimulationError, match=r"expected at least 2e-05 s.*got 1e-07 s"):
+        hi.simulate(parse_card(LATE), TIME, inputs={"u": STEP}, parameters={"T": 1e-7})
+
+
+def tank(folder: Path, card: str = TANK) -> Path:
+    """A study whose given values have no steady state; the plant has k = 0.9 and area = 0.7."""
+    time = np.linspace(0.0, 20.0, 401)
+    flow = np.where(time < 2.0, 0.3, 0.4)
+    rest = 0.3 / (0.9 - 0.3)
+    found = solve_ivp(
+        lambda t, h: (0.4 - 0.9 * h / (1.0 + h)) / 0.7,
+        (2.0, 20.0),
+        [rest],
+        t_eval=time[time >= 2.0],
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    level = np.concatenate([np.full((time < 2.0).sum(), rest), found.y[0]])
+    level += 1e-3 * np.random.default_rng(5).standard_normal(time.size)
+    rows = np.column_stack([time, flow, level])
+    np.savetxt(folder / "more.csv", rows, delimiter=",", header="time,q,h", comments="", fmt="%.9g")
+    (folder / "tank.toml").write_text(card, encoding="utf-8")
+    (folder / "study.toml").write_text(TANK_STUDY, encoding="utf-8")
+    return folder / "study.toml"
+
+
+def test_a_first_start_without_a_steady_state_is_one_failed_start(tmp_path, capsys):
+    from typer.testing import CliRunner
+
+    from hvdc_ident.cli import app
+
+    outcome = CliRunner().invoke(app, ["run", str(tank(tmp_path)), "--quiet"])
+    assert outcome.exit_code == 1, outcome.output  # the given values cannot be simulated, and the rest is done
+    results = tmp_path / "study-results"
+    fit = json.loads((results / "fit.json").read_text(encoding="utf-8"))
+    assert fit["starts"][0]["status"] == "failed" and "no steady state" in fit["starts"][0]["message"]
+    for name, true in (("k", 0.9), ("area", 0.7)):
+        low, high = fit["estimates"][name]["ci95"]
+        assert low - 0.3 * (high - low) < true < high + 0.3 * (high - low)
+    simulated = json.loads((results / "simulation.json").read_text(encoding="utf-8"))
+    assert "at the given values no steady state" in simulated["experiments"]["more"]["reason"]
+
+
+def test_a_model_without_a_steady_state_in_all_of_its_ranges_is_wrong_input(tmp_path):
+    path = tank(tmp_path, TANK.replace("max = 3.0", "max = 0.25"))
+    with pytest.raises(SteadyStateError, match="no steady state"):
+        hi.fit(str(path))
+
+
+def wave_record() -> hi.Experiment:
+    time = np.linspace(0.0, 3.0, 1501)
+    y = np.sin(2.0 * np.pi * 7.0 * time) + 0.01 * np.random.default_rng(6).standard_normal(time.size)
+    return hi.Experiment(time, outputs={"y": y}, noise={"y": 0.01}, role="fit")
+
+
+def test_an_optimum_that_one_start_alone_reached_is_told_with_doubt():
+    """The cost over a frequency has an optimum in every band of 1/3 Hz: of eight starts the nearest alone finds the lowest."""
+    found = hi.fit(parse_card(WAVE), wave_record(), ["f", "a"])
+    assert found.estimates["f"].value == pytest.approx(7.0, abs=0.01)
+    costs = sorted(s.cost for s in found.starts)
+    assert costs[1] > 10.0 * costs[0]  # the others did end elsewhere
+    assert found.search_doubt.startswith("one start of 8 alone reached the lowest cost")
+    assert found.message.startswith(found.search_doubt) and " ".join(str(found).split()).startswith(
+        "Fit: converged. One start of 8 alone"
+    )
+
+
+def test_starts_that_agree_leave_no_doubt():
+    near = hi.fit(parse_card(WAVE), wave_record(), {"f": (6.9, 7.1), "a": (0.2, 3.0)})
+    assert near.search_doubt == ""
+    alone = hi.fit(parse_card(WAVE), wave_record(), ["f", "a"], starts=1)
+    assert alone.search_doubt == ""  # one start was asked for
+
+
+def test_starts_along_a_valley_agree():
+    """Only f*g enters: the starts end at other places with the same cost."""
+    card = WAVE.replace("a*sin(2*pi*f*time)", "a*sin(2*pi*f*g*time)").replace(
+        "[states]", "g = {value = 1.0, min = 0.99, max = 1.01}\n[states]"
+    )
+    from hvdc_ident.fit import FitParameter, Problem, fit
+    from hvdc_ident.simulate import ModelSimulator
+
+    model = parse_card(card)
+    free = [FitParameter("f", 7.0, 6.95, 7.05), FitParameter("g", 1.0, 0.99, 1.01)]
+    found = fit(Problem(ModelSimulator(model), (wave_record(),), tuple(free)), starts=5, assess=False)
+    assert len({round(s.end["g"], 4) for s in found.starts}) > 1
+    assert found.search_doubt == ""
