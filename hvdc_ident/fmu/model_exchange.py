@@ -152,17 +152,15 @@ class ModelExchangeRun:
             t = float(solver.t) if event is None else event
             if self.row < len(rows) and rows[self.row] <= t:
                 self._record_until(solver.dense_output(), t)
-            if event is not None:
-                y = np.asarray(solver.dense_output()(event), dtype=float) if self.nx else y
-                return event, self._state_event(event, y)
+            if event is not None and self.nx:
+                y = np.asarray(solver.dense_output()(event), dtype=float)
             if completed or t >= end:
                 self._set_point(t, y[: self.nx], before_jump=t >= end)
-            if completed:
-                wanted, over = self.library.completed_integrator_step()
-                if over:
-                    raise RunEnded(t)
-                if wanted and t < end:
-                    return t, self._state_event(t, y)
+            wanted, over = self.library.completed_integrator_step() if completed else (False, False)
+            if over:
+                raise RunEnded(t)
+            if event is not None or (wanted and t < end):
+                return t, self._state_event(t, y)
         return end, y
 
     def _solver(self, t: float, y: Array, end: float, most: float = np.inf) -> Any:
@@ -288,8 +286,13 @@ class ModelExchangeRun:
         return self._event_at(t, y, None)
 
     def _event_at(self, t: float, y: Array, u: Array | None) -> Array:
-        """Return the states after event mode at t; inputs u are set in it where they jump."""
-        old = self.library.get_derivatives().copy() if self.columns else None
+        """Return the states after event mode at t; inputs u are set in it where they jump.
+
+        Some FMUs decide in event mode by what they computed last, in which a search for the event may have left them on
+        its other side: so derivatives and indicators are computed here first.
+        """
+        old = self.library.get_derivatives().copy()
+        self.library.get_indicators()
         self.library.enter_event_mode()
         if u is not None:
             self.instance.inputs.set(u)
@@ -299,7 +302,7 @@ class ModelExchangeRun:
         x = self.library.get_states() if changed else y[: self.nx]
         if self.columns:
             jumped = bool(np.abs(x - y[: self.nx]).max(initial=0.0) > 0.0)
-            if u is None and old is not None:
+            if u is None:
                 size = np.abs(old).max(initial=0.0) + np.abs(self.library.derivatives.values).max(initial=0.0)
                 jumped |= bool(
                     np.abs(self.library.get_derivatives() - old).max(initial=0.0) > JUMP_TOLERANCE * max(size, 1e-300)

@@ -2,8 +2,9 @@
    NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
    faults AT_INSTANTIATE, AT_SETUP, AT_ENTER(r) into the initialization mode, AT_STEP, AT_SLOPES, AT_RESET, AT_GET(r),
    AT_SET(r, reference, value), BEGIN(t, has_end, end). Of co-simulation: INTERNAL, the length of the FMU's own steps, s;
-   STOPS_AT(t, h), the instant that a step reaches; SLOPE(r, reference, slope); ENDS(r, t) asks for the end. States are
-   r[0 .. NX-1], their derivatives r[NX .. 2NX-1]. */
+   STOPS_AT(t, h), the instant that a step reaches; SLOPE(r, reference, slope); ENDS(r, t) asks for the end.
+   STEP_EVENT(r): whether an event is wanted after a completed step. States are r[0 .. NX-1], their derivatives
+   r[NX .. 2NX-1]. */
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -16,6 +17,9 @@ typedef struct { double r[NR]; double t, next, point, inner; int timed; void (*l
 #define N (NX > 0 ? NX : 1)
 #ifndef AT_ENTER
 #define AT_ENTER(r)
+#endif
+#ifndef STEP_EVENT
+#define STEP_EVENT(r) 0
 #endif
 #ifndef ENDS
 #define ENDS(r, t) 0
@@ -160,7 +164,7 @@ int fmi2NewDiscreteStates(Instance c, Info *e) {
     return 0;
 }
 int fmi2EnterContinuousTimeMode(Instance c) { return 0; }
-int fmi2CompletedIntegratorStep(Instance c, int n, int *e, int *end) { *e = 0; *end = ENDS(M->r, M->t); return 0; }
+int fmi2CompletedIntegratorStep(Instance c, int n, int *e, int *end) { *e = STEP_EVENT(M->r); *end = ENDS(M->r, M->t); return 0; }
 int fmi2SetTime(Instance c, double t) { M->t = t; return 0; }
 int fmi2SetContinuousStates(Instance c, const double *x, size_t n) { memcpy(M->r, x, n * sizeof(double)); return 0; }
 int fmi2GetContinuousStates(Instance c, double *x, size_t n) { memcpy(x, M->r, n * sizeof(double)); return 0; }
@@ -226,7 +230,7 @@ int fmi3UpdateDiscreteStates(Instance c, bool *again, bool *end, bool *nominals,
     *again = *nominals = false; *end = ENDS(M->r, M->t); *values = changed; *defined = timed; return 0;
 }
 int fmi3EnterContinuousTimeMode(Instance c) { return 0; }
-int fmi3CompletedIntegratorStep(Instance c, bool n, bool *e, bool *end) { *e = false; *end = ENDS(M->r, M->t); return 0; }
+int fmi3CompletedIntegratorStep(Instance c, bool n, bool *e, bool *end) { *e = STEP_EVENT(M->r); *end = ENDS(M->r, M->t); return 0; }
 int fmi3SetTime(Instance c, double t) { M->t = t; return 0; }
 int fmi3SetContinuousStates(Instance c, const double *x, size_t n) { memcpy(M->r, x, n * sizeof(double)); return 0; }
 int fmi3GetContinuousStates(Instance c, double *x, size_t n) { memcpy(x, M->r, n * sizeof(double)); return 0; }
