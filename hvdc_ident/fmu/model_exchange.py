@@ -6,6 +6,7 @@ Sensitivities S = dx/dp are integrated as additional states, S' = A S + df/dp, e
 from __future__ import annotations
 
 import warnings
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,8 +20,8 @@ from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
 from hvdc_ident.fmu.piecewise_linear import Interpolant, PackedInputs
 
 MAX_STEPS = 200_000  # of a run
-MAX_EVENTS = 100_000  # of a run
-MAX_CHATTER = 50  # state events within CHATTER_SPAN of each other
+MAX_EVENTS = 100_000  # at states, of a run
+MAX_CHATTER = 50  # events within CHATTER_SPAN of each other
 CHATTER_SPAN = 1e-9  # share of the span
 MAX_RETRIES = 8  # shorter steps tried where the FMU discards a point
 JUMP_TOLERANCE = 1e-6  # change of a derivative at an event, against its size, that sensitivities cannot pass
@@ -78,6 +79,9 @@ class ModelExchangeRun:
         self.segment_end = self.end
         self.close: list[float] = []
         self.before = self.counts.accepted
+        self.events = self.state_events = 0  # of this run
+        self.last_digit = float(np.spacing(np.abs(self.time[[0, -1]]).max()))
+        self.rounding = 0.0  # difference up to which instants are one
 
     def go(self, values: Mapping[str, float]) -> None:
         """Fill every row. Raises RunFailed, FmiError or SensitivitiesLost; RunEnded with the rows up to the end."""
@@ -97,19 +101,27 @@ class ModelExchangeRun:
         self.atol = 1e-2 * self.tolerance * self.instance.nominals()
         y = np.concatenate([x, *(self.start.T if self.start is not None and self.columns else [])])
         stops = sorted({*(s for s in self.signals.breaks.tolist() if t <= s <= self.end), self.end})
-        y = self._stop_at(t, y, stops)
+        self.rounding = self._rounding(t)
+        t, y = self._stop_at(t, y, stops)
         while t < self.end:
             stop = next(s for s in stops if s > t)
             due = self.instance.next_time
-            if due is not None and due <= t:
-                y = self._state_event(t, y)
+            self.rounding = self._rounding(stop)
+            if due is not None and due <= t + self.rounding:
+                t, y = self._stop_at(t, y, stops)
                 continue
-            # Two instants that differ by rounding alone are one: no integrator can step from one to the other.
-            rounding = 1e-12 * max(1.0, abs(stop))
-            self.segment_end = stop if due is None or abs(due - stop) <= rounding else min(due, stop)
+            self.segment_end = stop if due is None or abs(due - stop) <= self.rounding else min(due, stop)
             t, y = self._segment(t, y, self.segment_end)
             if t >= self.segment_end:
-                y = self._stop_at(t, y, stops, timed=due is not None and due <= t + rounding)
+                t, y = self._stop_at(t, y, stops)
+
+    def _rounding(self, t: float) -> float:
+        """Return the difference up to which instants are one: no integrator can step from one to the other.
+
+        Rows and jumps are off by some last digits of the largest instant. An FMU that adds its period to the last
+        event's instant rounds each sum: after n events it is off by up to n/2 last digits.
+        """
+        return max(1e-12 * max(1.0, abs(t)), (8 + self.events) * self.last_digit)
 
     def _inputs_at(self, t: float, *, before_jump: bool) -> Array:
         """Return all inputs at an instant, before the jumps there or after them."""
@@ -151,16 +163,17 @@ class ModelExchangeRun:
             event = self._crossing(solver, before)
             t = float(solver.t) if event is None else event
             if self.row < len(rows) and rows[self.row] <= t:
-                self._record_until(solver.dense_output(), t)
+                self._record_until(solver.dense_output(), min(t, end - self.rounding))
             if event is not None and self.nx:
                 y = np.asarray(solver.dense_output()(event), dtype=float)
-            if completed or t >= end:
+            if completed or event is not None or t >= end:
                 self._set_point(t, y[: self.nx], before_jump=t >= end)
             wanted, over = self.library.completed_integrator_step() if completed else (False, False)
             if over:
                 raise RunEnded(t)
             if event is not None or (wanted and t < end):
-                return t, self._state_event(t, y)
+                self._count_state_event(t)
+                return t, self._event_at(t, y, None)
         return end, y
 
     def _solver(self, t: float, y: Array, end: float, most: float = np.inf) -> Any:
@@ -273,17 +286,21 @@ class ModelExchangeRun:
                 low, z_low = middle, z
         return high
 
-    def _state_event(self, t: float, y: Array) -> Array:
-        """Process a state event; return the states after it."""
-        self.counts.events += 1
-        span = self.end - float(self.time[0])
-        self.close = [s for s in self.close if t - s <= CHATTER_SPAN * span] + [t]
-        if self.counts.events > MAX_EVENTS or len(self.close) > MAX_CHATTER:
+    def _count_state_event(self, t: float) -> None:
+        """Count a state event. Raises RunFailed where there are too many in the run, or around this instant."""
+        self.state_events += 1
+        if self._count_event(t) or self.state_events > MAX_EVENTS:
             raise RunFailed(
                 "a limit switches on and off without end", t, "add a hysteresis or a small lag where it acts"
             )
-        self._set_point(t, y[: self.nx])
-        return self._event_at(t, y, None)
+
+    def _count_event(self, t: float) -> bool:
+        """Count an event; return whether there are too many around this instant."""
+        self.counts.events += 1
+        self.events += 1
+        span = self.end - float(self.time[0])
+        self.close = [s for s in self.close if t - s <= CHATTER_SPAN * span] + [t]
+        return len(self.close) > MAX_CHATTER
 
     def _event_at(self, t: float, y: Array, u: Array | None) -> Array:
         """Return the states after event mode at t; inputs u are set in it where they jump.
@@ -311,28 +328,36 @@ class ModelExchangeRun:
                 raise SensitivitiesLost(f"a state or a derivative jumps at {t:.6g} s")
         return np.concatenate([x, y[self.nx :]]) if changed else y
 
-    def _stop_at(self, t: float, y: Array, stops: Sequence[float], *, timed: bool = False) -> Array:
-        """Process a stop; return the states: rows before its jump are recorded, then inputs and time events act, then rows after it."""
+    def _stop_at(self, t: float, y: Array, stops: Sequence[float]) -> tuple[float, Array]:
+        """Process a stop and those that differ from it by rounding; return the instant of the last and the states after it.
+
+        Rows before its jump are recorded, then time events and inputs act, then rows after it.
+        """
         self._set_point(t, y[: self.nx], before_jump=True)
-        while self.row + 1 < self.time.size and self.time[self.row] == t == self.time[self.row + 1]:
+        near = t + self.rounding
+        while self.row + 1 < self.time.size and self.time[self.row] == self.time[self.row + 1] <= near:
             self._record(y)
-        u = self._inputs_at(t, before_jump=False)
-        jumps = t in stops and bool((u != self._inputs_at(t, before_jump=True)).any())
-        if timed:
-            self.counts.events += 1
+        before, breaks = self._inputs_at(t, before_jump=True), stops[bisect_left(stops, t) : bisect_right(stops, near)]
+        t = max([t, *breaks])
+        while (due := self.instance.next_time) is not None and due <= near:
+            t = max(t, due)  # before that instant, the FMU has no event
+            if self._count_event(t):
+                raise RunFailed("the FMU asks for time events without end", t, "export it again, or as co-simulation")
+            self.library.set_time(t)
             y = self._event_at(t, y, None)
-        if jumps:
+        u = self._inputs_at(t, before_jump=False)
+        if breaks and (u != before).any():
             y = self._event_at(t, y, u)
         self.segment_end = self.end + 1.0 if t < self.end else t
         self._set_point(t, y[: self.nx])
         while self.row < self.time.size and self.time[self.row] <= t:
             self._record(y)
-        return y
+        return t, y
 
     # --- rows ---
 
     def _record_until(self, dense: Any, t: float) -> None:
-        """Record the rows of a step that lie before t; those at a stop are recorded there."""
+        """Record the rows of a step that lie before t; those at a stop, but for rounding, are recorded there."""
         while self.row < self.time.size and self.time[self.row] < t:
             s = float(self.time[self.row])
             y = np.asarray(dense(s), dtype=float) if self.nx else np.zeros(0)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import fmpy
 import numpy as np
 import pytest
 from c_fmu import CModel, Var, build, description, needs_compiler
-from c_models import BALL, PLAIN
+from c_models import BALL, COUNTER, PLAIN
 
 from hvdc_ident import simulate
-from hvdc_ident.data import experiment
+from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.fmu import read_fmu
 
 pytestmark = needs_compiler
@@ -55,6 +56,110 @@ def test_event_mode_is_entered_with_the_indicators_of_the_event(fmu, version):
     time = np.linspace(0.0, 10.0, 334)
     found = simulate(fmu(THERMOSTAT, version), experiment("heat", time))
     assert np.abs(found["y"] - heated(time)).max() < 1e-6
+
+
+# --- rows at time events ---
+
+# A counter beside a state. It sums its period, and does nothing before the instant that it has said.
+STRICT = CModel(
+    "strict",
+    PLAIN
+    + """
+#define NR 5
+static void start(double *r) { r[2] = 0.25; }
+static void equations(double *r, double t) { r[1] = 1; r[4] = r[3]; }
+static int tick(double *r, double t, double *next, int *timed) {
+    if (!*timed) *next = t + r[2];
+    else if (t >= *next) { r[3] += 1; *next += r[2]; }
+    *timed = 1;
+    return 0;
+}
+#define EVENT(r, t, next, timed) tick(r, t, next, timed)
+""",
+    (
+        Var("x", 0),
+        Var("der(x)", 1, more=(("derivative", "x"),)),
+        Var("period", 2, "parameter", "fixed", (("start", "0.25"),)),
+        Var("count", 4, "output", "discrete"),
+    ),
+    1,
+    kinds=("ModelExchange",),
+)
+
+
+@pytest.mark.parametrize("model", [COUNTER, STRICT], ids=["tolerant", "strict"])
+@pytest.mark.parametrize("period", [0.1, 0.3])
+def test_a_row_at_a_time_event_is_after_it(fmu, model, period):
+    """0.1 + 0.1 + 0.1 is more than 0.3."""
+    time = np.round(period * np.arange(101), 10)
+    found = simulate(fmu(model), experiment("count", time), {"period": period})
+    assert np.array_equal(found["count"], np.arange(101))
+
+
+def test_ten_thousand_sums_of_a_period_may_round_to_the_same_side(fmu):
+    """From 4096 s on, each sum is 0.48 of a last digit too large: after 10 000 they are 4.4e-9 s late."""
+    digit, sums = np.spacing(4096.0), 10_000
+    period = (round(1e-3 / digit) + 0.52) * digit
+    time = np.array([4096.0, 4096.0 + sums * period])
+    found = simulate(fmu(STRICT), experiment("sums", time), {"period": period})
+    assert found["count"].tolist() == [0, sums]
+
+
+def test_fmpy_has_the_same_samples(fmu):
+    model, time = fmu(COUNTER), np.round(0.1 * np.arange(11), 10)
+    found = simulate(model, experiment("count", time), {"period": 0.1})["count"]
+    theirs = fmpy.simulate_fmu(
+        str(model.fmu.path),
+        validate=False,
+        stop_time=1.0,
+        output_interval=0.1,
+        start_values={"period": 0.1},
+        output=["count"],
+        record_events=False,
+    )
+    assert np.array_equal(found, theirs["count"])
+
+
+# x' = n u, where n counts two clocks, of 0.1 s and of 0.3 s, which sum their periods.
+CLOCKS = CModel(
+    "clocks",
+    PLAIN
+    + """
+#define NR 8
+static void start(double *r) { r[5] = 0.1; r[6] = 0.3; }
+static void equations(double *r, double t) { r[1] = r[3] * r[2]; r[4] = r[3] + r[2]; }
+static int tick(double *r, double t, double *next, int *timed) {
+    if (t >= r[5]) { r[3] += 1; r[5] += 0.1; }
+    if (t >= r[6]) { r[3] += 1; r[6] += 0.3; }
+    *timed = 1; *next = fmin(r[5], r[6]);
+    return 0;
+}
+#define EVENT(r, t, next, timed) tick(r, t, next, timed)
+""",
+    (
+        Var("x", 0),
+        Var("der(x)", 1, more=(("derivative", "x"),)),
+        Var("u", 2, "input", "continuous", (("start", "0"),)),
+        Var("y", 0, "output"),
+        Var("ticks", 3, "output", "discrete"),
+        Var("through", 4, "output"),
+    ),
+    1,
+    kinds=("ModelExchange",),
+)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("at", [0.3, 0.1 + 0.2])
+def test_clocks_and_jumps_that_differ_by_rounding_are_at_one_instant(fmu, version, at):
+    """The clocks' sums, 0.30000000000000004 and 0.3, the jump at either, two rows of 0.3: before all, and after."""
+    time = np.array([0.0, 0.1, 0.2, 0.3, 0.3, 0.4, 0.6, 0.9, 1.0])
+    u = InputSignal.step(at, 1.0, 3.0)
+    found = simulate(fmu(CLOCKS, version), experiment("ticks", time, {"u": u}))
+    assert found["ticks"].tolist() == [0, 1, 2, 2, 4, 5, 8, 12, 13]
+    assert found["through"] - found["ticks"] == pytest.approx([1.0] * 4 + [3.0] * 5, abs=1e-12)
+    areas = [0.0, 0.0, 0.1, 0.3, 0.3, 1.5, 4.8, 12.9, 16.5]
+    assert found["y"] == pytest.approx(areas, abs=1e-7)
 
 
 # --- after completed steps ---
