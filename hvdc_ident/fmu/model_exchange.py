@@ -171,9 +171,13 @@ class ModelExchangeRun:
             wanted, over = self.library.completed_integrator_step() if completed else (False, False)
             if over:
                 raise RunEnded(t)
-            if event is not None or (wanted and t < end):
+            if event is not None:
                 self._count_state_event(t)
                 return t, self._event_at(t, y, None)
+            if wanted:
+                after = self._step_event(t, y, t - before)
+                if after is not None:
+                    return t, after
         return end, y
 
     def _solver(self, t: float, y: Array, end: float, most: float = np.inf) -> Any:
@@ -301,6 +305,22 @@ class ModelExchangeRun:
         span = self.end - float(self.time[0])
         self.close = [s for s in self.close if t - s <= CHATTER_SPAN * span] + [t]
         return len(self.close) > MAX_CHATTER
+
+    def _step_event(self, t: float, y: Array, step: float) -> Array | None:
+        """Process the event that the FMU wants after a completed step of this length; return the states after it.
+
+        Some FMUs want one after every step. Where it changes neither the states nor the next time event, and no
+        derivative by so much that another such step would differ by its tolerance, it returns None: the integrator goes on.
+        """
+        due, old = self.instance.next_time, self.library.get_derivatives().copy()
+        after = self._event_at(t, y, None)
+        self.positive = self.library.get_indicators() > 0.0
+        x = y[: self.nx]
+        moved = step * np.abs(self.library.get_derivatives() - old) > self.atol + self.tolerance * np.abs(x)
+        if np.array_equal(after[: self.nx], x) and due == self.instance.next_time and not moved.any():
+            return None
+        self._count_state_event(t)
+        return after
 
     def _event_at(self, t: float, y: Array, u: Array | None) -> Array:
         """Return the states after event mode at t; inputs u are set in it where they jump.

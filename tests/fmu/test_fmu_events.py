@@ -8,7 +8,7 @@ import fmpy
 import numpy as np
 import pytest
 from c_fmu import CModel, Var, build, description, needs_compiler
-from c_models import BALL, COUNTER, PLAIN
+from c_models import BALL, COUNTER, PLAIN, response, spring
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
@@ -172,6 +172,56 @@ def stepping(model, folder, version):
         text = text.replace("<ModelExchange ", '<ModelExchange needsCompletedIntegratorStep="true" ')
     path = build(model, folder, version, **{"modelDescription.xml": text.encode()})
     return read_fmu(path, interface="model-exchange")
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_events_wanted_after_every_step_that_change_nothing_are_free(fmu, tmp_path, version):
+    time = np.linspace(0.0, 5.0, 251)
+    step = experiment("step", time, {"u": InputSignal.step(1.0, 0.0, 1.0)})
+    wanting = replace(spring("wanting"), code=spring().code + "#define STEP_EVENT(r) 1\n")
+    model = stepping(wanting, tmp_path, version)
+    found, plain = simulate(model, step), simulate(fmu(spring(), version, "model-exchange"), step)
+    model.pool.close()
+    assert np.abs(found["y"] - response(time)).max() < 2e-7
+    assert found.statistics.accepted == plain.statistics.accepted
+    assert found.statistics.events == plain.statistics.events
+
+
+# An angle of rate w that is turned back into -pi .. pi after a step that has left it.
+ANGLE = CModel(
+    "angle",
+    PLAIN
+    + """
+#define NR 6
+static void start(double *r) { r[2] = 3; }
+static void equations(double *r, double t) { r[1] = r[2]; r[3] = sin(r[0]); }
+#define STEP_EVENT(r) (r[0] > 3.141592653589793)
+static int turned(double *r) {
+    if (r[0] > 3.141592653589793) { r[0] -= 2 * 3.141592653589793; return 1; }
+    return 0;
+}
+#define EVENT(r, t, next, timed) turned(r)
+""",
+    (
+        Var("phi", 0),
+        Var("der(phi)", 1, more=(("derivative", "phi"),)),
+        Var("w", 2, "parameter", "tunable", (("start", "3"),)),
+        Var("y", 3, "output"),
+        Var("angle", 0, "output"),
+    ),
+    1,
+    kinds=("ModelExchange",),
+)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_event_after_a_step_that_changes_a_state_begins_a_new_segment(tmp_path, version):
+    time = np.linspace(0.0, 20.0, 401)
+    model = stepping(ANGLE, tmp_path, version)
+    found = simulate(model, experiment("turn", time))
+    model.pool.close()
+    assert np.abs(found["y"] - np.sin(3.0 * time)).max() < 1e-6
+    assert 1 <= found.statistics.events <= 10  # at 3.14 rad and after each of 9 turns; 60 rad are 9.5 turns
 
 
 @pytest.mark.parametrize("version", [2, 3])
