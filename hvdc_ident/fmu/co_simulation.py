@@ -308,6 +308,7 @@ class _Stepper:
     def __init__(self, instance: Instance, calls: CallPattern, inputs: Inputs, compute: Callable[[], Array]) -> None:
         self.instance, self.calls, self.compute = instance, calls, compute
         self.behind = 0.0
+        self._begun = False  # whether a step was taken
         self._stepped = inputs  # at the end of the last step
         self._current: Inputs | None = inputs
         self._read = False  # whether outputs were read with other inputs since
@@ -345,6 +346,7 @@ class _Stepper:
                 share = 0.5 * (x + y)
                 self._apply(tuple(u + share * (v - u) for u, v in zip(first, last, strict=True)))
                 self._advance(a + x * (b - a), b if y == 1.0 else a + y * (b - a))
+            self._current = None  # they are set in the next step, whatever they are
             return
         self._apply(first)
         if moves or self._sloping:
@@ -356,10 +358,10 @@ class _Stepper:
         self._current = None  # the FMU may have moved its inputs along the slopes, or not
 
     def _apply(self, u: Inputs) -> None:
-        """Set the inputs of the next step."""
-        if self._current != u:
+        """Set the inputs of the next step: in the first one too, for some FMUs do not step with those of their start."""
+        if self._current != u or not self._begun:
             self._set(u)
-        self._stepped = u
+        self._stepped, self._begun = u, True
 
     def _advance(self, a: float, b: float) -> None:
         t, rounding = a, 1e-12 * max(abs(b), 1.0)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import fmpy
 import numpy as np
 import pytest
 from c_fmu import Var, build, description, needs_compiler
-from c_models import latch
+from c_models import LATCH_CODE, latch
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
@@ -97,6 +98,46 @@ static double nanoseconds(void) { struct timespec t; clock_gettime(CLOCK_MONOTON
     found = run(load(replace(model, variables=(*model.variables, Var("took", 13, "output")))), JUMPS)
     assert np.abs(found["out"] - lagging(TIME, JUMPS)).max() < 1e-6 and not found.notes
     assert np.abs(found["through"] - found["out"] - InputSignal.corners(JUMPS)(TIME)).max() < 1e-12
+
+
+# A step moves it only where an input was set since it was initialised or outputs were read with one that was set.
+LAZY = """
+#undef INITIALIZE
+#define INITIALIZE(r) (r[6] = r[4], r[9] = 0)
+#define AT_SET(r, v, x) (r[9] = 1)
+#define AT_GET(r) (r[7] = r[9] = 0)
+#define AT_STEP(r) do { if (!r[9]) return 0; r[6] = r[4]; r[7] = 1; r[9] = 0; } while (0)
+"""
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [(0.0, 2.0), (1.0, 2.0)],
+        [(0.0, 2.0), (0.6, 2.0), (0.6, -1.0), (1.0, -1.0)],
+        [(0.0, 0.5), (0.25, 0.5), (0.25, 1.0), (0.275, 3.0), (0.275, 2.0), (1.0, 2.0)],  # 2 is the ramp's mean too
+    ],
+    ids=["constant", "jump", "mean"],
+)
+def test_inputs_are_set_in_every_step(load, version, corners):
+    """As FMPy's simulation does, whose rows have no jump at them."""
+    model = load(replace(latch(more=LAZY, name="lazy"), code=LATCH_CODE + LAZY), version)
+    found = run(model, corners)["out"]
+    held = 0.025**2 / (8 * T) * 80.0  # the ramp, 80/s, is held at its mean
+    assert np.abs(found - lagging(TIME, corners)).max() < (held if len(corners) == 6 else 1e-6)
+    if len(corners) == 2:
+        constant = np.array([(0.0, 2.0), (1.0, 2.0)], dtype=[("time", float), ("u", float)])
+        theirs = fmpy.simulate_fmu(
+            str(model.fmu.path),
+            validate=False,
+            fmi_type="CoSimulation",
+            stop_time=1.0,
+            output_interval=0.025,
+            input=constant,
+            output=["out"],
+        )
+        assert np.abs(found - theirs["out"]).max() < 1e-9
 
 
 ABLE = ' canHandleVariableCommunicationStepSize="true"'
