@@ -137,6 +137,20 @@ def find_calls(
         learned["sloping"] = _tried_slopes(span, allowed, held, run)
 
 
+def find_held(learned: dict[str, Any], time: Array, run: Callable[[Array], Array]) -> None:
+    """Learn from one run with more rows whether outputs are older than their rows, where runs so far cannot tell.
+
+    run: at instants. learned: gets "outputs held", None where that run cannot tell either.
+    """
+    behind = learned.get("behind", 0.0)
+    if behind == 0.0 or "outputs held" in learned or learned.get("steps") == "even":
+        return
+    learned["outputs held"] = None
+    earlier = time[1:] - 0.5 * behind  # after the last own step before the row
+    run(np.union1d(time, earlier[earlier > time[:-1]]))
+    learned["behind"] = behind  # of the rows that were asked for
+
+
 def notes(learned: Mapping[str, Any]) -> dict[str, str]:
     """Return notes for the user on how the FMU was called, by subject."""
     texts = {}
@@ -153,7 +167,7 @@ def notes(learned: Mapping[str, Any]) -> dict[str, str]:
         texts["steps"] = (
             "the FMU refuses steps of different lengths: it took even ones, rows between are joined by lines"
         )
-    if learned.get("behind", 0.0) > 0.0:
+    if learned.get("outputs held"):
         texts["internal steps"] = (
             f"the FMU takes steps of its own and its outputs at a row are those of the last one, up to "
             f"{learned['behind']:.3g} s earlier"
@@ -225,6 +239,7 @@ def _run(
     before, after = (list(map(tuple, side.tolist())) for side in sides)  # compared in every step: tuples are quickest
     outputs = instance.variables(names)
     left, right = (np.empty((stops.size, len(names))) for _ in range(2))
+    belongs = stops.copy()  # instants that the FMU says it has reached by steps of its own
     stepper = _Stepper(instance, calls, before[0], outputs.get)
     reads_changes = calls.reading != "never"
     instants = stops.tolist()
@@ -241,6 +256,7 @@ def _run(
                 recorded = time[time <= stops[count - 1] + _rounding(time)]
                 e.rows = _rows(recorded, stops[:count], left[:count], right[:count])
                 raise
+            belongs[k] = stepper.computed
         current = stepper.has_inputs(before[k])
         left[k] = outputs.get() if calls.plain or not reads_changes or current else stepper.read(before[k])
         if calls.plain and reads_changes and not current:
@@ -250,9 +266,33 @@ def _run(
             changed = stepper.read(after[k])
             if not calls.plain:
                 right[k] = changed
-    if stepper.behind > instance.learned.get("behind", 0.0):
-        instance.learned["behind"] = stepper.behind
+    if (belongs < stops).any():
+        steady = ((sides[0][1:] == sides[1][:-1]) & (sides[0][1:] == sides[0][:-1])).all(axis=1)
+        continuous = [v.continuous for v in outputs.variables]
+        _learn_held(instance.learned, stops, belongs, steady, left[:, continuous])
     return _rows(time, stops, left, right)
+
+
+def _learn_held(
+    learned: dict[str, Any], stops: Array, belongs: Array, steady: NDArray[np.bool_], outputs: Array
+) -> None:
+    """Learn by how much outputs are older than their rows, and whether they are.
+
+    belongs: (n,) instants that the FMU says its outputs belong to. Some name the end of a step of their solver there and
+    interpolate their outputs all the same. So they have to keep their values, to the last digit, from row to row where
+    that instant and the inputs stay, in the midst of a motion. steady: (n - 1,) whether the inputs stay.
+    """
+    learned["behind"] = max(float((stops - belongs).max()), learned.get("behind", 0.0))
+    same = belongs[1:] == belongs[:-1]
+    with np.errstate(invalid="ignore"):  # outputs that are not finite are no evidence
+        size = np.ptp(outputs, axis=0)
+        steps = np.abs(np.diff(outputs, axis=0)) > REPEAT_TOLERANCE * size
+    moves = np.vstack([np.zeros_like(size, dtype=bool), steps[~same], np.zeros_like(size, dtype=bool)])
+    own = np.cumsum(~same)  # number of the FMU's own step that each row but the first belongs to
+    amid = moves[own] & moves[own + 1] & (same & steady)[:, None]
+    if amid.any():
+        held = bool((outputs[1:] == outputs[:-1])[amid].all())
+        learned["outputs held"] = held and learned.get("outputs held") is not False
 
 
 def _is_even(stops: Array) -> bool:
@@ -303,11 +343,11 @@ def _rows(time: Array, stops: Array, left: Array, right: Array) -> Array:
 
 
 class _Stepper:
-    """The steps of one run. behind: largest time by which the outputs of a step were older than its end, s."""
+    """The steps of one run. computed: the instant that the FMU says it has reached, in steps of its own, in the last one."""
 
     def __init__(self, instance: Instance, calls: CallPattern, inputs: Inputs, compute: Callable[[], Array]) -> None:
         self.instance, self.calls, self.compute = instance, calls, compute
-        self.behind = 0.0
+        self.computed = -np.inf
         self._begun = False  # whether a step was taken
         self._stepped = inputs  # at the end of the last step
         self._current: Inputs | None = inputs
@@ -371,8 +411,8 @@ class _Stepper:
             except TerminationRequested as e:
                 raise RunEnded(max(e.reached, t)) from None
             if reached >= b - rounding:
-                if computed < b - rounding and b - computed > 1e-9 * max(abs(b), b - a):
-                    self.behind = max(self.behind, b - computed)
+                behind = computed < b - rounding and b - computed > 1e-9 * max(abs(b), b - a)
+                self.computed = computed if behind else b
                 return
             t = reached
         raise RunFailed(f"the FMU returned early {MAX_EARLY_RETURNS} times in one step", t)

@@ -115,6 +115,7 @@ class SensitivityRun:
                 methods.setdefault(method, []).append(name)
             self.notes["sensitivities"] = "; ".join(f"{m}: {', '.join(names)}" for m, names in methods.items())
         if co_simulated:
+            self._find_held(outputs)
             self.notes |= co_simulation.notes(self.learned)
         if self.ended is not None:
             t, count = self.ended
@@ -147,26 +148,35 @@ class SensitivityRun:
 
     def _find_calls(self) -> None:
         """Learn how a co-simulation FMU has to be called, where this experiment can show it."""
+        co_simulation.find_calls(
+            self.learned, self.description, self.signals, self.time, self.tolerance, self._co_simulated
+        )
+
+    def _find_held(self, outputs: Array) -> None:
+        """Learn whether outputs of a co-simulation FMU are older than their rows, where it says so and they move."""
+        if self.ended is None and self.description.variable_step and moving(outputs).any():
+            calls = co_simulation.CallPattern.learned(self.learned)
+            with contextlib.suppress(RunFailed):
+                co_simulation.find_held(self.learned, self.time, lambda time: self._co_simulated(calls, time))
+
+    def _co_simulated(self, calls: co_simulation.CallPattern, time: Array) -> Array:
+        """(n, outputs) of a run that calls the FMU in some way, of the outputs asked for and all others."""
         names = tuple(dict.fromkeys([*self.names, *self.description.outputs]))
+        self.handler.restart_deadline()
 
-        def run(calls: co_simulation.CallPattern, time: Array) -> Array:
-            self.handler.restart_deadline()
-
-            def rows(instance: Instance) -> Array:
-                try:
-                    return co_simulation.run(instance, self.values, self.signals, time, names, self.tolerance, calls)
-                except RunEnded as e:
-                    return self._padded(e, time.size)
-
-            if self.handler.isolated:
-                return self._in_new_process(rows, model_exchange.Counts())
-            self.handler.runs += 1
+        def rows(instance: Instance) -> Array:
             try:
-                return rows(self.handler.instance)
-            except (FmiError, RunFailed) as e:
-                raise self.handler.failed(e) from None
+                return co_simulation.run(instance, self.values, self.signals, time, names, self.tolerance, calls)
+            except RunEnded as e:
+                return self._padded(e, time.size)
 
-        co_simulation.find_calls(self.learned, self.description, self.signals, self.time, self.tolerance, run)
+        if self.handler.isolated:
+            return self._in_new_process(rows, model_exchange.Counts())
+        self.handler.runs += 1
+        try:
+            return rows(self.handler.instance)
+        except (FmiError, RunFailed) as e:
+            raise self.handler.failed(e) from None
 
     # --- runs ---
 

@@ -2,7 +2,7 @@
    NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
    faults AT_INSTANTIATE, AT_SETUP, AT_ENTER(r) into the initialization mode, AT_STEP, AT_SLOPES, AT_RESET, AT_GET(r),
    AT_SET(r, reference, value), BEGIN(t, has_end, end). Of co-simulation: INTERNAL, the length of the FMU's own steps, s;
-   STOPS_AT(t, h), the instant that a step reaches; SLOPE(r, reference, slope); ENDS(r, t) asks for the end.
+   STOPS_AT(t, h), the instant that a step reaches; SAYS(reached), what FMI 3.0 says of it; SLOPE(r, reference, slope); ENDS(r, t) asks for the end.
    STEP_EVENT(r): whether an event is wanted after a completed step. States are r[0 .. NX-1], their derivatives
    r[NX .. 2NX-1]. */
 #include <math.h>
@@ -20,6 +20,9 @@ typedef struct { double r[NR]; double t, next, point, inner; int timed; void (*l
 #endif
 #ifndef STEP_EVENT
 #define STEP_EVENT(r) 0
+#endif
+#ifndef SAYS
+#define SAYS(reached) reached
 #endif
 #ifndef ENDS
 #define ENDS(r, t) 0
@@ -253,7 +256,7 @@ int fmi3GetDirectionalDerivative(Instance c, const unsigned *u, size_t nu, const
     return directional(M, u, nu, k, nk, s, o); }
 int fmi3EnterStepMode(Instance c) { return 0; }
 int fmi3DoStep(Instance c, double t, double h, bool p, bool *event, bool *end, bool *early, double *reached) {
-    int left, s = advance(M, t, h, &left); *event = false; *end = ENDS(M->r, M->t); *early = left; *reached = left ? M->point : M->inner; return s; }
+    int left, s = advance(M, t, h, &left); *event = false; *end = ENDS(M->r, M->t); *early = left; *reached = left ? M->point : SAYS(M->inner); return s; }
 #define UNUSED(f) int f(void) { return 3; }
 UNUSED(fmi3InstantiateScheduledExecution) UNUSED(fmi3GetFloat32) UNUSED(fmi3GetInt8) UNUSED(fmi3GetUInt8)
 UNUSED(fmi3GetInt16) UNUSED(fmi3GetUInt16) UNUSED(fmi3GetUInt32) UNUSED(fmi3GetInt64) UNUSED(fmi3GetUInt64)

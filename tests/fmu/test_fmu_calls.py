@@ -179,6 +179,27 @@ def test_internal_steps_that_rows_do_not_suit(load, version, own):
         assert f"up to {(TIME - ended).max():.3g} s earlier" in found.notes["internal steps"]
 
 
+def test_internal_steps_shorter_than_the_rows(load):
+    """No two rows lie in one internal step: another run, of more rows, shows that outputs are those of its begin."""
+    time = np.linspace(0.0, 1.0, 21)
+    model = load(latch("plain", "#define INTERNAL 0.04\n", "shorter"), 3)
+    for _ in range(2):
+        found = run(model, [(0.0, 1.0)], time)
+        ended = 0.04 * np.floor(time / 0.04 + 1e-6)
+        assert np.abs(found["out"] - (1.0 - np.exp(-ended / T))).max() < 1e-6
+        assert "up to 0.03 s earlier" in found.notes["internal steps"]
+
+
+@pytest.mark.parametrize("rows", [21, 41])
+@pytest.mark.parametrize("says", ["0.04 * floor(reached / 0.04 + 1e-6)", "0", "fmax(reached - 0.01, 0)"])
+def test_outputs_of_a_row_are_not_called_older_because_the_fmu_says_so(load, rows, says):
+    """It says where its solver was, or nothing of use, and its outputs are those of the row."""
+    time = np.linspace(0.0, 1.0, rows)
+    found = run(load(latch("plain", f"#define SAYS(reached) ({says})\n", "says"), 3), [(0.0, 1.0)], time)
+    assert np.abs(found["out"] - (1.0 - np.exp(-time / T))).max() < 1e-6
+    assert not found.notes
+
+
 @pytest.mark.parametrize("version", [2, 3])
 def test_steps_that_end_early_are_continued(load, version):
     """FMI 2.0 discards the step and tells how far it came, FMI 3.0 returns early: here at every multiple of 0.07 s."""
