@@ -26,7 +26,8 @@ FmiError = FMICallException
 """Raised by a call that returned discard, error or fatal; `.function`, `.status`."""
 WARNING, DISCARD, ERROR, FATAL = 1, 2, 3, 4
 Function = Callable[..., None]
-MESSAGES_KEPT = 30  # of the FMU in a run: the last one is quoted where the run fails
+MESSAGES_KEPT = 30  # of the FMU in a run, that differ
+MESSAGES_QUOTED = 3  # the last ones, where the run fails: an FMU reports a cause before its consequence
 
 
 def why_not_loaded(error: Exception, folder: str, d: Description) -> tuple[str, str]:
@@ -71,6 +72,11 @@ def refusal(d: Description, message: str) -> str:
     if d.needs_tool:
         return f"install {d.tool or 'its tool'}, in which alone it runs, or export it stand-alone"
     return "look for a wrong GUID, a missing licence or a missing resource, which make an FMU refuse"
+
+
+def quoted(messages: Sequence[str]) -> str:
+    """Return the last messages of an FMU, joined."""
+    return "; ".join(messages[-MESSAGES_QUOTED:])
 
 
 class TerminationRequested(Exception):
@@ -240,7 +246,10 @@ class FmiLibrary:
 
     def _heard(self, status: int, text: bytes | None) -> None:
         if status > 0 and text:
-            self.messages.append(" ".join(text.decode("utf-8", "replace").split())[:300])
+            message = " ".join(text.decode("utf-8", "replace").split())[:300]
+            with contextlib.suppress(ValueError):  # one that repeats is kept once, as the last
+                self.messages.remove(message)
+            self.messages.append(message)
             del self.messages[:-MESSAGES_KEPT]
 
     # --- instances ---

@@ -9,7 +9,7 @@ two fresh processes do not repeat either, such as the time that the computation 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.fmu.description import Description
-from hvdc_ident.fmu.fmi import DISCARD, ERROR, FATAL, FmiError, FmiLibrary, VariableGroup, refusal
+from hvdc_ident.fmu.fmi import DISCARD, ERROR, FATAL, FmiError, FmiLibrary, VariableGroup, quoted, refusal
 from hvdc_ident.processes.messages import Message
 from hvdc_ident.processes.server import die_like, in_new_process
 
@@ -36,7 +36,7 @@ EVENT_ITERATIONS = 1000  # of the discrete part at one instant
 class RunFailed(Exception):
     """A run that did not reach its end.
 
-    what: what happened. t: the instant, s. hint: what to try. message: the FMU's own last message. fatal: the process
+    what: what happened. t: the instant, s. hint: what to try. message: the FMU's own last messages. fatal: the process
     cannot be used any more. again: a new process may succeed, where this one has made an instance before. resident,
     space: bytes of memory and of address space of the separate process that it happened in; 0 where there was none.
     """
@@ -78,8 +78,8 @@ class RunEnded(RunFailed):
 
 
 def failure(error: Exception, messages: Sequence[str] = ()) -> RunFailed:
-    """Return any error of a run as RunFailed. messages: those of the FMU in this run; the last one is quoted."""
-    message = messages[-1] if messages else ""
+    """Return any error of a run as RunFailed. messages: those of the FMU in this run; the last ones are quoted."""
+    message = quoted(messages)
     if isinstance(error, RunFailed):
         return error
     if isinstance(error, FmiError):
@@ -90,6 +90,15 @@ def failure(error: Exception, messages: Sequence[str] = ()) -> RunFailed:
         return RunFailed("not enough memory", fatal=True)
     # A library that cannot be loaded or lacks a function; or a bug of this package.
     return RunFailed(" ".join(f"{type(error).__name__}: {error}".split())[:500], message=message)
+
+
+@contextlib.contextmanager
+def quoting(instance: Instance) -> Iterator[None]:
+    """Raise any error of the work on an instance as RunFailed with its messages, which end with its process."""
+    try:
+        yield
+    except Exception as e:
+        raise failure(e, instance.library.messages) from None
 
 
 class Instance:
@@ -182,12 +191,15 @@ class Instance:
     def instantiate(self) -> None:
         """Make an instance. Raises RunFailed where the FMU gives none."""
         self._set.clear()
+        self.library.messages.clear()
         try:
             self.library.instantiate()
         except RuntimeError:
-            message = f": {self.library.messages[-1]}" if self.library.messages else ""
-            hint = refusal(self.description, message)
-            raise RunFailed(f"the FMU gave no instance{message}", hint=hint, again=self._made > 0) from None
+            said = self.library.messages
+            hint = refusal(self.description, " ".join(said))
+            raise RunFailed(
+                f"the FMU gave no instance{': ' * bool(said)}{quoted(said)}", hint=hint, again=self._made > 0
+            ) from None
         self._made += 1
 
     def abandon(self) -> None:
@@ -257,7 +269,8 @@ def _run_twice(load: LoadFmu, run: Callable[[Instance], Array], reuse: Reuse) ->
     def work(send: Callable[[Message], None]) -> None:
         instance = load({"restart": reuse})
         for _ in range(2):
-            rows = run(instance)
+            with quoting(instance):
+                rows = run(instance)
             if instance.learned["restart"] == reuse:
                 send(({}, {"rows": rows}))
 

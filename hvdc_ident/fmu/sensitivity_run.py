@@ -31,6 +31,7 @@ from hvdc_ident.fmu.instance import (
     find_reuse,
     isolated,
     moving,
+    quoting,
 )
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.processes.messages import Message
@@ -227,7 +228,8 @@ class SensitivityRun:
 
         def work() -> Message:
             instance = self.handler.load_fmu({k: v for k, v in self.learned.items() if k != "restart"})
-            rows = run(instance)
+            with quoting(instance):
+                rows = run(instance)
             return {"learned": instance.learned, "counts": asdict(counts), "end": self.ended}, {"rows": rows}
 
         heading, arrays = isolated(lambda send: send(work()))[0]

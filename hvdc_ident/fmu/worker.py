@@ -98,7 +98,14 @@ class RequestHandler:
 
     def _guarded(self, work: Callable[[], Message]) -> Message:
         """Return the result of work that is done in a separate process where runs are."""
-        return isolated(lambda send: send(work()))[0] if self.isolated else work()
+
+        def told(send: Callable[[Message], None]) -> None:
+            try:
+                send(work())
+            except Exception as e:
+                raise self.failed(e) from None
+
+        return isolated(told)[0] if self.isolated else work()
 
     def _point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """Return derivatives, outputs and their Jacobian at a point."""

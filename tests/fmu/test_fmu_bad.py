@@ -144,6 +144,31 @@ def test_every_bad_file_is_one_error_and_those_after_it_run(tmp_path):
         assert str(again.value) == str(told.value) and model.pool.started == 1
 
 
+def test_a_cause_that_the_fmu_reports_before_its_consequence_is_told(tmp_path):
+    said = "the license file was not found: /opt/tool/license.dat", "the core was not made", "Instantiation failed"
+    calls = "".join(f'f->logger(f->env, name, 3, "error", "{text}"); ' for text in said)
+    unlicensed = broken("unlicensed", f"{{ {calls}return 0; }}")
+    model = read_fmu(build(unlicensed, tmp_path), interface="co-simulation", limits=PATIENT)
+    with pytest.raises(ComputationError, match=f"no instance: {'; '.join(said)}.*the licence that it asks for"):
+        simulate(model, STEP)
+    model.pool.close()
+
+
+def test_messages_of_a_run_that_repeat_are_told_once(tmp_path):
+    said = "the table ends at 0.2 s", "the equations have no solution", "the step failed"
+    order = said[0], *([said[1]] * 40), said[2]
+    calls = "".join(f'm->log(m->env, "", 3, "error", "{text}"); ' for text in order)
+    code = (
+        FAULTY.code + f"#undef AT_STEP\n#define AT_STEP(r) do {{ if (m->t > 0.2) {{ {calls}return 3; }} }} while (0)\n"
+    )
+    model = read_fmu(
+        build(replace(FAULTY, name="ends", code=code), tmp_path), interface="co-simulation", limits=PATIENT
+    )
+    with pytest.raises(SimulationError, match=f"the FMU said: {'; '.join(said)}"):
+        simulate(model, STEP)
+    model.pool.close()
+
+
 def test_wrong_names_and_values_are_wrong_input(fmu):
     model = fmu(FAULTY, 2, "co-simulation", QUICK)
     with pytest.raises(InputError, match=r"no parameter or input 'TT'.*did you mean 'T'"):
