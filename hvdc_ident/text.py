@@ -12,12 +12,18 @@ from typing import Any
 _SMALLER = ((1e-4, 1e6, "µs"), (0.1, 1e3, "ms"))
 
 
+def figures(value: float, digits: int = 4) -> str:
+    """Return a number with so many significant digits; below 1e6 without exponent: 153 with two digits is 153, not 1.5e+02."""
+    shown = f"{value:.{digits}g}"
+    return f"{value:.0f}" if "e+" in shown and abs(value) < 1e6 else shown
+
+
 def quantity(value: float, unit: str = "", digits: int = 4) -> str:
     """Return a value with its unit, so many significant digits; short times in ms or µs."""
     for below, factor, smaller in _SMALLER:
         if unit == "s" and 0.0 < abs(value) < below:
-            return f"{factor * value:.{digits}g} {smaller}"
-    return f"{value:.{digits}g} {unit}".rstrip()
+            return f"{figures(factor * value, digits)} {smaller}"
+    return f"{figures(value, digits)} {unit}".rstrip()
 
 
 def with_unit(name: str, unit: str) -> str:
@@ -38,12 +44,27 @@ def duration(seconds: float) -> str:
     return f"{seconds:.2g} s" if seconds < 100.0 else f"{seconds:.0f} s"
 
 
-def span(low: float, high: float, unit: str = "", digits: int = 4) -> str:
-    """Return the two ends of a range with one unit, that of the upper one."""
+def span(low: float, high: float, unit: str = "", digits: int = 4, word: str = "and") -> str:
+    """Return the two ends of a range with one unit, that of the upper one, with as many digits as tell them apart."""
+    digits = figures_of((low, high), digits)
     for below, factor, smaller in _SMALLER:
         if unit == "s" and 0.0 < abs(high) < below:
-            return f"{factor * low:.{digits}g} and {factor * high:.{digits}g} {smaller}"
-    return f"{low:.{digits}g} and {high:.{digits}g} {unit}".rstrip()
+            return f"{figures(factor * low, digits)} {word} {figures(factor * high, digits)} {smaller}"
+    return f"{figures(low, digits)} {word} {figures(high, digits)} {unit}".rstrip()
+
+
+def interval_text(ci95: Sequence[float | None] | None) -> str:
+    """Return an interval as "A to B"; one end that is open as "above A" or "below B"; empty where both are."""
+    low, high = ci95 or (None, None)
+    if low is not None and high is not None:
+        return span(low, high, digits=6, word="to")
+    end = high if low is None else low
+    return "" if end is None else f"{'below' if low is None else 'above'} {figures(end, 6)}"
+
+
+def interval_words(*, beyond_noise: bool) -> str:
+    """Return what an interval is called: of a model that leaves more than noise none covers the truth in 95 of 100 cases."""
+    return "interval if nothing else is missing" if beyond_noise else "95 % interval"
 
 
 def figures_of(ci95: Sequence[float | None] | None, fewest: int = 6) -> int:
@@ -52,6 +73,11 @@ def figures_of(ci95: Sequence[float | None] | None, fewest: int = 6) -> int:
     if low is None or high is None or low >= high:
         return fewest
     return min(15, max(fewest, math.ceil(math.log10(max(abs(low), abs(high)) / (high - low))) + 2))
+
+
+def times_text(factor: float) -> str:
+    """Return "31 times" or "1,030 times": two figures, or whole numbers from 100 on."""
+    return f"{factor:.2g} times" if factor < 99.5 else f"{factor:,.0f} times"
 
 
 _COMMAND = re.compile(r"`hvdc-ident [^`]*`|(?<![`\w/.-])hvdc-ident .*$")

@@ -12,7 +12,7 @@ from hvdc_ident.discrepancy.refit import Refit, held_out, held_out_by_record, un
 from hvdc_ident.discrepancy.scores import Scores
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import effects
-from hvdc_ident.text import percentage
+from hvdc_ident.text import figures, percentage
 
 CLEARLY = 30.0
 """In BIC: from where held-out data speak clearly against a candidate, whatever the fitted ones say. With a smaller squared
@@ -228,7 +228,8 @@ def speaks_against(before: Refit, after: Refit) -> str:
     if not worse:
         return ""
     name = max(worse, key=lambda n: worse[n] ** 2 - was[n] ** 2)
-    return f"the held-out record '{name}' speaks against it: {now[name]:.3g} times the noise with it, {was[name]:.3g} without"
+    with_it, without = figures(now[name], 3), figures(was[name], 3)
+    return f"the held-out record '{name}' speaks against it: {with_it} times the noise with it, {without} without"
 
 
 def unseen_rows(refit: Refit) -> int:

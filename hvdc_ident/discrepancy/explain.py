@@ -19,7 +19,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.uncertainty import uncertainty
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import listed, percentage, quantity
+from hvdc_ident.text import figures, listed, percentage, quantity
 
 MOST_PLACES = 4
 """Signals at most that are asked for."""
@@ -162,7 +162,10 @@ def off_given(last: Refit, given: Refit, adequate: bool, matters: bool) -> Findi
         return None
     noise = max(last.chi2, last.rows) if adequate else last.rows
     share = 1.0 - max(last.chi2 - noise, 0.0) / (before - noise)
-    explains, louder = f"That explains {percentage(share, 1)} of the gap", f"{np.sqrt(last.chi2 / last.rows):.3g} times"
+    explains, louder = (
+        f"That explains {percentage(share, 1)} of the gap",
+        f"{figures(np.sqrt(last.chi2 / last.rows), 3)} times",
+    )
     if matters and not adequate:
         rest = (
             f"what remains is {louder} the noise and does not look like noise, but no effect that was tried explains it"

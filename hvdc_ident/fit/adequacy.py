@@ -21,6 +21,7 @@ from hvdc_ident.fit.noise_model import ESTIMATED, GIVEN, MISFIT, from_misfit, sc
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import times_text
 
 LEVEL = 1e-3
 """Chance of a verdict against the model or the noise where both are right, over all outputs together."""
@@ -213,11 +214,6 @@ def _line(output: str, size: ResidualSize, source: str) -> str:
     if size.verdict == "does-not-fit":
         return f"the residual of {output} is {times_text(size.times)} the {kind} noise ({ratio})"
     return ""
-
-
-def times_text(factor: float) -> str:
-    """Return "31 times" or "1,030 times": two figures, or whole numbers from 100 on."""
-    return f"{factor:.2g} times" if factor < 100 else f"{factor:,.0f} times"
 
 
 def residual_tests(blocks: Sequence[ResidualBlock], experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:

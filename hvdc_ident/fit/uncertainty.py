@@ -23,6 +23,7 @@ from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import Estimate
 from hvdc_ident.fit.simulator import unit_of, unknown_of
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import figures
 
 if TYPE_CHECKING:
     from hvdc_ident.fit.nonsmooth import Trend
@@ -279,7 +280,7 @@ def _inside(unknown: FitParameter, value: float, known: Uncertainty, limits: tup
     width = unknown.max - unknown.min
     reasons = ["the interval is wider than the bounds"] if math.isfinite(width) and 2.0 * half > width else []
     if half > WIDER * plain > 0:
-        worth = f"{sum(known.effective.values()):.3g}"
+        worth = figures(sum(known.effective.values()), 3)
         reasons.append(
             f"the residuals are correlated, so that {known.rows} rows are worth no more than "
             f"{worth} independent {'row' if worth == '1' else 'rows'} and the interval is {half / plain:.2g} times as wide "

@@ -14,12 +14,11 @@ from scipy.special import chdtrc
 
 from hvdc_ident.data import Array
 from hvdc_ident.fit import FitParameter
-from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.uncertainty import TWO_SIDED, score_covariance
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, normalised, pivoted_order, standard_deviations
-from hvdc_ident.text import percentage
+from hvdc_ident.text import percentage, times_text
 
 LEVEL = 0.01
 """Level of the test of all parameters together (Bonferroni)."""

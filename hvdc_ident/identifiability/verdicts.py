@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.profile import Profile
+from hvdc_ident.text import times_text
 
 VerdictName = Literal[
     "structurally-unidentifiable",

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from hvdc_ident.text import percentage
+from hvdc_ident.text import figures, figures_of, percentage
 
 
 def text(value: Any) -> str:
@@ -25,7 +25,7 @@ def number(value: Any, digits: int = 4) -> str:
     """A number with so many significant digits; a dash where there is none."""
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         return "–"
-    shown = f"{value:.{digits}g}"
+    shown = figures(value, digits)
     if "e" in shown:
         mantissa, exponent = shown.split("e")
         return f"{mantissa}·10<sup>{int(exponent)}</sup>".replace("-", "−")
@@ -56,13 +56,15 @@ def estimate(value: Any, interval: Sequence[float | None] | None) -> tuple[str, 
     """Return a value and its 95 % interval as text, with the digits that the interval leaves; a dash where there is none."""
     low, high = interval or (None, None)
     if not all(isinstance(v, int | float) and math.isfinite(v) for v in (value, low, high)) or not 0 < abs(value) < 1e6:
-        ends = [number(v, 3) if v is not None else "" for v in (low, high)]
+        digits = figures_of(interval, 3) if all(isinstance(v, int | float) for v in (low, high)) else 3
+        ends = [number(v, digits) if v is not None else "" for v in (low, high)]
         one_sided = f"below {ends[1]}" if low is None else f"above {ends[0]}" if high is None else " … ".join(ends)
         return number(value), one_sided if interval and (low, high) != (None, None) else "–"
     assert low is not None and high is not None
     places = decimals(low, high)
     if abs(value) < 10.0 ** (1 - places) or places == 6:
-        return number(value), f"{number(low, 4)} … {number(high, 4)}"
+        digits = figures_of((low, high), 4)
+        return number(value, digits), f"{number(low, digits)} … {number(high, digits)}"
     shown = [f"{v:.{places}f}".replace("-", "−") for v in (value, low, high)]
     return shown[0], f"{shown[1]} … {shown[2]}"
 

@@ -33,6 +33,7 @@ from hvdc_ident.linearize import (
 )
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.study import schema
+from hvdc_ident.text import figures
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
@@ -243,7 +244,9 @@ def response_lines(responses: Iterable[Mapping[str, Any]], of: str) -> list[str]
             lines.append(f"response {r['name']}, {of}: the model is unstable where it was measured")
         for e in model.get("errors", ()):
             share = "" if e["relative"] is None else f" off by {100 * e['relative']:.3g} %,"
-            chi2 = "" if e["chi2_per_point"] is None else f"; {math.sqrt(e['chi2_per_point']):.3g} times the noise"
+            chi2 = (
+                "" if e["chi2_per_point"] is None else f"; {figures(math.sqrt(e['chi2_per_point']), 3)} times the noise"
+            )
             lines.append(
                 f"response {r['name']}, {e['channel']}, {of}:{share} gain by up to {e['gain_db']['value']:+.3g} dB at "
                 f"{e['gain_db']['omega'] / math.tau:.4g} Hz, phase by up to {e['phase_deg']['value']:+.3g} degrees at "

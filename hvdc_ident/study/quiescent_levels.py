@@ -44,7 +44,7 @@ from hvdc_ident.study.level_comparison import (
     outputs_of,
     with_candidate_runs,
 )
-from hvdc_ident.text import listed
+from hvdc_ident.text import figures, listed
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
@@ -279,7 +279,7 @@ def _level(c: Comparison, conversion: Conversion | None, cause: Cause | None, qu
     assert level.difference is not None
     text = f"{_reading(c, UNCHANGED)}: a difference of {_signed(level.difference, c.record.unit)}"
     if level.noise_units is not None and not c.record.deterministic:
-        text += f", {abs(level.noise_units):.3g} times the noise"
+        text += f", {figures(abs(level.noise_units), 3)} times the noise"
     if len(c.levels) > 1:
         text += ", more than the candidates can make good within their bounds"
     follows = first is not None and first.error < 0.5 and abs(first.slope - 1.0) < max(2.0 * first.error, FINEST)
@@ -296,7 +296,7 @@ def _reading(c: Comparison, conversion: Conversion) -> str:
         or c.model is None
         or not (conversion is UNCHANGED or abs(c.model) > 3.0 * c.error / abs(conversion.factor))
     ):
-        return f"{output} moves {c.movements[0].slope:.3g} times as far as the model does"
+        return f"{output} moves {figures(c.movements[0].slope, 3)} times as far as the model does"
     difference = c.recorded - c.model
     ratio = abs(c.recorded / difference) if difference else 1.0
     digits = max(4, 2 + math.ceil(math.log10(max(ratio, 1.0))))  # that show the difference in two digits

@@ -11,11 +11,11 @@ from scipy.integrate import solve_ivp
 from hvdc_ident.data import InputSignal
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.fit import FitParameter, Problem, fit
-from hvdc_ident.fit.adequacy import times_text
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
 from hvdc_ident.model import Model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.study.stages.identify import lines_of
+from hvdc_ident.text import times_text
 from tests.fit.simulators import recorded
 from tests.identifiability.cases import closed
 

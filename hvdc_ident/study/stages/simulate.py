@@ -147,13 +147,13 @@ ROWS = 12
 
 def worst_of(data: Mapping[str, Any]) -> str:
     """Return the worst signal with its errors, as a phrase; empty where nothing was compared."""
-    from hvdc_ident.text import quantity
+    from hvdc_ident.text import figures, quantity
 
     if not data.get("gaps"):
         return ""
     g = data["gaps"][0]
-    over = [f"{100.0 * g['nrmse']:.3g} % of the recorded range"] if g["nrmse"] is not None else []
-    over += [f"{g['noise_units']:.3g} times the noise"] if g["noise_units"] is not None else []
+    over = [f"{figures(100.0 * g['nrmse'], 3)} % of the recorded range"] if g["nrmse"] is not None else []
+    over += [f"{figures(g['noise_units'], 3)} times the noise"] if g["noise_units"] is not None else []
     return f"{g['output']} in {g['experiment']}, RMSE {', '.join([quantity(g['rmse'], g['unit']), *over])}"
 
 
