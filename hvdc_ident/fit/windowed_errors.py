@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
+from hvdc_ident.data.units import same_unit
 from hvdc_ident.errors import StudyError, require_known
 from hvdc_ident.fit.assessment import Curve
 from hvdc_ident.immutable import FrozenMap
@@ -127,7 +128,9 @@ def windowed_errors(
 
     Each: event, end (s; the instant the event is over), end_from ("inputs" or "settling"), and for each window `from`,
     `to` (s), n, max, mean, mean_absolute (in the output's unit), limits and within (None where there is no limit for
-    the unit, or no row in the window). curves: by experiment and output. units: of the outputs.
+    the unit, or no row in the window). Of the signal itself: within (None where no window is judged) and reason, why it is
+    not judged. signals, windows: how many passed, failed and were not judged. curves: by experiment and output. units: of
+    the outputs.
     """
     table: dict[str, dict[str, Any]] = {}
     by_name = {e.name: e for e in experiments}
@@ -135,23 +138,38 @@ def windowed_errors(
         for output, curve in line.items():
             table.setdefault(output, {})[name] = _errors(by_name[name], curve, profile, units.get(output, ""))
     head = {"name": profile.name, "version": profile.version, "title": profile.title, "source": profile.source}
-    return {"profile": {**head, "notes": profile.notes, "unit": profile.unit}, "errors": table}
+    each = [about for line in table.values() for about in line.values()]
+    return {
+        "profile": {**head, "notes": profile.notes, "unit": profile.unit},
+        "errors": table,
+        "signals": _counted([a["within"] for a in each]),
+        "windows": _counted([a[w]["within"] for a in each if a["event"] is not None for w in WINDOWS]),
+    }
+
+
+def signal_within(about: Mapping[str, Any]) -> bool | None:
+    """Return whether a signal keeps its limits in every window that is judged; None where none is."""
+    judged = [w for n in WINDOWS if (w := (about.get(n) or {}).get("within")) is not None]
+    return all(judged) if judged else None
+
+
+def _counted(outcomes: Sequence[bool | None]) -> dict[str, int]:
+    return {"passed": outcomes.count(True), "failed": outcomes.count(False), "not_judged": outcomes.count(None)}
 
 
 def _errors(e: Experiment, curve: Curve, profile: ToleranceProfile, unit: str) -> dict[str, Any]:
     if e.event is None:
-        return {"event": None, "reason": "no event: no input moves and none is given"}
+        return {"event": None, "within": None, "reason": "no event: no input moves and none is given"}
     end, source = event_end(e, curve.measured, profile.windows["settling"])
     spans = windows(e, end, profile)
     rows = np.zeros(e.time.size, dtype=bool)
     rows[curve.rows] = True
-    limited = unit == profile.unit
-    return {
-        "event": e.event,
-        "end": end,
-        "end_from": source,
-        **{w: _window(e.time, spans[w], rows, curve, profile.limits[w] if limited else None) for w in WINDOWS},
-    }
+    limited = same_unit(unit, profile.unit)
+    found = {w: _window(e.time, spans[w], rows, curve, profile.limits[w] if limited else None) for w in WINDOWS}
+    within = signal_within(found)
+    reason = f"the limits are in {profile.unit}, the output is {f'in {unit}' if unit else 'without a unit'}"
+    reason = "" if within is not None else "no row in any window" if limited else reason
+    return {"event": e.event, "end": end, "end_from": source, "within": within, "reason": reason, **found}
 
 
 def _window(

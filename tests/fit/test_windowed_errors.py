@@ -72,6 +72,27 @@ def test_limits_hold_for_their_unit_alone():
     assert (found["before"]["limits"], found["before"]["within"]) == (None, None)
 
 
+def test_what_is_not_judged_is_not_passed():
+    """A boiler's power in MW, off by a half, beside a valve in pu on its record, a second valve off by a tenth, and rows of none."""
+    u = InputSignal.step(1.0, 0.0, 1.0)
+    y = np.where(T < 1.0, 0.0, 1.0 - np.exp(-(T - 1.0) / 0.2))
+    e = recorded("e", T, rest={"inputs": {"u": u}, "event": 1.0}, P=30 * y, valve=y, spare=y, dumb=y)
+    curves = {
+        "P": curve(20 * y, 30 * y),
+        "valve": curve(y, y),
+        "spare": curve(y + 0.1, y),
+        "dumb": curve(y, y, np.arange(96, 102)),
+    }
+    units = {"P": "MW", "valve": "p.u.", "spare": "pu", "dumb": "pu"}
+    found = windowed_errors({"e": curves}, (e,), PROFILE, units)
+    lines = {o: line["e"] for o, line in found["errors"].items()}
+    assert {o: a["within"] for o, a in lines.items()} == {"P": None, "valve": True, "spare": False, "dumb": None}
+    assert lines["P"]["reason"] == "the limits are in pu, the output is in MW"
+    assert lines["dumb"]["reason"] == "no row in any window" and lines["valve"]["reason"] == ""
+    assert found["signals"] == {"passed": 1, "failed": 1, "not_judged": 2}
+    assert found["windows"] == {"passed": 3, "failed": 3, "not_judged": 6}
+
+
 def test_a_step_is_over_where_the_reference_has_settled():
     u = InputSignal.step(1.0, 0.0, 1.0)
     y = np.where(T < 1.0, 0.0, 1.0 - np.exp(-(T - 1.0) / 0.2))
@@ -84,7 +105,7 @@ def test_a_step_is_over_where_the_reference_has_settled():
 
 def test_a_window_without_rows_and_an_experiment_without_event_have_no_errors():
     still = pulse(np.zeros(T.size), signal=InputSignal.constant(1.0), event=None)
-    assert still == {"event": None, "reason": "no event: no input moves and none is given"}
+    assert still == {"event": None, "within": None, "reason": "no event: no input moves and none is given"}
     late = pulse(np.zeros(T.size), signal=InputSignal.step(3.995, 0.0, 1.0), event=3.995)
     assert (late["after"]["n"], late["after"]["max"], late["after"]["within"]) == (0, None, None)
 
