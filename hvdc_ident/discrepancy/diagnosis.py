@@ -31,7 +31,16 @@ from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
 from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
 from hvdc_ident.discrepancy.signatures.candidates import entries
-from hvdc_ident.discrepancy.verdict import Judgement, findings_of, headline, judge, leaves_a_gap, tests_of
+from hvdc_ident.discrepancy.verdict import (
+    Judgement,
+    findings_of,
+    headline,
+    judge,
+    keeps_tolerance,
+    leaves_a_gap,
+    leaves_more_than_noise,
+    tests_of,
+)
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.files import plain
@@ -165,9 +174,12 @@ def _assembled(
     given = at_given(first, {f.name: f.given for f in free})
     responses_found = responses(model, first, augmented, last)
     sets = tuple(g for g in judgement.sets if len(g) > 1 or judgement.doubt)
-    findings = findings_of(search, outcome, judgement, effects)
-    text = headline(judgement, findings)
     rest = remaining(first, last, tests, search)
+    beyond = leaves_more_than_noise(
+        judgement, last, adequate=rest["adequate"], significance=search.options.significance
+    )
+    findings = findings_of(search, outcome, judgement, effects, with_intervals=not beyond)
+    text = headline(judgement, findings, tolerated=keeps_tolerance(search, last))
     if judgement.verdict == "no-evidence":
         moved = off_given(last, given, rest["adequate"], leaves_a_gap(search, last))
         findings, text = ((moved,), moved.text) if moved is not None else (findings, text)
@@ -185,6 +197,7 @@ def _assembled(
         detectable=detectable(outcome, search.options),
         gap=gap(given, first, last),
         remaining=rest,
+        beyond_noise=beyond,
         parameters_before=FrozenMap({f.name: f.given for f in free}),
         parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.given) for f in free}),
         parameters_after=FrozenMap({f.name: last.values.get(f.name, f.given) for f in free}),

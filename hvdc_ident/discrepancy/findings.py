@@ -16,17 +16,19 @@ from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import listed, quantity
+from hvdc_ident.text import figures_of, listed, quantity
 
 SHARED = ("s", "rad/s", "Hz", "")
 """Units of parameters that mean the same at every place."""
 
 
-def finding(found: Round, one: EffectClass, put_in: FoundEffect | None = None) -> Finding:
+def finding(
+    found: Round, one: EffectClass, put_in: FoundEffect | None = None, *, with_intervals: bool = True
+) -> Finding:
     """The class as it is told: what one of its likely members does, and where else it may be.
 
     put_in: what was put into the model: where that is a likely member, it is the one, with its sizes beside all other effects;
-    else it is the likeliest, as its own refit has it.
+    else it is the likeliest, as its own refit has it. with_intervals: whether the sentence tells the intervals of the sizes.
     """
     refits = {_key_of(t.refit): t.refit for t in found.trials}
     likely_ones = credible(one.members)
@@ -52,7 +54,8 @@ def finding(found: Round, one: EffectClass, put_in: FoundEffect | None = None) -
         by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
     places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
     does = own.text if own is not None else sentence(best, best.parameters, filled(best.expression, best.parameters))
-    text = f"{does}{_sizes(parameters)}{_others(one, best)}{_apart(best, places)}."
+    sizes = _sizes(parameters) if with_intervals else ""
+    text = f"{does}{sizes}{_others(one, best)}{_apart(best, places)}."
     return Finding(best.effect, _names(one, best.effect), one.probability, FrozenMap(parameters), places, text, delay)
 
 
@@ -117,7 +120,7 @@ def _sizes(parameters: Mapping[str, EffectSize]) -> str:
     known = {n: s for n, s in parameters.items() if s.ci95 is not None and None not in s.ci95}
     each = []
     for n, s in known.items():
-        low, high = (quantity(v, s.unit) for v in s.ci95 or () if v is not None)
+        low, high = (quantity(v, s.unit, figures_of(s.ci95, 4)) for v in s.ci95 or () if v is not None)
         each.append(f"{n} {low} to {high}" if len(parameters) > 1 else f"{low} to {high}")
     return f" (95 %: {', '.join(each)})" if each else ""
 

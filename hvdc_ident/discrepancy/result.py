@@ -12,7 +12,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import percentage
+from hvdc_ident.text import interval_text, interval_words, percentage
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -182,7 +182,8 @@ class Diagnosis(Shown):
     though nothing that was tried explains as much; empty where nothing does. separating_experiment: what would tell them
     apart, or show what was not excited or is in doubt.
     candidates: every candidate's line, the best first. location: where model and data differ. detectable: smallest size
-    by candidate. gap: before and after. remaining: what is left. parameters_*: by name; `parameters_refitted` are the
+    by candidate. gap: before and after. remaining: what is left. beyond_noise: whether that is more than noise; the values and
+    the intervals then hold only if nothing else is missing. parameters_*: by name; `parameters_refitted` are the
     nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in.
     fallback: the form found outside the catalogue, if one was looked for. bode: responses of nominal and augmented
     models with the data's. noise: standard deviation and AR coefficient by output, and where they come from.
@@ -215,6 +216,7 @@ class Diagnosis(Shown):
     remainder: Mapping[str, Any] = field(default_factory=dict)
     hypotheses: tuple[Hypothesis, ...] = ()
     latent: Mapping[str, Any] = field(default_factory=dict)
+    beyond_noise: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """The diagnosis as JSON takes it; `augmented_model` is the name of the card that `files` holds."""
@@ -253,11 +255,11 @@ class Diagnosis(Shown):
     def _screen(self) -> Iterator[str | TextTable]:
         yield f"Diagnosis: {self.verdict}. {self.text}"
         rows = [
-            (e.effect, ", ".join(e.at), n, size.value, size.unit, _span(size.ci95))
+            (e.effect, ", ".join(e.at), n, size.value, size.unit, interval_text(size.ci95))
             for e in self.effects
             for n, size in e.parameters.items()
         ]
-        header = ("effect", "at", "parameter", "value", "unit", "95 % interval")
+        header = ("effect", "at", "parameter", "value", "unit", interval_words(beyond_noise=self.beyond_noise))
         yield TextTable(header, tuple(rows)) if rows else ""
         gaps = [
             (words, self.gap.pooled[n]["fit"], self.gap.pooled[n]["holdout"])
@@ -328,11 +330,6 @@ class Diagnosis(Shown):
             wrap=True,
         )
         return fig
-
-
-def _span(ci95: tuple[float | None, float | None] | None) -> str:
-    low, high = ci95 or (None, None)
-    return "" if low is None or high is None else f"{low:.4g} to {high:.4g}"
 
 
 def _named(value: FoundEffect | Rival | Line | Place) -> dict[str, Any]:

@@ -27,7 +27,8 @@ from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, Verdict
 from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.text import listed, percentage
+from hvdc_ident.fit.adequacy import MATTERS
+from hvdc_ident.text import figures, listed, percentage
 
 DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""
@@ -120,32 +121,59 @@ def _weighed(
     return replace(found, verdict="named" if sure else "ambiguous", text=f"Missing: {names}.")
 
 
+def leaves_more_than_noise(judgement: Judgement, last: Refit, *, adequate: bool, significance: float) -> bool:
+    """Return True where what the model `last` leaves is more than noise: by the tests of it, by the remainder, or by a doubt.
+
+    Its values, and the sizes of its effects, then make up for what is left as well. They hold only if nothing else is missing, and
+    an interval that takes the residual for noise does not cover the truth as often as it says. adequate: whether the tests take the
+    residual for noise. One that they do not has to be louder too, as for a fit: noise is known to so much, and noise of another
+    colour than was supposed is no misfit.
+    """
+    left = judgement.remainder if judgement.verdict in ("named", "ambiguous") else None
+    shown = bool(judgement.doubt) or (left is not None and bool(_rest(left, significance)))
+    return shown or (not adequate and max(_power_by_output(last.nominal()).values(), default=0.0) > MATTERS)
+
+
+def _power_by_output(left: Nominal) -> dict[str, float]:
+    """The mean square of the residual of each output, in units of its noise."""
+    each: dict[str, list[Array]] = {}
+    for b in left.blocks:
+        each.setdefault(b.output, []).append(b.residual)
+    return {o: float(np.mean(np.concatenate(parts) ** 2)) for o, parts in each.items()}
+
+
 def findings_of(
-    search: SearchContext, outcome: SearchOutcome, judgement: Judgement, placed: Sequence[FoundEffect]
+    search: SearchContext,
+    outcome: SearchOutcome,
+    judgement: Judgement,
+    placed: Sequence[FoundEffect],
+    *,
+    with_intervals: bool = True,
 ) -> tuple[Finding, ...]:
     """Return the findings: of each effect that was put in its likely classes, then the held parameters whose values are off.
 
-    placed: the effects that were put in, with their sentences.
+    placed: the effects that were put in, with their sentences. with_intervals: whether these tell the intervals of the sizes.
     """
     share = None if judgement.remainder is None else 1.0 - judgement.remainder.share
     found: list[Finding] = []
     for of, own, group in zip(outcome.kept, placed, judgement.sets, strict=False):
-        found += [replace(finding(of, one, own), share=share) for one in likely(classes(group))]
+        found += [
+            replace(finding(of, one, own, with_intervals=with_intervals), share=share) for one in likely(classes(group))
+        ]
     freed = {f.name for f in (*search.held, *search.stated)} & set(outcome.refit.problem.names)
     if placed and freed and (moved := moved_parameters(outcome.refit, freed)) is not None:
         found.append(replace(moved, share=share))
     return tuple(found)
 
 
-def headline(judgement: Judgement, findings: Sequence[Finding]) -> str:
-    """The verdict in one or two sentences."""
+def headline(judgement: Judgement, findings: Sequence[Finding], *, tolerated: bool = False) -> str:
+    """The verdict in one or two sentences. tolerated: whether every signal keeps the tolerance that is stated for it."""
     left = judgement.remainder
     if judgement.verdict != "named" or left is None:
         return judgement.text
     explains = "Together they explain" if len(findings) > 1 else "It explains"
-    rest = f"what remains is {left.noise_units:.3g} times the noise" + (
-        ", within the tolerance" if left.below_tolerance else ""
-    )
+    rest = f"what remains is {figures(left.noise_units, 3)} times the noise"
+    rest += ", within the stated tolerance" if tolerated else ""
     caveat = f" {judgement.caveat[:1].upper()}{judgement.caveat[1:]}." if judgement.caveat else ""
     return (
         f"{' '.join(f.text for f in findings)} {explains} {percentage(1.0 - left.share, 1)} of the gap; {rest}.{caveat}"
@@ -162,7 +190,7 @@ def _rest(remainder: Remainder, significance: float) -> str:
         )
     held = remainder.held_out or 0.0
     if held > TOLERANCE and remainder.held_out_p <= significance:
-        record = f", most of it in '{remainder.record}' ({remainder.record_units:.3g} times the noise)"
+        record = f", most of it in '{remainder.record}' ({figures(remainder.record_units, 3)} times the noise)"
         parts.append(f"{percentage(held, 1)} of the held-out gap is left{record if remainder.record else ''}")
     return "; ".join(parts)
 
@@ -249,6 +277,12 @@ def noise_left(left: Nominal) -> float:
         own = np.concatenate(quiet.get(output) or [np.zeros(0)])
         total += count * (float(np.mean(own**2)) if own.size >= FEWEST else 1.0)
     return max(total / max(sum(rows.values()), 1), 1.0)
+
+
+def keeps_tolerance(search: SearchContext, last: Refit) -> bool:
+    """Return True where a tolerance is stated and a model keeps it in every signal that has one."""
+    largest = worst(last)
+    return bool(search.tolerance) and all(largest.get(o, np.inf) <= band for o, band in search.tolerance.items())
 
 
 def leaves_a_gap(search: SearchContext, last: Refit) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from cases import FREE, SIGMA, TRUE, experiments, model
 from refits import beside, plain
@@ -17,8 +18,9 @@ from hvdc_ident.discrepancy.classes import classes
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.explain import at_given, off_given, sentence
 from hvdc_ident.discrepancy.refit import run
-from hvdc_ident.discrepancy.remainder import remainder_of
+from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
+from hvdc_ident.discrepancy.verdict import Judgement, headline, keeps_tolerance, leaves_more_than_noise
 from hvdc_ident.immutable import FrozenMap
 
 GIVEN = {"Kp": 2.6, "Ki": 9.0}
@@ -56,6 +58,50 @@ def test_a_finding_has_its_probability_and_places(lagged: Diagnosis) -> None:
     assert told.equivalent_delay is not None and told.equivalent_delay.value == pytest.approx(0.03, rel=0.05)
     assert told.share is not None and told.share > 0.95
     assert "It explains" in lagged.text and "times the noise" in lagged.text
+
+
+def test_what_leaves_more_than_noise_tells_no_interval(lagged: Diagnosis) -> None:
+    """With the lag alone the drive is right; with a brake as well, which is not looked for, its values are off by more than they say."""
+    assert not lagged.beyond_noise and "(95 %: " in lagged.text and "within" not in lagged.text
+    records = experiments(lag=0.03, drag=lambda w: TRUE["b"] * w * (1.0 + 0.03 * w**2))
+    braked = diagnose(model(), records, FREE, effects=["lag"], options=DiagnosisOptions(most=1, fallback=False), seed=1)
+    assert [e.effect for e in braked.effects] == ["lag"]
+    assert braked.beyond_noise and "95 %" not in braked.text and all("95 %" not in f.text for f in braked.findings)
+    assert "interval if nothing else is missing" in str(braked) and "95 % interval" in str(lagged)
+
+
+@pytest.mark.parametrize(
+    ("adequate", "loud", "doubt", "remainder", "more"),
+    [
+        (True, 2.0, "", None, False),  # louder than was supposed, and noise
+        (False, 1.3, "", None, False),  # of another colour, and hardly louder
+        (False, 2.0, "", None, True),
+        (True, 1.0, "the experiments ask for different sizes", None, True),
+        (True, 1.0, "", Remainder(0.05, None, 1.0, p=0.005), True),
+        (True, 1.0, "", Remainder(0.05, None, 1.0, p=0.5), False),
+        (True, 1.0, "", Remainder(0.0, 0.05, 1.0, held_out_p=0.005), True),
+    ],
+)
+def test_more_than_noise_is_left_where_a_test_a_doubt_or_the_remainder_says_so(
+    adequate: bool, loud: float, doubt: str, remainder: Remainder | None, more: bool
+) -> None:
+    """loud: the residual of one of two outputs over its noise; that of the other is as loud as noise."""
+    signs = np.tile([1.0, -1.0], 50)
+    blocks = [SimpleNamespace(output=o, residual=k * signs) for o, k in (("w", 1.0), ("torque", loud))]
+    last: Any = SimpleNamespace(nominal=lambda: SimpleNamespace(blocks=blocks))
+    judgement = Judgement("named", "", (), doubt=doubt, remainder=remainder)
+    assert leaves_more_than_noise(judgement, last, adequate=adequate, significance=0.01) is more
+
+
+def test_the_headline_speaks_of_a_tolerance_only_where_one_is_stated_and_kept(lagged: Diagnosis) -> None:
+    told = Judgement("named", "", (), remainder=Remainder(0.0, None, 4.0))
+    assert "what remains is 4 times the noise." in headline(told, lagged.findings)
+    assert "4 times the noise, within the stated tolerance." in headline(told, lagged.findings, tolerated=True)
+    first = plain(experiments(lag=0.03))
+    largest = max(v for v in first.problem.rmse(first.theta)["w"].values() if v is not None)
+    for band, kept in ((1.01 * largest, True), (0.99 * largest, False)):
+        assert keeps_tolerance(replace(SEARCH, tolerance=FrozenMap({"w": band})), first) is kept
+    assert keeps_tolerance(SEARCH, first) is False
 
 
 def test_the_json_of_findings(lagged: Diagnosis) -> None:
