@@ -11,9 +11,9 @@ import numpy as np
 from hvdc_ident.axes import joined
 from hvdc_ident.data import Array
 from hvdc_ident.display import Table, rounded
+from hvdc_ident.report.answers import beyond_noise, places_of
 from hvdc_ident.report.overlay import Overlay
-from hvdc_ident.study.run_summary import interval_text
-from hvdc_ident.text import figures_of, one_of, percentage
+from hvdc_ident.text import figures_of, interval_text, interval_words, one_of, percentage
 
 _COMMAND = re.compile(r"`?hvdc-ident ([a-z]+) STUDY(?: --to FILE)?`?")
 _BUTTONS = {"letter": "the button Letter", "export": "a button below Take away", "run": "Run all"}
@@ -79,11 +79,12 @@ def finding_table(diagnosis: Mapping[str, Any]) -> Table:
             within = interval_text(p.get("ci95"))
             value = f"{name} = {p['value']:.{figures_of(p.get('ci95'), 4)}g} {p.get('unit') or ''}".rstrip()
             sizes.append(f"{value} ({within})" if within else value)
-        places = [f"{', '.join(p['at'])} ({percentage(p['probability'])})" for p in f["places"]]
+        places = [f"{at} ({percentage(p)})" for at, p in places_of(f["places"]).items()]
         more = [f"{len(places) - PLACES} more"] if len(places) > PLACES else []
         where = "; ".join([*places[:PLACES], *more])
         rows.append((one_of(f["same_as"]), percentage(f["probability"]), "; ".join(sizes), where))
-    return Table(("effect", "probability", "size (95 %)", "likely at"), tuple(rows)).without_empty()
+    words = "95 %" if not beyond_noise(diagnosis) else interval_words(beyond_noise=True)
+    return Table(("effect", "probability", f"size ({words})", "likely at"), tuple(rows)).without_empty()
 
 
 def gap_table(diagnosis: Mapping[str, Any]) -> Table:

@@ -6,7 +6,7 @@ The first screen of the report and the letter both show these answers, each in i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.fit.adequacy import MATTERS
+from hvdc_ident.fit.windowed_errors import signal_within
 from hvdc_ident.report.overlay import STAGES, Overlay, overlay_of
 from hvdc_ident.report.results import Results
-from hvdc_ident.text import one_of, percentage, quantity
+from hvdc_ident.text import figures, interval_words, listed, one_of, percentage, quantity
 
 Signal = tuple[str, str]
 """An output and an experiment."""
@@ -24,6 +25,8 @@ Table = Mapping[str, Mapping[str, float | None]]
 
 ADDED = {"term": "formula", "filter": "filter", "curve": "curve"}
 """Words for what stands in the model in place of an effect of the catalogue."""
+AT_BOUND = "at its bound"
+"""Note on a value that stands on a bound of the search."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,8 @@ class Errors:
     """Errors of the model with one set of values.
 
     name: "given", "fitted" or "effect". rmse, largest: in the worst signal, in its unit; times: rmse over the noise, there.
-    above: signals whose error is above the noise, of `judged`; outside: signals outside the tolerance, of `limited`.
+    above: signals whose error is above the noise, of `judged`, and `unknown`: those whose noise is not known. outside: signals
+    outside the tolerance, of `limited`, and `unlimited`: those without one.
     """
 
     name: str
@@ -42,23 +46,32 @@ class Errors:
     judged: int
     outside: int
     limited: int
+    unknown: int = 0
+    unlimited: int = 0
 
     @property
     def on_noise(self) -> bool | None:
-        """True where every signal with a known noise is followed to it; None where none is known."""
-        return self.above == 0 if self.judged else None
+        """True where every signal is followed to its noise, False where one is not; None where the noise of none, or of some, is
+        not known and no other fails."""
+        return _passed(self.above, self.judged, self.unknown)
 
     @property
     def tolerated(self) -> bool | None:
-        """True where every signal with a tolerance keeps it; None without one."""
-        return self.outside == 0 if self.limited else None
+        """True where every signal keeps its tolerance, False where one does not; None where none, or not all, of them have one."""
+        return _passed(self.outside, self.limited, self.unlimited)
+
+
+def _passed(failed: int, judged: int, not_judged: int) -> bool | None:
+    """What is not judged is not passed."""
+    return False if failed else None if not_judged or not judged else True
 
 
 @dataclass(frozen=True)
 class Value:
     """A parameter: the value that counts with its interval, and the others by name; None where there is none.
 
-    value: that of the model with what it lacks where that was named, else the fitted one. note: why it is held.
+    value: that of the model with what it lacks where that was named, else the fitted one. note: why it is held, or that it
+    stands on a bound.
     """
 
     name: str
@@ -73,6 +86,19 @@ class Value:
     def value(self) -> float | None:
         """The value that counts."""
         return self.fitted if self.effect is None else self.effect
+
+    @property
+    def differs(self) -> bool | None:
+        """True where the interval leaves out the given value, False where it holds it; None where there is no interval."""
+        low, high = self.interval or (None, None)
+        if self.given is None or self.value is None or (low is None and high is None):
+            return None
+        return not (-math.inf if low is None else low) <= self.given <= (math.inf if high is None else high)
+
+    @property
+    def change(self) -> float | None:
+        """The value that counts less the given one, over the given one; None where there is none, or the given one is 0."""
+        return self.value / self.given - 1.0 if self.value is not None and self.given else None
 
 
 @dataclass(frozen=True)
@@ -119,10 +145,23 @@ class Answers:
     @property
     def added(self) -> str:
         """Kind of the addition in the augmented model: "effect", "formula", "filter" or "curve"; empty where nothing was added."""
-        if self.diagnosis.get("effects"):
-            return "effect"
-        kind = (self.diagnosis.get("fallback") or {}).get("kind", "") if self.diagnosis.get("augmented_model") else ""
-        return ADDED.get(kind, "")
+        return added_to(self.diagnosis)
+
+    @property
+    def conditional(self) -> bool:
+        """True where the values that count hold only if nothing else is missing: what their model leaves is more than noise."""
+        return values_conditional(self.fit, self.diagnosis, effect=any(v.effect is not None for v in self.values))
+
+    @property
+    def condition(self) -> str:
+        """Sentence on what the values that count rest on; empty where what is left is noise."""
+        if not self.conditional:
+            return ""
+        return "They hold only if nothing else is missing: what remains is more than the noise."
+
+    def interval_words(self, *, effect: bool) -> str:
+        """What the intervals of the values with the effect, or else of the fitted ones, are called."""
+        return interval_words(beyond_noise=values_conditional(self.fit, self.diagnosis, effect=effect))
 
     @cached_property
     def worst(self) -> Signal | None:
@@ -183,14 +222,40 @@ class Answers:
     @property
     def follows(self) -> bool | None:
         """The verdict on the model as it is, fitted where it was; None where neither a tolerance nor a noise is known."""
-        found = self.judged
-        if found is None:
-            return None
-        return found.tolerated if self.by_tolerance and found.tolerated is not None else found.on_noise
+        return None if self.judged is None else self.passed(self.judged)
+
+    def held_to_tolerance(self, errors: Errors) -> bool:
+        """True where the verdict on these errors is by a tolerance, False where it is by the noise."""
+        return self.by_tolerance and errors.limited > 0
+
+    def passed(self, errors: Errors) -> bool | None:
+        """The verdict on these errors; None where a signal is not judged and no other fails."""
+        return errors.tolerated if self.held_to_tolerance(errors) else errors.on_noise
+
+    def not_judged(self, errors: Errors, *, tolerance: bool) -> str:
+        """Phrase on the signals that are not judged, by the tolerance or else by the noise, and what to state; empty without any."""
+        count = errors.unlimited if tolerance else errors.unknown
+        if not count:
+            return ""
+        said = f"{count} signal{'s' if count > 1 else ''} not judged"
+        if not tolerance:
+            return f"{said}: state the noise of {listed(self._without_noise(errors.name))}"
+        if self.tolerance:
+            rest = [o for o in self.rmse[errors.name] if o not in self.tolerance]
+            return f"{said}: the study states no tolerance for {listed(rest)}"
+        why: dict[str, list[str]] = {}
+        for output, line in self._windows(errors.name).items():
+            for about in line.values():
+                if signal_within(about) is None:
+                    names = why.setdefault(str(about.get("reason") or "no limit in its unit"), [])
+                    names += [] if output in names else [output]
+        reasons = [f"{one_of(names)} ({reason})" for reason, names in why.items()]
+        return f"{said}: {'; '.join(reasons)}" if reasons else said
 
     def _errors(self, name: str) -> Errors:
         table = self.rmse[name]
-        noisy = [(e, s) for (o, x), e in _entries(table) if (s := self.noise((o, x)))]
+        signals = list(_entries(table))
+        noisy = [(e, s) for (o, x), e in signals if (s := self.noise((o, x)))]
         kept = self._kept(name)
         rmse = largest = times = None
         if self.worst is not None:
@@ -201,20 +266,20 @@ class Answers:
             run = overlay_of(self.results, experiment, output, (name,))
             largest = None if run is None else float(np.nanmax(np.abs(run.error(name)), initial=0.0))
         above = sum(e**2 > MATTERS * s**2 for e, s in noisy)
-        return Errors(name, rmse, largest, times, above, len(noisy), sum(not k for k in kept), len(kept))
+        unknown, unlimited = (max(len(signals) - len(judged), 0) for judged in (noisy, kept))
+        return Errors(
+            name, rmse, largest, times, above, len(noisy), sum(not k for k in kept), len(kept), unknown, unlimited
+        )
+
+    def _without_noise(self, name: str) -> list[str]:
+        return list(dict.fromkeys(o for (o, x), _ in _entries(self.rmse[name]) if not self.noise((o, x))))
 
     def _kept(self, name: str) -> list[bool]:
         """Of each signal with a tolerance, whether the model keeps it: the study's own, else that of the profile's windows."""
         if self.tolerance:
             return [e <= self.tolerance[o] for (o, _), e in _entries(self.rmse[name]) if o in self.tolerance]
-        kept = []
-        for line in self._windows(name).values():
-            for about in line.values():
-                within = [
-                    w for k in ("before", "during", "after") if (w := (about.get(k) or {}).get("within")) is not None
-                ]
-                kept += [all(within)] if within else []
-        return kept
+        each = [signal_within(about) for line in self._windows(name).values() for about in line.values()]
+        return [kept for kept in each if kept is not None]
 
     def _windows(self, name: str) -> Mapping[str, Any]:
         return (self.results.get(STAGES[name]).get("windowed_errors") or {}).get("errors") or {}
@@ -249,20 +314,25 @@ class Answers:
         held = self.fit.get("held") or {n: h.get("reason", "") for n, h in (told.get("held") or {}).items()}
         rows = []
         for name, line in lines.items():
-            known = name in self.fitted or (name in later and name in after)
-            ends = self.interval(name, "discrepancy" if name in after else "fit") if known else None
-            rows.append(
-                Value(
-                    name,
-                    str(line.get("unit") or ""),
-                    line.get("given"),
-                    (self.fit.get("values") or {}).get(name) if name in self.fitted else None,
-                    after.get(name) if name in self.fitted or name in later or not self.fit else None,
-                    ends,
-                    "" if known else str(held.get(name) or ""),
-                )
-            )
+            fitted = (self.fit.get("values") or {}).get(name) if name in self.fitted else self._on_bound.get(name)
+            effect = after.get(name) if name in self.fitted or name in later or not self.fit else None
+            value = fitted if effect is None else effect
+            ends = self.interval(name, "fit" if effect is None else "discrepancy") if value is not None else None
+            note = "" if value is not None else str(held.get(name) or "")
+            if value is not None and (
+                (effect is None and name in self._on_bound) or value in (line.get("min"), line.get("max"))
+            ):
+                note = AT_BOUND
+            rows.append(Value(name, str(line.get("unit") or ""), line.get("given"), fitted, effect, ends, note))
         return tuple(rows)
+
+    @property
+    def _on_bound(self) -> dict[str, float]:
+        """The parameters that a fit holds on the bound where the search for them ended, with that bound."""
+        if not self.fitted:
+            return {}
+        estimates = self.fit.get("estimates") or {}
+        return {n: e["value"] for n, e in estimates.items() if n not in self.fitted and e.get("method") == "one-sided"}
 
     @cached_property
     def missing(self) -> tuple[Missing, ...]:
@@ -283,7 +353,7 @@ class Answers:
                     "parameter" if parameters else one_of(f["same_as"]),
                     (said or str(f["text"])).rstrip("."),
                     float(f["probability"]),
-                    () if parameters else tuple((", ".join(p["at"]), float(p["probability"])) for p in places),
+                    () if parameters else tuple(places_of(places).items()),
                     quantity(late["value"], "s", 3) if late.get("value") is not None else "",
                 )
             )
@@ -291,15 +361,11 @@ class Answers:
 
     @property
     def remainder(self) -> str:
-        """Sentence on what is left with the findings in the model; empty where that is noise, or where nothing was found."""
-        left = self.diagnosis.get("remainder") or {}
-        if (
-            not self.missing
-            or not self.added
-            or not left
-            or (left.get("below_tolerance") and not self.diagnosis.get("doubt"))
-        ):
+        """Sentence on what is left with the additions in the model; empty where that is noise, or where nothing was added."""
+        if not self.added or not beyond_noise(self.diagnosis):
             return ""
+        # Of a formula, a filter or a curve no more is known: the shares are those of the best of the catalogue.
+        left = self.diagnosis.get("remainder") or {} if self.added == "effect" else {}
         share, held = left.get("share"), left.get("held_out")
         parts = []
         if (
@@ -313,12 +379,19 @@ class Answers:
         if isinstance(held, int | float) and held >= 0.005:
             where = f", most of it in {left['record']}" if left.get("record") else ""
             times = (
-                f" ({left['record_units']:.3g} times the noise)"
+                f" ({figures(left['record_units'], 3)} times the noise)"
                 if left.get("record") and left.get("record_units")
                 else ""
             )
             parts.append(f"on held-out recordings {percentage(held)} is left{where}{times}")
-        return ". ".join(p[:1].upper() + p[1:] for p in parts)
+        told = ". ".join(p[:1].upper() + p[1:] for p in parts)
+        adequate = (self.diagnosis.get("remaining") or {}).get("adequate", bool(self.doubt))
+        return told or ("" if adequate else "What is left is still not noise")
+
+    @property
+    def doubt(self) -> str:
+        """What tells that something else stands behind the additions, as a sentence goes on; empty where nothing does."""
+        return str(self.diagnosis.get("doubt") or "") if self.added else ""
 
     @property
     def next(self) -> str:
@@ -348,6 +421,52 @@ def _entries(table: Table) -> Iterable[tuple[Signal, float]]:
         for experiment, error in line.items():
             if error is not None:
                 yield (output, experiment), float(error)
+
+
+def added_to(diagnosis: Mapping[str, Any]) -> str:
+    """Return the kind of the addition in an augmented model: "effect", "formula", "filter" or "curve"; empty without one."""
+    if diagnosis.get("effects"):
+        return "effect"
+    kind = (diagnosis.get("fallback") or {}).get("kind", "") if diagnosis.get("augmented_model") else ""
+    return ADDED.get(kind, "")
+
+
+def beyond_noise(diagnosis: Mapping[str, Any]) -> bool:
+    """Return True where what the model of a diagnosis leaves is more than noise: something else is missing.
+
+    The diagnosis says so itself; of one of an earlier version its tests do.
+    """
+    left = diagnosis.get("remaining") or {}
+    tested = bool(diagnosis.get("doubt")) or (not left.get("adequate", True) and left.get("material", True))
+    return bool(diagnosis.get("beyond_noise", tested))
+
+
+def values_conditional(fit: Mapping[str, Any], diagnosis: Mapping[str, Any], *, effect: bool) -> bool:
+    """Return True where values hold only if nothing else is missing, so that no interval of theirs is one of 95 %.
+
+    effect: those with what the model lacks, judged by what is left with it. Else those of a fit of the model as it is: by the
+    residuals of the fit, and by a diagnosis that found something missing, or something left that it could not name.
+    """
+    if effect:
+        return beyond_noise(diagnosis)
+    misfit = (fit.get("adequacy") or {}).get("verdict") == "does-not-fit"
+    return misfit or bool(added_to(diagnosis)) or beyond_noise(diagnosis)
+
+
+def places_of(
+    places: Iterable[Mapping[str, Any]], join: Callable[[Iterable[str]], str] = ", ".join
+) -> dict[str, float]:
+    """Return likely places with their probabilities, each once, with the signal that is brought in where that tells them apart."""
+    places = list(places)
+    sources: dict[str, set[str]] = {}
+    for p in places:
+        sources.setdefault(join(p["at"]), set()).add(str(p.get("from") or ""))
+    found: dict[str, float] = {}
+    for p in places:
+        at = join(p["at"])
+        at += f" from {p['from']}" if p.get("from") and len(sources[at]) > 1 else ""
+        found[at] = found.get(at, 0.0) + float(p.get("probability", 0.0))
+    return found
 
 
 def joined_gap(gap: Mapping[str, Table]) -> dict[str, dict[str, float | None]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from hvdc_ident.report.answers import Answers, Errors, Value
+from hvdc_ident.report.answers import AT_BOUND, Answers, Errors, Value
 from hvdc_ident.report.html import badge, estimate, number, percent, prose, rough, share, table, text
 from hvdc_ident.report.overlay import WORDS, Sheet
 from hvdc_ident.report.results import Results
@@ -64,8 +64,8 @@ def _verdict(found: Answers) -> str:
             rough(e.rmse),
             rough(e.times) if e.times is not None else "",
             rough(e.largest) if e.largest is not None else "",
-            _counted(e.on_noise, e.above, e.judged) if e.judged else "",
-            _counted(e.tolerated, e.outside, e.limited) if e.limited else "",
+            _counted(e.above, e.judged, e.unknown) if e.judged else "",
+            _counted(e.outside, e.limited, e.unlimited) if e.limited or (e.unlimited and found.by_tolerance) else "",
         ]
         for e in found.errors
     ]
@@ -75,22 +75,38 @@ def _verdict(found: Answers) -> str:
     return f"<p class='answer'>{_sentence(found, found.judged)}</p><p>{worst}</p>{table(header, rows, words=(0, 4, 5))}{_basis(found)}"
 
 
-def _counted(passed: bool | None, failed: int, of: int) -> str:
-    """A badge, and how many signals are behind a FAIL."""
-    return badge(passed) + (f" {failed} of {of}" if failed else "")
+def _counted(failed: int, judged: int, not_judged: int) -> str:
+    """A badge with the number of signals behind it, where it is not all of them, and the number of those that are not judged."""
+    parts = []
+    if failed:
+        parts.append(f"{badge(False)} {failed} of {judged}")
+    elif judged:
+        parts.append(badge(True) + (f" {judged}" if not_judged else ""))
+    return ", ".join([*parts, *([f"not judged {not_judged}"] if not_judged else [])])
 
 
 def _sentence(found: Answers, judged: Errors) -> str:
     which = "The fitted model" if judged.name == "fitted" else "The model with its given values"
-    if found.follows is None:
+    held = found.held_to_tolerance(judged)
+    count, failed = (judged.limited, judged.outside) if held else (judged.judged, judged.above)
+    if not count:
         return f"{which} is not judged: neither the noise of the recordings nor a tolerance is known."
-    kind = "keeps the tolerance" if found.by_tolerance else "follows every recorded signal to its noise"
-    if found.follows:
-        return f"{badge(True)} {which} {kind}."
-    kind = "does not keep the tolerance" if found.by_tolerance else "does not follow the recordings to their noise"
+    if not failed:
+        rest = text(found.not_judged(judged, tolerance=held))
+        signals = f"the {count} signal{'s' if count > 1 else ''} that {'are' if count > 1 else 'is'} judged"
+        if held:
+            kind = f"keeps the tolerance in {signals}; {rest}" if rest else "keeps the tolerance"
+        else:
+            kind = f"follows {signals} to the noise; {rest}" if rest else "follows every recorded signal to its noise"
+        return f"{badge(True) if not rest else ''} {which} {kind}.".strip()
+    kind = "does not keep the tolerance" if held else "does not follow the recordings to their noise"
     completed = next((e for e in found.errors if e.name == "effect"), None)
-    mended = completed is not None and (completed.tolerated if found.by_tolerance else completed.on_noise)
-    return f"{badge(False)} {which} {kind}{'; with the effect it does' if mended else ''}."
+    mended = ""
+    if completed is not None:
+        done = completed.limited and not completed.outside if held else completed.judged and not completed.above
+        some = completed.unlimited if held else completed.unknown
+        mended = f"; with the effect it does{', where it is judged' if some else ''}" if done else ""
+    return f"{badge(False)} {which} {kind}{mended}."
 
 
 def _basis(found: Answers) -> str:
@@ -98,13 +114,19 @@ def _basis(found: Answers) -> str:
     parts = []
     if any(e.judged for e in found.errors):
         parts.append("On the noise: the error has at most twice the noise’s power. Behind FAIL: signals that fail.")
+        if rest := found.not_judged(found.errors[-1], tolerance=False):
+            parts.append(f"On the noise, {text(rest)}.")
     if found.tolerance:
         each = ", ".join(
             f"{text(o)} {number(v)} {text(found.results.units.get(o, ''))}".rstrip() for o, v in found.tolerance.items()
         )
         parts.append(f"Tolerance of the RMSE: {each}.")
-    elif any(e.limited for e in found.errors):
+    elif any(e.limited for e in found.errors) or found.profile.get("named"):
         parts.append(_windows(found.profile))
+    if found.tolerance or found.profile:
+        windowed = next((e for e in reversed(found.errors) if e.limited), found.errors[-1])
+        if (windowed.limited or found.by_tolerance) and (rest := found.not_judged(windowed, tolerance=True)):
+            parts.append(f"In the {'tolerance' if found.tolerance else 'windows'}, {text(rest)}.")
     return f"<p class='small'>{' '.join(parts)}</p>"
 
 
@@ -125,13 +147,15 @@ def _values(found: Answers) -> str:
         if len(found.values) > ROWS
         else ""
     )
-    header = ["parameter, unit", "given", "value", "95 % interval", "change", ""]
-    return f"<p class='answer'>{_which(found)}</p>{table(header, rows, words=(0, 5))}{more}{_moved(found)}"
+    effect = any(v.effect is not None for v in found.values)
+    header = ["parameter, unit", "given", "value", found.interval_words(effect=effect), "change", ""]
+    which = " ".join(s for s in (_which(found), found.condition if found.fitted or effect else "") if s)
+    return f"<p class='answer'>{which}</p>{table(header, rows, words=(0, 5))}{more}{_moved(found)}"
 
 
 def _value_row(v: Value) -> list[str]:
     shown, interval = estimate(v.value, v.interval)
-    note = "held" if v.note else ""
+    note = AT_BOUND if v.note == AT_BOUND else "held" if v.note else ""
     return [
         f"<strong>{text(v.name)}</strong>" + (f", {text(v.unit)}" if v.unit else ""),
         number(v.given),
@@ -195,6 +219,8 @@ def _missing(found: Answers) -> str:
             parts.append(f"<p>Where, by probability: {shown}{rest}.</p>")
     if found.remainder:
         parts.append(f"<p><strong>Not all of it:</strong> {text(found.remainder)}.</p>")
+    elif found.doubt:
+        parts.append(f"<p><strong>In doubt:</strong> {text(found.doubt)}.</p>")
     return "".join(parts)
 
 

@@ -1,23 +1,35 @@
 """The letter: one printed page to the owner of a model, made from the results alone.
 
 Who writes to whom about which model; whether it follows the recordings; the values given, fitted and with what it lacks; what
-that is and what it does to the gains; what the owner is asked to confirm; what to record to be sure; and a figure of before
-and after.
+that is and which of the given values the recordings leave out; what the owner is asked to confirm; what to record to be sure;
+and a figure of before and after.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
-from hvdc_ident.report.answers import Answers, Errors
+from hvdc_ident.report.answers import AT_BOUND, Answers, Errors, Value, added_to, beyond_noise, places_of
 from hvdc_ident.report.html import badge, estimate, number, table, text
-from hvdc_ident.report.overlay import Sheet, overlay_of
+from hvdc_ident.report.overlay import WORDS, Sheet, overlay_of
 from hvdc_ident.report.results import Results
-from hvdc_ident.text import form_of, listed, percentage, quantity, span
+from hvdc_ident.text import (
+    figures,
+    figures_of,
+    form_of,
+    interval_text,
+    listed,
+    percentage,
+    quantity,
+    span,
+    times_text,
+)
 
 FILE = "letter.html"
 STAGE = "discrepancy"
@@ -25,6 +37,8 @@ MOVED = 0.02
 """Share of the given value from which on a fitted value is said to differ from it."""
 RIVALS = 3
 """Effects and places that are told beside the one in the model."""
+MOST_OFF = 4
+"""Values that differ from the given ones which are told one by one."""
 ASKED = {
     "backlash": "the play of the mechanism",
     "deadband": "the width of the dead band",
@@ -80,7 +94,7 @@ def letter_of(results: Results) -> Letter:
             hint="hvdc-ident diagnose STUDY",
         )
     answers = Answers(results)
-    sentences = (_missed(answers), _consistent(found), _gains(answers), _gained(found))
+    sentences = (_missed(answers), _consistent(answers), _values_judged(answers), _gained(found))
     return Letter(tuple(s for s in sentences if s), _request(answers), _next(found), tuple(_attached(results, found)))
 
 
@@ -133,7 +147,7 @@ def _passed(answers: Answers) -> bool | None:
     errors = _given(answers)
     if errors is None:
         return None
-    return errors.tolerated if answers.by_tolerance and errors.tolerated is not None else errors.on_noise
+    return answers.passed(errors)
 
 
 def _missed(answers: Answers) -> str:
@@ -141,52 +155,68 @@ def _missed(answers: Answers) -> str:
     errors = _given(answers)
     if errors is None or answers.worst is None:
         return "The model could not be compared with the recordings at its given values."
-    if _passed(answers):
-        kind = (
-            "keeps the tolerance in every recorded signal"
-            if answers.by_tolerance
-            else "follows every recorded signal to its noise"
-        )
-        return f"With the values it came with, your model {kind}."
+    mine = "With the values it came with, your model"
+    held = answers.held_to_tolerance(errors)
+    failed, count = (errors.outside, errors.limited) if held else (errors.above, errors.judged)
+    rest = answers.not_judged(errors, tolerance=held)
+    if count and not failed:
+        kind = ("keeps the tolerance in", "") if held else ("follows", " to its noise")
+        signals = f"{count} recorded signal{'s' if count > 1 else ''}" if rest else "every recorded signal"
+        return f"{mine} {kind[0]} {signals}{kind[1]}{f'; {rest}' if rest else ''}."
     output, experiment = answers.worst
     unit = str(answers.results.units.get(output, ""))
-    times = f", {errors.times:.2g} times the noise of the recording" if errors.times is not None else ""
-    worst = f"most of all {output} in experiment '{experiment}': its RMSE there is {_plain(errors.rmse, unit)}{times}."
-    if answers.by_tolerance and errors.limited:
-        return f"With the values it came with, your model is outside the tolerance in {errors.outside} of {errors.limited} signals, {worst}"
-    among = f" {errors.above} of {errors.judged} recorded signals" if errors.judged else " the recordings"
-    return f"With the values it came with, your model misses{among}, {worst}{_in_windows(answers, errors)}"
+    times = f", {times_text(errors.times)} the noise of the recording" if errors.times is not None else ""
+    worst = f"{output} in experiment '{experiment}': its RMSE there is {_plain(errors.rmse, unit)}{times}"
+    beside = f" Of the others, {rest}." if rest and count else ""
+    if not count:
+        return f"{mine} cannot be judged: neither the noise of the recordings nor a tolerance is known. It is farthest off in {worst}."
+    if held:
+        return f"{mine} is outside the tolerance in {failed} of {count} signals, most of all {worst}.{beside}"
+    return f"{mine} misses {failed} of {count} recorded signals, most of all {worst}.{beside}{_in_windows(answers, errors)}"
 
 
 def _in_windows(answers: Answers, errors: Errors) -> str:
-    """Clause on the windows of the tolerance profile that stands in where a study names none."""
+    """Sentence on the windows of the tolerance profile that stands in where a study names none."""
     if not errors.limited or not answers.profile:
         return ""
     name = str(answers.profile.get("source", "")).split(" (")[0] or str(answers.profile.get("name", ""))
-    if errors.tolerated:
-        return f" In every signal that is less than the windows of {name} allow."
-    return f" In {errors.outside} of {errors.limited} signals that is more than the windows of {name} allow."
+    rest = answers.not_judged(errors, tolerance=True)
+    rest = f"; {rest}" if rest else ""
+    if errors.outside:
+        return f" In {errors.outside} of {errors.limited} signals that is more than the windows of {name} allow{rest}."
+    signals = f"{errors.limited} signal{'s' if errors.limited > 1 else ''}" if rest else "every signal"
+    return f" In {signals} it is less than the windows of {name} allow{rest}."
 
 
 def _plain(value: float | None, unit: str) -> str:
     """A number with two digits and its unit, as plain text."""
-    return "unknown" if value is None else f"{value:.2g} {unit}".rstrip()
+    return "unknown" if value is None else f"{figures(value, 2)} {unit}".rstrip()
 
 
 def _values(answers: Answers) -> str:
     """The one table: each parameter given, fitted and with the effect."""
     rows = []
-    for v in answers.values or ():
-        fitted = estimate(v.fitted, answers.interval(v.name, "fit"))[0] if v.fitted is not None else ""
-        value, interval = estimate(v.value, v.interval) if v.value is not None else ("", "")
-        effect = value if v.effect is not None else ""
-        rows.append([text(v.name), number(v.given), fitted, effect, interval if v.interval else "", text(v.unit)])
+    for v in answers.values:
+        fitted, own = estimate(v.fitted, answers.interval(v.name, "fit")) if v.fitted is not None else ("", "")
+        effect, later = estimate(v.effect, v.interval) if v.effect is not None else ("", "")
+        interval = (own if v.effect is None else later) if v.interval else ""
+        said = v.note if v.note == AT_BOUND else f"held, {v.note.split(':')[0]}" if v.note else ""
+        cells = [text(v.name), number(v.given), fitted, effect, "; ".join(s for s in (interval, text(said)) if s)]
+        rows.append([*cells, text(v.unit)])
     if not rows:
         return ""
-    kind = "with the effect" if any(v.effect is not None for v in answers.values) else "fitted"
-    return table(
-        ["parameter", "given", "fitted", "with the effect", f"95 % interval, {kind}", "unit"], rows, words=(0, 5)
-    )
+    added = any(v.effect is not None for v in answers.values)
+    kind = "with the effect" if added else "fitted"
+    head = [
+        "parameter",
+        "given",
+        "fitted",
+        "with the effect",
+        f"{answers.interval_words(effect=added)}, {kind}",
+        "unit",
+    ]
+    told = f"<p>{text(answers.condition.replace('They', 'The values', 1))}</p>" if added or answers.fitted else ""
+    return table(head, rows, words=(0, 5)) + (told if answers.condition else "")
 
 
 def _figure(answers: Answers) -> str:
@@ -197,46 +227,51 @@ def _figure(answers: Answers) -> str:
     overlay = overlay_of(answers.results, answers.worst[1], answers.worst[0], ("given", after))
     if overlay is None:
         return ""
-    caption = f"{text(overlay.output)} in {text(overlay.experiment)}, before and after; below, recorded less simulated."
+    words = listed(WORDS[n] for n in overlay.runs)
+    caption = f"{text(overlay.output)} in {text(overlay.experiment)}, recorded and simulated ({words}); below, recorded less simulated."
     return overlay.figure(Sheet.new(7.4, 2.7, 0.5), caption, overlay.span)
 
 
 def _request(answers: Answers) -> str:
     """What the owner is asked to confirm."""
     found = answers.diagnosis
-    asked = []
+    asked: list[str] = []
+    told: set[str] = set()
     for f in found.get("findings") or []:
         if f["effect"] == "parameter":
+            told |= set(f["parameters"])
             sizes = listed(f"{n} = {quantity(p['value'], p.get('unit') or '')}" for n, p in f["parameters"].items())
             asked.append(f"the values that the recordings ask for: {sizes}")
             continue
         sizes = listed(
             f"{n} = {quantity(p['value'], p.get('unit') or '')}" for n, p in (f.get("parameters") or {}).items()
         )
-        places = [listed(p["at"]) for p in f.get("places") or []]
+        places = list(places_of(f.get("places") or [], listed))
         where = " or ".join(places[:2]) + (f" or one of {len(places) - 2} more places" if len(places) > 2 else "")
         what = ASKED.get(f["effect"], f"the {f['effect']}")
         asked.append(f"{what} at {where}, which the model leaves out (here {sizes})" if sizes else f"{what} at {where}")
+    off = [v for v in answers.values if v.differs and v.name not in told]
+    if off and (asked or found["verdict"] != "unnameable"):
+        asked.append(f"the value{'s' if len(off) > 1 else ''} {listed(_in_place_of(v, change=False) for v in off)}")
     if asked:
-        return f"Please confirm {'; and '.join(asked)}."
+        return f"Please confirm {'; and '.join(dict.fromkeys(asked))}."
     if found["verdict"] == "unnameable":
         return "Please tell us which filters, limits and delays of the plant the model leaves out."
-    moved = [
-        v.name for v in answers.values if v.value is not None and v.given and abs(v.value / v.given - 1.0) >= MOVED
-    ]
+    moved = [v.name for v in answers.values if v.differs is None and abs(v.change or 0.0) >= MOVED]
     return (
         f"Please confirm the value{'s' if len(moved) > 1 else ''} of {listed(moved)}: see the table." if moved else ""
     )
 
 
-def _consistent(found: dict[str, Any]) -> str:
+def _consistent(answers: Answers) -> str:
     """Sentences on what the difference is consistent with: the named effect, and those the data cannot tell from it."""
-    verdict, effects = found["verdict"], found.get("effects") or []
+    found = answers.diagnosis
+    verdict, effects, doubt = found["verdict"], found.get("effects") or [], _without_chance(answers.doubt)
     if verdict == "no-evidence":
-        return f"Beyond its values nothing is missing that these recordings could show. {found.get('text', '')}".strip()
+        return _nothing(answers)
     if not effects:
-        return str(found.get("text", ""))
-    told = [" ".join([_inside(e["text"].rstrip(".")), _interval(e)]).strip() for e in effects]
+        return _without_chance(str(found.get("text", "")))
+    told = [" ".join([_inside(e["text"].rstrip(".")), _interval(answers, e)]).strip() for e in effects]
     first = f"The difference is consistent with this: {'; and '.join(told)}."
     own = [(e["effect"], e["at"], e.get("from", "")) for e in effects]
     rivals = [r for group in found.get("ambiguity") or [] for r in group]
@@ -247,15 +282,30 @@ def _consistent(found: dict[str, Any]) -> str:
     )
     if names:
         more = f" and {len(names) - RIVALS} more" if len(names) > RIVALS else ""
-        first = f"{first} The recordings cannot tell it from: {'; '.join(names[:RIVALS])}{more}.{_in_common(found)}"
-    elif found.get("doubt"):
-        they = "They" if len(effects) > 1 else "It"
-        first += f" {they} may stand for something that none of those tried is: {found['doubt']}."
-    else:
+        first += f" The recordings cannot tell it from: {'; '.join(names[:RIVALS])}{more}.{_in_common(found)}"
+    elif not doubt:
         first += " No other effect that was tried, and no other place, explains the recordings as well."
-    if not found.get("doubt") and not (found.get("remaining") or {}).get("adequate", True):
-        first += " It is not all that is missing: with it the residuals are still not noise."
+    if doubt:
+        they = "They" if len(effects) > 1 else "It"
+        first += f" {they} may stand for something that none of those tried is: {doubt}."
+    if left := answers.remainder:
+        first += " It is not all that is missing" + ("." if doubt else f": {left[:1].lower()}{left[1:]}.")
     return first
+
+
+def _nothing(answers: Answers) -> str:
+    """Sentences where no effect was found: that nothing else is missing, or that something is which none that was tried explains."""
+    text_of = _without_chance(str(answers.diagnosis.get("text", ""))).strip()
+    if not answers.diagnosis.get("findings"):
+        text_of = text_of.partition(". ")[2]  # the first sentence says by which test nothing was found
+    if beyond_noise(answers.diagnosis):
+        return text_of or "What the model leaves is more than noise, and no effect that was tried explains it."
+    return f"Beyond its values nothing is missing that these recordings could show. {text_of}".strip()
+
+
+def _without_chance(sentence: str) -> str:
+    """A sentence of a diagnosis without the chances of its tests, which its owner has no use for."""
+    return re.sub(r" \(p = [^()]*\)", "", sentence)
 
 
 def _inside(sentence: str) -> str:
@@ -269,10 +319,15 @@ def _in_common(found: dict[str, Any]) -> str:
     late = [r.get("late") for group in groups for r in group if r.get("refitted", True)]
     if len(groups) != 1 or len(late) < 2 or any(v is None or v <= 0.0 for v in late):
         return ""
-    return f" Whichever it is, a slow signal is late by between {span(min(late), max(late), 's', 3)}."
+    ends = dict.fromkeys(quantity(v, "s", 3) for v in (min(late), max(late)))
+    said = f"between {span(min(late), max(late), 's', 3)}" if len(ends) > 1 else f"about {next(iter(ends))}"
+    return f" Whichever it is, a slow signal is late by {said}."
 
 
-def _interval(effect: dict[str, Any]) -> str:
+def _interval(answers: Answers, effect: dict[str, Any]) -> str:
+    """The 95 % intervals of an effect's sizes in brackets; empty where what is left with it is more than noise."""
+    if beyond_noise(answers.diagnosis):
+        return ""
     parts = []
     for name, size in effect["parameters"].items():
         low, high = size.get("ci95") or (None, None)
@@ -281,8 +336,41 @@ def _interval(effect: dict[str, Any]) -> str:
     return f"({', '.join(parts)}, 95 %)" if parts else ""
 
 
-def _gains(answers: Answers) -> str:
-    """Sentences on the gains: how far a fit moves them without the effect, and how far with it.
+def _values_judged(answers: Answers) -> str:
+    """Sentences on the given values: those that the intervals leave out, those that they hold, and what a fit without the addition
+    does to the one that it moves most."""
+    found, what = answers.diagnosis, answers.added
+    if found.get("verdict") == "unnameable" and not what:
+        name, alone, _ = _most_moved(answers)
+        moved = f": a fit moves {name} by {_percent(alone)}, and how much of it makes up for what is missing these records do not tell"
+        return f"Your values cannot be judged while that is missing{moved if name else ''}."
+    off = sorted((v for v in answers.values if v.differs), key=lambda v: -abs(v.change or math.inf))
+    kept = [v.name for v in answers.values if v.differs is False]
+    parts = []
+    if off:
+        more = f" and {len(off) - MOST_OFF} more" if len(off) > MOST_OFF else ""
+        start = f"With the {what}, the" if what else "The"
+        each = "; ".join(_in_place_of(v, interval=not answers.conditional) for v in off[:MOST_OFF])
+        parts.append(f"{start} recordings ask for other values than you gave: {each}{more}.")
+    if kept:
+        sure = "" if answers.conditional else "95 % "
+        one = f"Your value of {kept[0]} lies within its {sure}interval."
+        parts.append(one if len(kept) == 1 else f"Your values of {listed(kept)} lie within their {sure}intervals.")
+    if (off or kept) and answers.conditional:
+        parts.append("That holds only if nothing else is missing.")
+    name, alone, with_it_too = _most_moved(answers)
+    if name and what and abs(with_it_too) < 0.5 * abs(alone):
+        parts.append(
+            f"A fit without the {what} moves {name} by {_percent(alone)} to make up for it; with the {what} the same fit moves it "
+            f"by {_percent(with_it_too)}."
+        )
+    elif name and not off and not kept and abs(alone) >= MOVED:
+        parts.append(f"A fit moves {name} by {_percent(alone)}.")
+    return " ".join(parts)
+
+
+def _most_moved(answers: Answers) -> tuple[str, float, float]:
+    """The parameter that a fit without the addition moves most, by which share of the given value, and by which with it; "" without.
 
     The fit is that of the table, and of the diagnosis where none has run.
     """
@@ -292,37 +380,17 @@ def _gains(answers: Answers) -> str:
     moved = {
         n: (without[n] / g - 1.0, after[n] / g - 1.0) for n, g in given.items() if g and n in without and n in after
     }
-    if not moved:
-        return ""
-    name = max(moved, key=lambda n: abs(moved[n][0]))
-    alone, with_it = moved[name]
-    what = _added(found)
-    if found.get("verdict") == "unnameable" and not what:
-        return (
-            f"Your gains cannot be judged while that is missing: a fit moves {name} by {_percent(alone)}, and how much of it "
-            "makes up for what is missing these records do not tell."
-        )
-    if not what:
-        if abs(alone) < MOVED:
-            return "Your gains are not to blame: a fit leaves them within 2 % of what you gave."
-        return f"Your gains are to blame: fitted, {name} moves by {_percent(alone)}, and that closes the gap as far as it closes."
-    if abs(with_it) < 0.5 * abs(alone):
-        return (
-            f"Your gains are not to blame: a fit without the {what} moves {name} by {_percent(alone)} to make up for it; "
-            f"with the {what} the same fit moves it by {_percent(with_it)}."
-        )
-    return (
-        f"Your gains are to blame too: a fit moves {name} by {_percent(alone)} without the {what} and by "
-        f"{_percent(with_it)} with it."
-    )
+    name = max(moved, key=lambda n: abs(moved[n][0]), default="")
+    return (name, *moved[name]) if name else ("", 0.0, 0.0)
 
 
-def _added(found: dict[str, Any]) -> str:
-    """Kind of the addition in the augmented model: "effect", "formula", "filter" or "curve"; empty where nothing was added."""
-    if found.get("effects"):
-        return "effect"
-    kind = (found.get("fallback") or {}).get("kind", "") if found.get("augmented_model") else ""
-    return {"term": "formula", "filter": "filter", "curve": "curve"}.get(kind, "")
+def _in_place_of(v: Value, *, interval: bool = False, change: bool = True) -> str:
+    """A value that counts in place of the given one; on demand its 95 % interval, where it has two ends, and the change."""
+    digits = figures_of(v.interval, 4)
+    ends = interval_text(v.interval) if interval and None not in (v.interval or (None,)) else ""
+    moved = f" ({_percent(v.change)})" if change and v.change is not None else ""
+    told = f"{v.name} = {quantity(v.value or 0.0, v.unit, digits)}{f' (95 %: {ends})' if ends else ''}"
+    return f"{told} in place of {figures(v.given or 0.0, 6)}{moved}"
 
 
 def _percent(share: float) -> str:
@@ -334,16 +402,16 @@ def _percent(share: float) -> str:
 def _gained(found: dict[str, Any]) -> str:
     gap = found.get("gap") or {}
     shrink = gap.get("shrink_holdout")
-    if shrink is None or not _added(found):
+    if shrink is None or not added_to(found):
         return ""
     pooled = (gap.get("pooled") or {}).get("augmented") or {}
     left = pooled.get("holdout")
-    rest = f"; what is left is {left:.3g} times the noise" if isinstance(left, int | float) else ""
+    rest = f"; what is left is {figures(left, 3)} times the noise" if isinstance(left, int | float) else ""
     against = gap.get("held_out", "experiments")
     where = "experiments that no fit has seen" if against == "experiments" else against
     return (
         f"Adding it shrinks the error on {where} by {percentage(shrink)}, "
-        f"measured against the same model with its gains fitted and nothing added{rest}."
+        f"measured against the same model with its parameters fitted and nothing added{rest}."
     )
 
 

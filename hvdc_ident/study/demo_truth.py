@@ -16,7 +16,7 @@ import numpy as np
 from hvdc_ident.display import Table, rounded
 from hvdc_ident.linearize import loop, margins
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.study.run_summary import values_table
+from hvdc_ident.study.run_summary import conditions, values_table
 from hvdc_ident.text import listed, percentage, quantity
 
 FILE = "truth.json"
@@ -89,6 +89,7 @@ def truth_lines(truth: Mapping[str, Any], fit: Mapping[str, Any], diagnosis: Map
         f"The recordings were made by {truth['plant']}, so that the truth is known:",
         "",
         *str(truth_table(truth, fit, diagnosis)).splitlines(),
+        *conditions(fit, diagnosis),
         "",
         f"missing, found: {found_effect(diagnosis)}",
         f"missing, true: {true_effect(truth)}",

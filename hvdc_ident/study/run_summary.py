@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hvdc_ident.display import Table, rounded
+from hvdc_ident.report.answers import values_conditional
 from hvdc_ident.study.pipeline import Done
-from hvdc_ident.text import figures_of
+from hvdc_ident.text import figures_of, interval_text, interval_words
 
 
 def run_lines(done: Sequence[Done], truth: Sequence[str] = ()) -> list[str]:
@@ -24,6 +25,7 @@ def run_lines(done: Sequence[Done], truth: Sequence[str] = ()) -> list[str]:
         lines.append(f"{d.stage.name}: {state}; {verdict}" if verdict else f"{d.stage.name}: {state}")
     table = values_table(found.get("fit", {}), found.get("diagnose", {}))
     lines += ["", *truth] if truth else ["", *str(table).splitlines()] if table.rows else []
+    lines += conditions(found.get("fit", {}), found.get("diagnose", {})) if table.rows and not truth else []
     following = next_step(found)
     return [*lines, "", following] if following else lines
 
@@ -41,17 +43,20 @@ def values_table(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> Table:
             rounded(after.get(name), 5),
         )
         rows.append((name, c["unit"], rounded(c["given"], 6), *value))
-    header = ("parameter", "unit", "given", "fitted", "95 % interval", "with the effect")
+    words = interval_words(beyond_noise=values_conditional(fit, diagnosis, effect=False))
+    header = ("parameter", "unit", "given", "fitted", words, "with the effect")
     return Table(header, tuple(rows)).without_empty() if rows else Table(header, ())
 
 
-def interval_text(ci95: Sequence[float | None] | None) -> str:
-    """Return a 95 % interval as "A to B"; an end that is open as "above A" or "below B"; empty where both are."""
-    low, high = ci95 or (None, None)
-    if low is None or high is None:
-        return "" if low is high else f"above {low:.5g}" if low is not None else f"below {high:.5g}"
-    figures = figures_of((low, high))
-    return f"{low:.{figures}g} to {high:.{figures}g}"
+def conditions(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[str]:
+    """Return what the values of the table rest on, as a line; none where what is left is noise."""
+    if not fit.get("estimates"):
+        return []
+    effect = bool(diagnosis.get("augmented_model"))
+    if not values_conditional(fit, diagnosis, effect=effect):
+        return []
+    which = "The values with the effect" if effect else "The fitted values"
+    return [f"{which} hold only if nothing else is missing: what remains is more than the noise."]
 
 
 def next_step(found: Mapping[str, Mapping[str, Any]]) -> str:

@@ -173,6 +173,7 @@ def _discrepancy(rmse: dict[str, Any]) -> dict[str, Any]:
         "effects": [{**lag, "parameters": size, "chosen_from": 9}],
         "findings": [{**finding, "equivalent_delay": {"value": TAU, "ci95": None, "unit": "s"}}],
         "ambiguity": [],
+        "beyond_noise": True,
         "separating_experiment": {
             "text": "record P1_m as well, and step what acts on one side of P1 and P1_m and not on the other"
         },

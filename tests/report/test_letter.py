@@ -67,6 +67,7 @@ def diagnosis(**changes: Any) -> dict[str, Any]:
         "parameters_before": {"KIP": 30.0},
         "parameters_refitted": {"KIP": 31.5},
         "parameters_after": {"KIP": 30.1},
+        "estimates_after": {"KIP": {"value": 30.1, "ci95": [29.8, 30.4]}},
         "augmented_model": "augmented-model.toml",
         "sizes": sizes,
         **changes,
@@ -91,7 +92,10 @@ def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
         "there is 0.02 pu, 20 times the noise of the recording."
     )
     assert "lag of 1.6 ms" in consistent and "1.4 and 1.8 ms" in consistent and "delay at P2_m" in consistent
-    assert "not to blame" in gains and "+5.0 %" in gains and "+0.3 %" in gains
+    assert gains == (
+        "Your value of KIP lies within its 95 % interval. A fit without the effect moves KIP by +5.0 % to make up for it; with the "
+        "effect the same fit moves it by +0.3 %."
+    )
     assert "75 %" in gained and "1.05 times the noise" in gained
     assert letter.following == "To tell them apart: record P2 at 1 kHz."
     assert letter.attached == ("augmented-model.toml",)
@@ -112,7 +116,7 @@ def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp
         ambiguity=[], remaining={"adequate": False}, effects=2 * diagnosis()["effects"], doubt="it hums"
     )
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, several))).sentences
-    assert consistent.endswith("They may stand for something that none of those tried is: it hums.")
+    assert consistent.endswith("none of those tried is: it hums. It is not all that is missing.")
 
 
 def test_a_rival_outside_the_catalogue_is_told_with_its_formula(tmp_path: Path) -> None:
@@ -136,20 +140,20 @@ def test_what_the_members_of_a_set_have_in_common_is_said(tmp_path: Path) -> Non
     assert "Whichever" not in consistent
 
 
-def test_without_evidence_nothing_is_named_and_the_gains_are_judged(tmp_path: Path) -> None:
+def test_without_evidence_nothing_is_named_and_the_move_of_the_values_is_told(tmp_path: Path) -> None:
     found = diagnosis(verdict="no-evidence", effects=[], ambiguity=[], text="Nothing stands out.", sizes=None)
     letter = letter_of(Results(folder_with(tmp_path, found)))
     told = " ".join(letter.sentences)
-    assert "nothing is missing" in told and "Your gains are to blame: fitted, KIP moves by +5.0 %" in told
+    assert "nothing is missing" in told and "A fit moves KIP by +5.0 %." in told
     assert "lag" not in told and "shrinks" not in told
 
 
-def test_gains_are_not_blamed_while_something_without_a_name_is_missing(tmp_path: Path) -> None:
+def test_values_are_not_judged_while_something_without_a_name_is_missing(tmp_path: Path) -> None:
     found = diagnosis(verdict="unnameable", effects=[], ambiguity=[], text="Something is missing.", sizes=None)
     told = " ".join(letter_of(Results(folder_with(tmp_path, found))).sentences)
     assert (
-        "Your gains cannot be judged while that is missing: a fit moves KIP by +5.0 %" in told
-        and "to blame" not in told
+        "Your values cannot be judged while that is missing: a fit moves KIP by +5.0 %" in told
+        and "interval" not in told
     )
 
 
@@ -159,7 +163,7 @@ def test_a_law_that_was_found_counts_as_an_effect_does_where_it_is_in_the_model(
 ) -> None:
     found = diagnosis(verdict="unnameable", effects=[], ambiguity=[], text="A law does.", sizes=None)
     told = " ".join(letter_of(Results(folder_with(tmp_path, {**found, "fallback": {"kind": kind}}))).sentences)
-    assert f"a fit without the {word} moves KIP by +5.0 %" in told and "cannot be judged" not in told
+    assert f"A fit without the {word} moves KIP by +5.0 %" in told and "cannot be judged" not in told
     assert "Adding it shrinks the error on" in told
     less = {**found, "fallback": {"kind": kind}, "augmented_model": None}
     told = " ".join(letter_of(Results(folder_with(tmp_path, less))).sentences)
@@ -201,7 +205,7 @@ def test_a_letter_says_who_writes_to_whom_about_what(tmp_path: Path) -> None:
     assert "<dt>Model</dt><dd>m version 3.2</dd>" in page and "<dt>Plant</dt><dd>Link North</dd>" in page
     assert "<dt>To</dt>" not in write_letter(tmp_path, Letterhead(author="A.")).read_text("utf-8")
     row = re.search(r"<td>KIP</td>(.*?)</tr>", page)
-    assert row is not None and re.findall(r"<td[^>]*>(.*?)</td>", row[1]) == ["30", "30.1"]
+    assert row is not None and re.findall(r"<td[^>]*>(.*?)</td>", row[1]) == ["30", "30.10", "29.80 … 30.40"]
 
 
 @pytest.mark.parametrize(

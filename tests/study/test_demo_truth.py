@@ -75,4 +75,4 @@ def test_the_screen_and_the_page_have_the_truth_beside_what_was_found(tmp_path: 
 
     body = SECTION.render(Results(tmp_path))
     assert '<td class="n">28</td><td class="n">31.25</td><td class="n">29.88</td><td class="n">30</td>' in body
-    assert "found: lag" in body and "1.3 … 1.5" in body and "in the loop of Irorder2" in body
+    assert "found: lag" in body and "1.30 … 1.50" in body and "in the loop of Irorder2" in body

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.report.answers import beyond_noise, places_of
 from hvdc_ident.report.drawing import AFTER, BEFORE, EFFECT, MARK, MEASURED, figure, svg, visible
-from hvdc_ident.report.html import captioned, folded, number, percent, table, text
+from hvdc_ident.report.html import captioned, estimate, folded, number, percent, table, text
 from hvdc_ident.report.results import Results, Section
 from hvdc_ident.text import form_of, listed, one_of, percentage, span, with_unit
 
@@ -74,10 +75,9 @@ def _effects(found: dict[str, Any]) -> str:
     for e in found.get("effects") or []:
         sizes = []
         for name, p in (e.get("parameters") or {}).items():
-            low, high = p.get("ci95") or (None, None)
-            interval = f" (95 %: {number(low)} … {number(high)})" if p.get("ci95") else ""
-            size = f"{text(name)} = {number(p.get('value'))}{interval} {text(p.get('unit') or '')}"
-            sizes.append(size.rstrip())
+            value, interval = estimate(p.get("value"), p.get("ci95"))
+            ends = f" (95 %: {interval})" if p.get("ci95") and not beyond_noise(found) else ""
+            sizes.append(f"{text(name)} = {value}{ends} {text(p.get('unit') or '')}".rstrip())
         among = f"Chosen from {text(e.get('chosen_from'))} candidates that were refitted."
         lines.append(f"<li>{text(str(e.get('text', '')).rstrip('.'))}: {'; '.join(sizes)}. {among}</li>")
     return f"<ul>{''.join(lines)}</ul>" if lines else ""
@@ -88,9 +88,9 @@ def _findings(found: dict[str, Any]) -> str:
     rows = []
     for f in found.get("findings") or []:
         delay = f.get("equivalent_delay") or {}
-        likely = f["places"][:PLACES]
-        where = "; ".join(f"{', '.join(p['at'])} ({percent(p['probability'])})" for p in likely)
-        where += f"; and {len(f['places']) - PLACES} more" if len(f["places"]) > PLACES else ""
+        places = places_of(f["places"])
+        where = "; ".join(f"{at} ({percent(p)})" for at, p in [*places.items()][:PLACES])
+        where += f"; and {len(places) - PLACES} more" if len(places) > PLACES else ""
         value = delay.get("value")
         late = "" if value is None else number(1e3 * value, 3)
         rows.append([text(one_of(f["same_as"])), text(f"{percent(f['probability'])}"), text(where), late])
@@ -208,12 +208,14 @@ def _where(found: dict[str, Any]) -> str:
     if band:
         parts.append(f"It shares frequencies with the inputs from {number(band[0], 3)} to {number(band[1], 3)} Hz.")
     if region:
-        ends = f"{number(region['from'], 3)} and {number(region['to'], 3)}"
-        parts.append(f"It is densest where {text(region['signal'])} lies between {ends}.")
+        parts.append(
+            f"It is densest where {text(region['signal'])} lies between {span(region['from'], region['to'], '', 3)}."
+        )
     if slots := place.get("slots"):
         listed = ", ".join(f"{text(n)} {percentage(min(v, 1.0))}" for n, v in slots.items())
         parts.append(f"An effect at one insertion point could explain at most: {listed}.")
-    explained, rest = left.get("explained_share"), "noise" if left.get("adequate") else "not all noise"
+    explained = left.get("explained_share")
+    rest = "not all noise" if beyond_noise(found) else "noise" if left.get("adequate") else "no louder than noise"
     if explained is not None:
         parts.append(f"{percentage(explained, 1)} of the gap is explained; what is left is {rest}.")
     elif left:

@@ -7,7 +7,7 @@ from typing import Any
 from hvdc_ident.report.answers import Answers
 from hvdc_ident.report.html import estimate, folded, number, share, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import listed
+from hvdc_ident.text import interval_words, listed
 
 
 def _render(results: Results) -> str:
@@ -46,11 +46,12 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
                 text(v.unit),
             ]
         )
-    header = ["parameter", "given", "fitted", "95 % interval", "change", "refitted by the diagnosis"]
-    header += ["with the effect", "95 % interval", "change", "unit"]
+    header = ["parameter", "given", "fitted", found.interval_words(effect=False), "change", "refitted by the diagnosis"]
+    header += ["with the effect", found.interval_words(effect=True), "change", "unit"]
+    conditions = ", if nothing else is missing: what remains is more than the noise" if found.conditional else ""
     told = (
         "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
-        "effect: the same with the finding in the model; these are the values that count.</p>"
+        f"effect: the same with the finding in the model; these are the values that count{conditions}.</p>"
     )
     return table(header, rows, words=(0, 9)) + (told if refitted else "") + _notes(fit)
 
@@ -131,13 +132,13 @@ def _nuisances(fit: dict[str, Any]) -> str:
     rows = []
     for experiment, line in (fit.get("nuisance") or {}).items():
         for name, e in line.items():
-            low, high = e.get("ci95") or (None, None)
-            interval = f"{number(low)} … {number(high)}" if e.get("ci95") else "–"
-            cells = [text(experiment), text(name), number(e["value"]), number(e.get("std"), 2), interval]
+            value, interval = estimate(e["value"], e.get("ci95"))
+            cells = [text(experiment), text(name), value, number(e.get("std"), 2), interval]
             rows.append([*cells, text(e.get("unit", "")), text(e.get("reason", ""))])
     if not rows:
         return ""
-    head = ["experiment", "unknown of it alone", "value", "std", "95 % interval", "unit", "note"]
+    words = interval_words(beyond_noise=(fit.get("adequacy") or {}).get("verdict") == "does-not-fit")
+    head = ["experiment", "unknown of it alone", "value", "std", words, "unit", "note"]
     return "<h3>Unknown in single experiments</h3>" + table(head, rows, words=(0, 1, 5, 6))
 
 
@@ -161,9 +162,8 @@ def _one_by_one(fit: dict[str, Any]) -> str:
         return ""
     rows = []
     for name, d in lines.items():
-        low, high = d["ci95_of_mean"]
-        spread = [number(d["mean"]), number(d["std"], 2), number(d["variance"], 2), f"{number(low)} … {number(high)}"]
-        rows.append([text(name), number(d["n"]), *spread])
+        mean, interval = estimate(d["mean"], d["ci95_of_mean"])
+        rows.append([text(name), number(d["n"]), mean, number(d["std"], 2), number(d["variance"], 2), interval])
     head = ["parameter", "fits", "mean", "std over fits", "variance", "95 % interval of the mean"]
     told = (
         "<p class='small'>Each experiment fitted alone. The interval is of the mean over these fits: it shrinks with "

@@ -59,8 +59,10 @@ def _windows(results: Results) -> str:
     """Largest, mean and mean absolute error before, during and after the event, beside the profile's limits."""
     found = results.get("fit").get("windowed_errors") or results.get("simulation").get("windowed_errors") or {}
     profile, units = found.get("profile") or {}, results.units
-    rows: list[list[str]] = []
     over: list[list[str]] = []
+    rows: list[list[str]] = []
+    unjudged: list[list[str]] = []
+    why: list[str] = []
     for output, line in (found.get("errors") or {}).items():
         for name, about in line.items():
             if about.get("event") is None:
@@ -70,8 +72,10 @@ def _windows(results: Results) -> str:
                 span = f"{number(w['from'], 3)} … {number(w['to'], 3)}" if w["n"] else "–"
                 errors = [_error(w, kind) for kind in ("max", "mean", "mean_absolute")]
                 row = [text(output), text(name), window, span, *errors, text(units.get(output, ""))]
-                (over if any("<strong>" in e for e in errors) else rows).append(row)
-    if not rows and not over:
+                {True: rows, False: over, None: unjudged}[w.get("within")].append(row)
+                if w.get("within") is None:
+                    why.append(f"{output}: {about.get('reason') or 'no row in this window'}")
+    if not rows and not over and not unjudged:
         return ""
     end = {a.get("end_from") for line in found["errors"].values() for a in line.values()}
     steps = " A step counts as over where its record has settled." if "settling" in end else ""
@@ -81,11 +85,18 @@ def _windows(results: Results) -> str:
         f"An error above its limit is marked with its limit.{steps} {text(profile.get('notes', ''))}</p>"
     )
     head = ["output", "experiment", "window", "from … to, s", "largest", "mean", "mean absolute", "unit"]
-    counted = f"{len(rows) + len(over)} windows, {len(over)} with an error above its limit"
-    above = table(head, over, words=(0, 1, 2, 7)) if over else ""
-    within = (
-        folded(f"{len(rows)} windows within the limits", table(head, rows, words=(0, 1, 2, 7)) + told) if rows else told
+    counted = (
+        f"{len(rows)} windows within the limits, {len(over)} with an error above its limit, {len(unjudged)} not judged"
     )
+    above = table(head, over, words=(0, 1, 2, 7)) if over else ""
+    within = folded(f"{len(rows)} windows within the limits", table(head, rows, words=(0, 1, 2, 7))) if rows else ""
+    reasons = f"<p class='small'>{text('; '.join(dict.fromkeys(why)))}.</p>"
+    within += (
+        folded(f"{len(unjudged)} windows not judged", table(head, unjudged, words=(0, 1, 2, 7)) + reasons)
+        if unjudged
+        else ""
+    )
+    within += told
     if profile.get("named"):
         return f"<h3>Before, during and after the event: {counted}</h3>{above}{within}"
     return folded(f"Before, during and after the event: {counted}", above + within)

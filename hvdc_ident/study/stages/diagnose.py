@@ -126,6 +126,8 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
         if n in data["parameters_refitted"] and data["augmented_model"]
     ]
     lines += [f"Parameters, refitted without and with it: {', '.join(moved)}."] if moved else []
+    if moved and data.get("beyond_noise"):
+        lines.append("These values hold only if nothing else is missing: what remains is more than the noise.")
     told = "Next: `hvdc-ident letter STUDY` writes one page on this for the model's owner."
     return [*lines, *data["notes"], *([told] if data["augmented_model"] else [])]
 

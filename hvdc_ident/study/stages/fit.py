@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
-from hvdc_ident.text import figures_of
+from hvdc_ident.text import figures_of, interval_text, interval_words
 
 if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
@@ -119,11 +119,12 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     chi2 = judged.get("chi2_per_dof")
     # How large the residual is against the noise that every interval rests on.
     beside = f"chi2/dof {chi2:.3g}" if chi2 is not None else "noise from the residual"
+    words = "95 %" if judged.get("verdict") != "does-not-fit" else interval_words(beyond_noise=True)
     for name, e in data["estimates"].items():
         unit = f" {e['unit']}" if e["unit"] else ""
         given = f" (given {data['candidates'][name]['given']:.6g})"
         value = f"{e['value']:.{figures_of(e['ci95'])}g}"
-        lines.append(f"{name} = {value}{unit}{given}{_interval(e['ci95'], beside)}" + _note(e))
+        lines.append(f"{name} = {value}{unit}{given}{_interval(e['ci95'], words, beside)}" + _note(e))
     held = [n for n in data["candidates"] if n not in data["estimates"]]
     lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
     lines += _conditions(data)
@@ -134,14 +135,9 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _interval(ci95: Sequence[float | None] | None, beside: str) -> str:
-    low, high = ci95 or (None, None)
-    if low is None and high is None:
-        return ""
-    if low is None or high is None:
-        return f", 95 %: {'below' if low is None else 'above'} {high if low is None else low:.6g} ({beside})"
-    figures = figures_of(ci95)
-    return f", 95 %: {low:.{figures}g} to {high:.{figures}g} ({beside})"
+def _interval(ci95: Sequence[float | None] | None, words: str, beside: str) -> str:
+    ends = interval_text(ci95)
+    return f", {words}: {ends} ({beside})" if ends else ""
 
 
 def _conditions(data: Mapping[str, Any]) -> list[str]:
