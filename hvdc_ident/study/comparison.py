@@ -14,7 +14,7 @@ from hvdc_ident.report.answers import joined_gap
 from hvdc_ident.report.comparison import comparison_page
 from hvdc_ident.report.results import Results
 from hvdc_ident.study.stages import Stage, stages
-from hvdc_ident.text import figures_of, listed, percentage
+from hvdc_ident.text import figures, figures_of, listed, percentage
 
 SIDES = ("first", "second")
 APART = (
@@ -22,6 +22,8 @@ APART = (
     "above 1, chance alone does not explain it."
 )
 """The unit of a distance, in words."""
+FIXED = (1e-3, 1e7)
+"""Sizes from and up to which a value and its interval are written without an exponent."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -191,12 +193,18 @@ def value_texts(line: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _with_interval(value: float, ci95: Sequence[float | None] | None) -> str:
-    figures = figures_of(ci95, 5)
+    """Return a value with the halves of its interval, all with as many decimals: two figures of the smaller half."""
     low, high = ci95 or (None, None)
-    if low is None or high is None:
-        return f"{value:.{figures}g}"
-    down, up = f"{value - low:.2g}", f"{high - value:.2g}"
-    return f"{value:.{figures}g} ± {up}" if down == up else f"{value:.{figures}g} +{up} -{down}"
+    halves = [abs(end - value) for end in (low, high) if end is not None]
+    if len(halves) < 2 or min(halves) == 0.0 or not FIXED[0] <= max(abs(value), *halves) < FIXED[1]:
+        shown = figures(value, figures_of(ci95, 5))
+        down, up = (figures(half, 2) for half in halves) if len(halves) == 2 else ("", "")
+    else:
+        places = max(0, 1 - int(f"{min(halves):.1e}".split("e")[1]))  # of the half as rounded
+        shown, down, up = (f"{v:.{places}f}" for v in (value, *halves))
+    if not up:
+        return shown
+    return f"{shown} ± {up}" if down == up else f"{shown} +{up} -{down}"
 
 
 def finding_lines(findings: Sequence[Sequence[Mapping[str, Any]] | None]) -> list[str]:

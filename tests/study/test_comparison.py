@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 
 import hvdc_ident as hi
 from hvdc_ident.cli import app
-from hvdc_ident.study.comparison import distance
+from hvdc_ident.study.comparison import distance, value_texts
 
 CARD = """\
 schema = 1
@@ -90,6 +90,22 @@ def test_the_distance_of_equal_values_is_above_1_in_5_percent_of_cases() -> None
 )
 def test_the_halves_that_face_each_other_count(first: Any, second: Any, apart: float | None) -> None:
     assert distance(first, second) == (apart if apart is None else pytest.approx(apart))
+
+
+@pytest.mark.parametrize(
+    ("value", "ci95", "shown"),
+    [
+        (12345.0, [12195.0, 12495.0], "12345 ± 150"),
+        (5.0204, [5.0001, 5.0407], "5.020 ± 0.020"),
+        (183000.0, [180000.0, 189000.0], "183000 +6000 -3000"),
+        (18.0, [17.9, None], "18"),
+        (0.002, [0.0019, 0.0021], "0.00200 ± 0.00010"),
+    ],
+)
+def test_values_below_ten_million_have_no_exponent(value: float, ci95: list[float | None], shown: str) -> None:
+    """The figures of an interval end where two of its half are told."""
+    line = {"values": [value, value], "ci95": [ci95, ci95], "held": ["", ""]}
+    assert value_texts(line) == (shown, shown)
 
 
 def test_two_plants_are_told_apart(pair: tuple[Path, Path], tmp_path: Path) -> None:
