@@ -485,7 +485,9 @@ def export(
     .toml, .fmu and .mo are the model, .ssv its parameters, .mat, .json, .csv, .m and .tex its linear model.
     source: a Study, a Model, a shipped name, a path, or a LinearModel. linear: the linear model even for .mo.
     fmu: version and kinds of an FMU. values: of a study "given", "start" or "fitted" (left out, the fitted ones where a fit
-    stands in its folder of results, `folder`); or a FitResult, or values by name. The file says which it holds.
+    stands in its folder of results, `folder`); or a FitResult, or values by name. "fitted" are the values that count: with the
+    effect where a diagnosis in the folder named one, which the file then holds too; "effect" and "fit" are either of them. The
+    file says which it holds.
 
     Raises StudyError for an ending that is not known and where fitted values are asked for and none stand.
 

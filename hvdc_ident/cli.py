@@ -257,13 +257,14 @@ def export(
         str | None,
         option(
             "--values",
-            "given|start|fitted",
-            "Which values; default the fitted ones where a fit stands in the results, else the given ones.",
+            "given|start|fitted|effect|fit",
+            "Which values; default the fitted ones that count where a fit stands in the results, else the given ones. effect: with "
+            "the effect that a diagnosis found; fit: of the fit without one.",
         ),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="DIR", help="Folder of results with the fit; default STUDY-results."),
+        typer.Option("--out", metavar="DIR", help="Folder of results; default STUDY-results."),
     ] = None,
     console: Console,
     access: Access,
@@ -273,7 +274,7 @@ def export(
 
     written = write(access.study(study), to, linear, fmu.options(), values, out, reduced=reduced)
     size = written.path.stat().st_size
-    about = {"bytes": size, "values": written.values, "note": written.note}
+    about = {"bytes": size, "values": written.values, "set": written.of, "note": written.note}
     console.print_json({"schema": 1, "file": written.path.as_posix(), **about})
     console.say(f"{written.path}: {size} bytes" + (f"; {written.note}" if written.note else ""))
 

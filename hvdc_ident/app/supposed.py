@@ -16,6 +16,7 @@ from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.identifiability.experiment_design import ExperimentDesign, Move
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator
+from hvdc_ident.study.augmented import use_of
 from hvdc_ident.text import form_of, listed
 
 
@@ -50,7 +51,7 @@ def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) ->
         for other in group[1:]:
             effects = [*found[:k], other, *found[k + 1 :]]
             try:
-                model = hi.apply_effects(plant, [_use(e) for e in effects])
+                model = hi.apply_effects(plant, [use_of(e) for e in effects])
             except HvdcIdentError:  # a formula, or an unknown input: no effect that can be put in by its name
                 continue
             rivals.append(Supposition(_named(effects), model, _sizes(study, model), fitted=False))
@@ -85,13 +86,6 @@ def _named(effects: Sequence[Mapping[str, Any]]) -> str:
         source = f" from {e['from']}" if e.get("from") else ""
         parts.append(f"{form_of(e)} at {listed(e['at'])}{source}")
     return "; ".join(parts) or "as found"
-
-
-def _use(effect: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an effect of the results as `apply_effects` takes it."""
-    values = {n: p["value"] if isinstance(p, Mapping) else p for n, p in (effect.get("parameters") or {}).items()}
-    more = {k: effect[k] for k in ("from", "expression") if effect.get(k)}
-    return {"effect": effect["effect"], "at": effect["at"], "parameters": values, **more}
 
 
 def _sizes(study: hi.Study, model: AnyModel) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.fit.windowed_errors import signal_within
 from hvdc_ident.report.overlay import STAGES, Overlay, overlay_of
 from hvdc_ident.report.results import Results
+from hvdc_ident.report.values_that_count import ValuesThatCount, values_that_count
 from hvdc_ident.text import figures, interval_words, listed, one_of, percentage, quantity
 
 Signal = tuple[str, str]
@@ -71,7 +72,7 @@ class Value:
     """A parameter: the value that counts with its interval, and the others by name; None where there is none.
 
     value: that of the model with what it lacks where that was named, else the fitted one. note: why it is held, or that it
-    stands on a bound.
+    stands on a bound. with_effect: whether the value with the effect counts; effect_interval: its 95 % interval.
     """
 
     name: str
@@ -81,11 +82,13 @@ class Value:
     effect: float | None
     interval: tuple[float | None, float | None] | None
     note: str = ""
+    with_effect: bool = True
+    effect_interval: tuple[float | None, float | None] | None = None
 
     @property
     def value(self) -> float | None:
         """The value that counts."""
-        return self.fitted if self.effect is None else self.effect
+        return self.effect if self.with_effect and self.effect is not None else self.fitted
 
     @property
     def differs(self) -> bool | None:
@@ -150,7 +153,7 @@ class Answers:
     @property
     def conditional(self) -> bool:
         """True where the values that count hold only if nothing else is missing: what their model leaves is more than noise."""
-        return values_conditional(self.fit, self.diagnosis, effect=any(v.effect is not None for v in self.values))
+        return values_conditional(self.fit, self.diagnosis, effect=self.counting.name == "effect")
 
     @property
     def condition(self) -> str:
@@ -162,6 +165,11 @@ class Answers:
     def interval_words(self, *, effect: bool) -> str:
         """What the intervals of the values with the effect, or else of the fitted ones, are called."""
         return interval_words(beyond_noise=values_conditional(self.fit, self.diagnosis, effect=effect))
+
+    @cached_property
+    def counting(self) -> ValuesThatCount:
+        """Which values count: those with the effect, where the diagnosis named one, else those of the fit."""
+        return values_that_count(self.fit, self.diagnosis)
 
     @cached_property
     def worst(self) -> Signal | None:
@@ -312,18 +320,21 @@ class Answers:
         lines = lines or {n: {"given": g} for n, g in (self.diagnosis.get("parameters_before") or {}).items()}
         later = self.diagnosis.get("estimates_after") or {}
         held = self.fit.get("held") or {n: h.get("reason", "") for n, h in (told.get("held") or {}).items()}
-        rows = []
+        rows, with_effect = [], self.counting.name != "fit"  # without a fit there are no others
         for name, line in lines.items():
             fitted = (self.fit.get("values") or {}).get(name) if name in self.fitted else self._on_bound.get(name)
             effect = after.get(name) if name in self.fitted or name in later or not self.fit else None
-            value = fitted if effect is None else effect
-            ends = self.interval(name, "fit" if effect is None else "discrepancy") if value is not None else None
+            counts = with_effect and effect is not None
+            value = effect if counts else fitted
+            ends = self.interval(name, "discrepancy" if counts else "fit") if value is not None else None
+            with_it = self.interval(name, "discrepancy") if effect is not None else None
             note = "" if value is not None else str(held.get(name) or "")
             if value is not None and (
-                (effect is None and name in self._on_bound) or value in (line.get("min"), line.get("max"))
+                (not counts and name in self._on_bound) or value in (line.get("min"), line.get("max"))
             ):
                 note = AT_BOUND
-            rows.append(Value(name, str(line.get("unit") or ""), line.get("given"), fitted, effect, ends, note))
+            unit = str(line.get("unit") or "")
+            rows.append(Value(name, unit, line.get("given"), fitted, effect, ends, note, with_effect, with_it))
         return tuple(rows)
 
     @property

@@ -14,7 +14,7 @@ SIDES = ("first", "second")
 def comparison_page(
     data: Mapping[str, Any], texts: Sequence[Sequence[str]], input_lines: Sequence[str], conclusion: str, about: str
 ) -> str:
-    """Return the page as HTML. texts: both fitted values of each parameter with their intervals.
+    """Return the page as HTML. texts: both fitted values of each parameter that count, with their intervals.
 
     input_lines: what went into both, in words. conclusion: what the values come to. about: what the unit of a distance is.
     """
@@ -48,10 +48,11 @@ def _values(values: Sequence[Mapping[str, Any]], texts: Sequence[Sequence[str]],
     for v, (first, second) in zip(values, texts, strict=True):
         change = "" if v["change_percent"] is None else number(v["change_percent"], 3)
         apart = "" if v["apart"] is None else number(v["apart"], 3)
-        given, after = (_both(v[k]) for k in ("given", "with_effect"))
-        rows.append([text(v["parameter"]), given, text(first), text(second), change, apart, after, text(v["unit"])])
-    header = ["parameter", "given", *SIDES, "change, %", "apart", "with the effect", "unit"]
-    return table(header, rows, words=(0, 7)) + f"<p class='small'>{text(about)}</p>"
+        given, before, after = (_both(v[k]) for k in ("given", "without_effect", "with_effect"))
+        cells = [given, text(first), text(second), change, apart, before, after, text(v["unit"])]
+        rows.append([text(v["parameter"]), *cells])
+    header = ["parameter", "given", *SIDES, "change, %", "apart", "without the effect", "with the effect", "unit"]
+    return table(header, rows, words=(0, 8)) + f"<p class='small'>{text(about)}</p>"
 
 
 def _both(values: Sequence[float | None]) -> str:

@@ -147,7 +147,7 @@ def _values(found: Answers) -> str:
         if len(found.values) > ROWS
         else ""
     )
-    effect = any(v.effect is not None for v in found.values)
+    effect = found.counting.name == "effect"
     header = ["parameter, unit", "given", "value", found.interval_words(effect=effect), "change", ""]
     which = " ".join(s for s in (_which(found), found.condition if found.fitted or effect else "") if s)
     return f"<p class='answer'>{which}</p>{table(header, rows, words=(0, 5))}{more}{_moved(found)}"
@@ -168,6 +168,8 @@ def _value_row(v: Value) -> list[str]:
 
 def _which(found: Answers) -> str:
     """Which values these are."""
+    if found.counting.name == "fit" and found.counting.doubt:
+        return f"Fitted without an effect: {text(found.counting.doubt)}. They may make up for what is missing."
     if found.added and any(v.effect is not None for v in found.values):
         kind = "" if found.added == "effect" else f" ({found.added})"
         return f"Fitted together with what the model lacks{kind}."
@@ -179,11 +181,16 @@ def _which(found: Answers) -> str:
 
 
 def _moved(found: Answers) -> str:
-    """Return what a fit without the effect does to the parameter that it moves most."""
+    """Return what a fit without the effect, or with it where the other counts, does to the parameter that the former moves most."""
     moved = {v.name: v for v in found.values if v.effect is not None and v.fitted is not None and v.given}
     if not moved:
         return ""
     most = max(moved.values(), key=lambda v: abs((v.fitted or 0.0) / (v.given or 1.0) - 1.0))
+    if found.counting.name == "fit":
+        return (
+            f"<p class='small'>With {text(found.counting.added)} a fit puts {text(most.name)} at {number(most.effect, 4)} "
+            f"{text(most.unit)} ({share(most.effect, most.given)}). Changes are from the given values.</p>"
+        )
     return (
         f"<p class='small'>Without it a fit would put {text(most.name)} at {number(most.fitted, 3)} {text(most.unit)} "
         f"({share(most.fitted, most.given)}), to make up for what is missing. Changes are from the given values.</p>"

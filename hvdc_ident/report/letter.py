@@ -198,8 +198,8 @@ def _values(answers: Answers) -> str:
     rows = []
     for v in answers.values:
         fitted, own = estimate(v.fitted, answers.interval(v.name, "fit")) if v.fitted is not None else ("", "")
-        effect, later = estimate(v.effect, v.interval) if v.effect is not None else ("", "")
-        interval = (own if v.effect is None else later) if v.interval else ""
+        effect, later = estimate(v.effect, v.effect_interval) if v.effect is not None else ("", "")
+        interval = own if v.effect is None else later
         said = v.note if v.note == AT_BOUND else f"held, {v.note.split(':')[0]}" if v.note else ""
         cells = [text(v.name), number(v.given), fitted, effect, "; ".join(s for s in (interval, text(said)) if s)]
         rows.append([*cells, text(v.unit)])

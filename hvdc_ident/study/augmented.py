@@ -1,20 +1,23 @@
-"""The model with the effects of a diagnosis beside the recordings: its curves, its errors and the intervals of its values."""
+"""The model with the effects of a diagnosis: from its results; and beside the recordings its curves, errors and intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.adequacy import adequacy
+from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import Curve
 from hvdc_ident.fit.noise_model import MISFIT, source_of, source_text
 from hvdc_ident.fit.uncertainty import estimates_of, uncertainty
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import AnyModel, read_card
 from hvdc_ident.simulate import ModelSimulator, simulate
 from hvdc_ident.study import fitting
 
@@ -23,12 +26,31 @@ if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
 
+def augmented_model(study: Study, diagnosis: Mapping[str, Any], folder: Path) -> AnyModel:
+    """Return the model with what a diagnosis put in, at its values. diagnosis: its JSON; folder: where its files stand.
+
+    It is the card that the diagnosis wrote; an FMU, which has none, gets the effects anew.
+    """
+    card = diagnosis.get("augmented_model")
+    if card:
+        return read_card(folder / Path(str(card)).name)
+    own = {n: float(v) for n, v in diagnosis["parameters_after"].items() if n in study.model.parameters}
+    return apply_effects(study.model.with_values(own), [use_of(e) for e in diagnosis["effects"]])
+
+
+def use_of(effect: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an effect of the results as `apply_effects` and a study's [[model.effect]] take it."""
+    values = {n: p["value"] if isinstance(p, Mapping) else p for n, p in (effect.get("parameters") or {}).items()}
+    more = {k: effect[k] for k in ("from", "expression") if effect.get(k)}
+    return {"effect": effect["effect"], "at": effect["at"], "parameters": values, **more}
+
+
 def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
     """Return what discrepancy.json says of the augmented model beside the recordings, and a CSV file of its curves by name.
 
-    fitted: the parameters that the diagnosis estimated. The JSON holds `rmse_after`, `windowed_errors` and `estimates_after`, as
-    fit.json does of the fit. Experiments that the model cannot be run on are left out, and so are those with unknowns of their
-    own, whose values a diagnosis does not keep. Nothing is returned where no effect was put in.
+    fitted: the parameters that the diagnosis estimated. The JSON holds `rmse_after`, `windowed_errors`, `estimates_after` and
+    `residual_tests_after`, as fit.json does of the fit. Experiments that the model cannot be run on are left out, and so are those
+    with unknowns of their own, whose values a diagnosis does not keep. Nothing is returned where no effect was put in.
     """
     if found.augmented is None:
         return {}, {}
@@ -50,7 +72,7 @@ def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dic
     data = {
         "rmse_after": rmse,
         "windowed_errors": fitting.errors_in_windows(study, curves),
-        "estimates_after": _estimates(study, found, fitted, curves),
+        **_estimates(study, found, fitted, curves),
     }
     return data, files
 
@@ -58,31 +80,36 @@ def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dic
 def _estimates(
     study: Study, found: Diagnosis, fitted: Sequence[str], curves: Mapping[str, Mapping[str, Curve]]
 ) -> dict[str, Any]:
-    """Return the fitted parameters of the augmented model with 95 % intervals, at the values of the diagnosis.
+    """Return the fitted parameters of the augmented model with 95 % intervals, at the values of the diagnosis, and the tests of
+    its residuals against noise.
 
     By the curvature of the cost there, widened for correlated residuals and a misfit above the noise, as those of a fit are;
-    the parameters of the effects are unknowns too. Empty where an experiment has unknowns of its own.
+    the parameters of the effects are unknowns too. Both empty where an experiment has unknowns of its own.
     """
+    nothing: dict[str, Any] = {"estimates_after": {}, "residual_tests_after": {}}
     model = found.augmented
     assert model is not None
     if any(e.nuisance for e in study.experiments):
-        return {}
+        return nothing
     added = [n for n in model.parameters if n not in study.model.parameters]
     unknowns = [FitParameter.of(n, model.parameters[n]) for n in (*fitted, *added)]
     free = tuple(u for u in unknowns if not u.on_bound(u.start))
     if not any(u.name in fitted for u in free):
-        return {}
+        return nothing
     problem = Problem(ModelSimulator(model), study.experiments, free, weights=FrozenMap(_misfit(study, curves)))
     try:
         blocks = problem.blocks(problem.start)
     except ComputationError:
-        return {}
+        return nothing
     sources = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
     spans = np.array([u.span for u in problem.unknowns])
     known = uncertainty(blocks, problem.names, spans, problem.noise_source, None, problem.noise_dof)
     known = known.widened(adequacy(problem, blocks, sources, known.effective, known.rho).widening)
     estimates = estimates_of(problem, problem.start, blocks, known, known)
-    return {n: plain(estimates[n]) for n in fitted if n in estimates}
+    return {
+        "estimates_after": {n: plain(estimates[n]) for n in fitted if n in estimates},
+        "residual_tests_after": residual_tests(blocks, problem.fitted_experiments),
+    }
 
 
 def _misfit(study: Study, curves: Mapping[str, Mapping[str, Curve]]) -> dict[str, float]:

@@ -13,6 +13,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.report.answers import joined_gap
 from hvdc_ident.report.comparison import comparison_page
 from hvdc_ident.report.results import Results
+from hvdc_ident.report.values_that_count import estimates_that_count, values_that_count
 from hvdc_ident.study.stages import Stage, stages
 from hvdc_ident.text import figures, figures_of, listed, percentage
 
@@ -49,9 +50,11 @@ class RunComparison(Shown):
         """The values that differ beyond their intervals."""
         judged = [v for v in self.data["values"] if v["apart"] is not None]
         beyond = [v["parameter"] for v in judged if v["apart"] > 1.0]
-        if beyond:
-            return f"Apart beyond both intervals: {listed(beyond)}."
-        return "No value differs beyond both intervals." if judged else "No value was fitted in both."
+        if not beyond:
+            return "No value differs beyond both intervals." if judged else "No value was fitted in both."
+        mixed = len({s["name"] for s in self.data["sets"]}) > 1
+        why = " One run is fitted with an effect and the other without one, which moves values too." if mixed else ""
+        return f"Apart beyond both intervals: {listed(beyond)}.{why}"
 
     def _tables(self) -> Iterator[str | Table]:
         if self.data["values"]:
@@ -80,7 +83,7 @@ class RunComparison(Shown):
 
     @property
     def input_lines(self) -> list[str]:
-        """The differences in software, model, files and given values, in lines."""
+        """The differences in software, model, files and given values, in lines; and which fitted values are compared."""
         data = self.data
         lines = [f"{kind}: {a} and {b}" for kind, (a, b) in data["differing"].items()]
         files = data["sources"]
@@ -88,7 +91,8 @@ class RunComparison(Shown):
         lines += [f"inputs of the {s} alone: {', '.join(files[s])}" for s in SIDES if files[s]]
         for name, (a, b) in data["given_values"].items():
             lines.append(f"given value of {name}: {a:.6g} and {b:.6g}")
-        return lines or ["inputs, software, model and given values: the same"]
+        lines = lines or ["inputs, software, model and given values: the same"]
+        return [*lines, *(f"values of the {side}: {v['text']}" for side, v in zip(SIDES, data["sets"], strict=True))]
 
     @property
     def verdict_lines(self) -> list[str]:
@@ -102,7 +106,7 @@ class RunComparison(Shown):
         return lines + finding_lines(self.data["findings"])
 
 
-GAPS = {"given": "at the given values", "fitted": "at the fitted values", "augmented": "with the effects found"}
+GAPS = {"given": "at the given values", "fitted": "fitted without an effect", "augmented": "with the effects found"}
 """The sets of values at which gaps are compared, and their names in text."""
 
 
@@ -142,6 +146,7 @@ def compare_runs(first: str | Path, second: str | Path) -> RunComparison:
             "given_values": {
                 n: [given[0][n], given[1][n]] for n in given[0] if given[0][n] != given[1].get(n, given[0][n])
             },
+            "sets": [_set_of(r) for r in results],
             "values": _values(*results),
             "gaps": _gaps(*results),
             "verdicts": {s.name: v for s in stages() if any(v := [_verdict(s, r) for r in results])},
@@ -233,14 +238,27 @@ def _sources(first: dict[str, str], second: dict[str, str]) -> dict[str, list[st
     }
 
 
+def _set_of(results: Results) -> dict[str, str]:
+    """Return which of the fitted values count: "fit" or "effect", "" where there are none, and the same in words."""
+    counts = values_that_count(results.get("fit"), results.get("discrepancy"))
+    if counts.name == "effect":
+        words = f"fitted with {counts.added}, as the diagnosis named it"
+    elif counts.name == "fit":
+        words = f"fitted without an effect{f'; {counts.doubt}' if counts.doubt else ''}"
+    else:
+        words = "not fitted"
+    return {"name": counts.name, "text": words}
+
+
 def _values(first: Results, second: Results) -> list[dict[str, Any]]:
-    """Return every candidate of either fit with both values, their intervals and their distance."""
+    """Return every candidate of either fit with both values that count, their intervals and their distance."""
     fits = [first.get("fit"), second.get("fit")]
+    counted = [estimates_that_count(r.get("fit"), r.get("discrepancy")) for r in (first, second)]
     candidates = [f.get("candidates") or {} for f in fits]
     after = [(r.get("discrepancy").get("parameters_after") or {}) for r in (first, second)]
     rows = []
     for name in dict.fromkeys([*candidates[0], *candidates[1]]):
-        both = [(f.get("estimates") or {}).get(name) or {} for f in fits]
+        both = [estimates.get(name) or {} for estimates in counted]
         values = [e.get("value") for e in both]
         known = all(v is not None for v in values)
         lines = [c.get(name) or {} for c in candidates]
@@ -254,6 +272,10 @@ def _values(first: Results, second: Results) -> list[dict[str, Any]]:
                 "held": [_held(f, name) if not e else "" for f, e in zip(fits, both, strict=True)],
                 "change_percent": 100.0 * (values[1] / values[0] - 1.0) if known and values[0] else None,
                 "apart": distance(both[0], both[1]) if known else None,
+                "without_effect": [
+                    ((f.get("estimates") or {}).get(name) or {}).get("value") if a.get(name) is not None else None
+                    for f, a in zip(fits, after, strict=True)
+                ],
                 "with_effect": [a.get(name) for a in after],
             }
         )

@@ -1,8 +1,4 @@
-"""Export of a study's model with one of its sets of values, and the letter with the augmented model beside it.
-
-given: the values the model came with, the vendor's; everything is simulated with them and compared with them.
-start: where a search begins. fitted: what a fit in the folder of results estimated, with what it held.
-"""
+"""Export of a study's model with one of its sets of values, and the letter with the augmented model beside it."""
 
 from __future__ import annotations
 
@@ -10,11 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import date
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
-from hvdc_ident.errors import ComputationError, StudyError
-from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.errors import ComputationError, LinearizationError, StudyError
 from hvdc_ident.model import Model, read_card
 from hvdc_ident.report.letter import STAGE, Letterhead, write_letter
 from hvdc_ident.report.results import Results
@@ -22,6 +17,7 @@ from hvdc_ident.study.pipeline import Done, have_stage
 from hvdc_ident.study.schema import LetterTable
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study
+from hvdc_ident.study.value_sets import ValueSet, value_set
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
@@ -29,97 +25,6 @@ if TYPE_CHECKING:
 
 SSV = "http://ssp-standard.org/SSP1/SystemStructureParameterValues"
 SSC = "http://ssp-standard.org/SSP1/SystemStructureCommon"
-
-SetName = Literal["given", "start", "fitted"]
-SETS: tuple[SetName, ...] = get_args(SetName)
-
-NO_ESTIMATES = ("failed", "not-converged")
-"""Ends of a fit whose numbers are no estimates: they are never the fitted values."""
-NOT_BY_ITSELF = ("two-optima",)
-"""Ends of a fit that gives several answers that are as good: its best one is taken only where it is asked for."""
-
-
-@dataclass(frozen=True)
-class ValueSet:
-    """Values of a study's parameters, in their units.
-
-    name: given, start or fitted. note: what is to be said of them, in words that stand alone: where they come from, and
-    why they are not the fitted ones where those might be expected. fit: the fingerprint of the fit, of fitted ones.
-    """
-
-    name: SetName
-    values: FrozenMap[float]
-    note: str
-    fit: str = ""
-
-
-def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> ValueSet:
-    """The set of that name; None: the fitted values where a fit stands in the folder, else the given ones.
-
-    folder: of results, by default the study's own. A fit stands where it came to an end on the study, the files and the
-    software as they are now. Raises StudyError for another name, and where fitted values are asked for and none stand.
-    """
-    if wanted is not None and wanted not in SETS:
-        raise StudyError(
-            "no such set of values",
-            where="--values",
-            expected=", ".join(SETS),
-            got=repr(wanted),
-            hint="--values given: those the model came with; start: where a search begins; fitted: those of a fit",
-        )
-    if wanted == "given":
-        return _given(study)
-    if wanted == "start":
-        return ValueSet("start", study.start, f"start values of study '{study.name}', where a search begins")
-    found, why = fitted_values(study, folder or study.folder)
-    if found is not None and (wanted == "fitted" or not why):
-        return found
-    if wanted == "fitted":
-        raise StudyError(
-            f"there are no fitted values: {why}",
-            where=study.path.name,
-            expected=f"a finished fit of the study and its files as they are now, in {folder or study.folder}",
-            hint=f"hvdc-ident fit {study.path}, or --values given",
-        )
-    return _given(study, "" if why == NONE else why)
-
-
-NONE = "no fit has run"
-
-
-def fitted_values(study: Study, folder: Path) -> tuple[ValueSet | None, str]:
-    """The fitted values of the folder; and why they are not to be taken unasked, "" where they are.
-
-    None where there are none to take at all: no fit, one of another state of the study, or one that failed.
-    """
-    from hvdc_ident.study.pipeline import standing
-
-    data, why = standing(study, "fit", folder)
-    if why or data.get("status") in NO_ESTIMATES:
-        return None, why or f"the fit in {folder} ended as {data['status']}: {data.get('message', '')}"
-    values = study.given | {n: float(data["values"][n]) for n in study.candidates if n in data["values"]}
-    found = ValueSet("fitted", values, f"fitted values of study '{study.name}' ({_outcome(data)})", data["fingerprint"])
-    if data["status"] in NOT_BY_ITSELF:
-        return (
-            found,
-            f"the fit in {folder} ended as {data['status']}: {data['message']}; --values fitted takes the best",
-        )
-    return found, ""
-
-
-def _given(study: Study, why: str = "") -> ValueSet:
-    return ValueSet("given", study.given, f"given values of study '{study.name}'" + (f"; {why}" if why else ""))
-
-
-def _outcome(fit: Mapping[str, Any]) -> str:
-    """Return how a fit ended, and how far above the noise: what a reader has to know of its values."""
-    held = [n for n in fit.get("candidates", {}) if n not in (fit.get("fitted") or [])]
-    chi = fit.get("chi2_per_dof")
-    verdict = str((fit.get("adequacy") or {}).get("verdict", ""))
-    parts = [f"fit {fit['status']}", *(["the model does not fit these records"] if verdict == "does-not-fit" else [])]
-    parts += [f"chi2/dof {chi:.3g}"] if isinstance(chi, int | float) else []
-    parts += [f"held: {', '.join(held)}"] if held else []
-    return ", ".join(parts)
 
 
 @dataclass(frozen=True)
@@ -133,11 +38,16 @@ class FmuOptions:
 
 @dataclass(frozen=True)
 class Written:
-    """A file that was written, what is to be said of it, and the name of the set of values that it holds, of a study."""
+    """A file that was written, and what is to be said of it.
+
+    values, of: of a study, the name of the set of values that it holds, as it was asked for, and what they are: given, start,
+    fit or effect.
+    """
 
     path: Path
     note: str = ""
     values: str = ""
+    of: str = ""
 
 
 def fmu_options(fmi: str | None, kind: str | None, source_only: bool) -> FmuOptions | None:
@@ -182,11 +92,12 @@ def write(
     """Write a file in the format of its ending: .toml, .fmu and .mo are the model, .ssv its parameters, the others its linear model.
 
     source: a study, a model (linearised at its steady state) or a linear model. linear: the linear model even where the
-    ending is one of the nonlinear model's. fmu: version and kinds of an FMU. values: of a study, "given", "start" or
-    "fitted"; left out, the fitted ones where a fit stands in its folder of results (folder, by default the study's own),
-    else the given ones. reduced: the reduced linear model that a study's [linearize] asks for. The result says which values
-    the file holds, and whether an FMU holds a binary. Raises StudyError for an ending that is not known, where the model is
-    not of the kind that the ending needs, and where fitted values are asked for and none stand.
+    ending is one of the nonlinear model's. fmu: version and kinds of an FMU. values: of a study, a name of `value_sets`;
+    left out, the fitted ones where they stand in its folder of results (folder, by default the study's own), else the given
+    ones. Values with an effect are written with the effect in the model. reduced: the reduced linear model that a study's
+    [linearize] asks for. The result says which values the file holds, and whether an FMU holds a binary. Raises StudyError for
+    an ending that is not known, where the model is not of the kind that the ending needs, and where values are asked for that do
+    not stand.
     """
     from hvdc_ident.linearize.export import formats
     from hvdc_ident.linearize.export import write as write_linear
@@ -223,7 +134,7 @@ def write(
         written = Written(write_linear(_reduced(source, model) if reduced else model, path))
     if selected is None:
         return written
-    return Written(written.path, "; ".join(t for t in (written.note, selected.note) if t), selected.name)
+    return Written(written.path, "; ".join(t for t in (written.note, selected.note) if t), selected.name, selected.of)
 
 
 def _reduced(source: Study | Model | LinearModel, whole: LinearModel) -> LinearModel:
@@ -273,6 +184,8 @@ def _parameters(source: Study | Model, selected: ValueSet | None, path: Path, _:
     from hvdc_ident.files import write_text
 
     model = source.model if isinstance(source, Study) else source
+    if selected is not None and selected.model is not None:
+        model = selected.model
     values = {n: q.value for n, q in model.parameters.items()} | (dict(selected.values) if selected else {})
     return Written(write_text(path, ssv(values, source.name, selected.note if selected else "")))
 
@@ -286,11 +199,13 @@ _WRITERS: dict[str, Callable[[Study | Model, ValueSet | None, Path, FmuOptions],
 
 
 def _model(source: Study | Model, selected: ValueSet | None) -> Model:
-    """The model with the selected values."""
+    """The model with the selected values, and with the effect that they hold with."""
     if isinstance(source, Model):
         return source
     if not isinstance(source.model, Model):
         raise StudyError("the model's equations are not here to be written", where=source.path.name, got="an FMU")
+    if selected is not None and isinstance(selected.model, Model):
+        return selected.model
     return source.model.with_values(dict(selected.values)) if selected and selected.values else source.model
 
 
@@ -308,7 +223,15 @@ def _linear(source: Study | Model | LinearModel, selected: ValueSet | None) -> L
 
     if isinstance(source, Study):
         assert selected is not None
-        return linear_model(source, selected)
+        try:
+            return linear_model(source, selected)
+        except LinearizationError as e:
+            if selected.model is None:
+                raise
+            hint = "--values fit is the linear model of the fit without the effect"
+            raise LinearizationError(
+                f"with the effect that counts {e.what}", where=e.where, expected=e.expected, got=e.got, hint=hint
+            ) from None
     return linearize(source) if isinstance(source, Model) else source
 
 

@@ -186,6 +186,8 @@ def _written(
     data = plain({**heading, **about, **taken, **outcome.data, **implausible})
     for name, text in outcome.files.items():
         write_text(folder / name, text)
+    for name, text in wanted.follow(study, folder, data).items():
+        write_text(folder / name, text)
     write_text(folder / wanted.file, json_pieces(data))
     return Done(wanted, data, outcome.failed, fresh=True)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from hvdc_ident.display import Table, rounded
 from hvdc_ident.report.answers import values_conditional
+from hvdc_ident.report.values_that_count import values_that_count
 from hvdc_ident.study.pipeline import Done
 from hvdc_ident.text import figures_of, interval_text, interval_words
 
@@ -26,6 +27,8 @@ def run_lines(done: Sequence[Done], truth: Sequence[str] = ()) -> list[str]:
     table = values_table(found.get("fit", {}), found.get("diagnose", {}))
     lines += ["", *truth] if truth else ["", *str(table).splitlines()] if table.rows else []
     lines += conditions(found.get("fit", {}), found.get("diagnose", {})) if table.rows and not truth else []
+    counting = counting_line(found.get("fit", {}), found.get("diagnose", {}))
+    lines += [counting] if counting and table.rows else []
     following = next_step(found)
     return [*lines, "", following] if following else lines
 
@@ -49,14 +52,25 @@ def values_table(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> Table:
 
 
 def conditions(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[str]:
-    """Return what the values of the table rest on, as a line; none where what is left is noise."""
-    if not fit.get("estimates"):
-        return []
-    effect = bool(diagnosis.get("augmented_model"))
-    if not values_conditional(fit, diagnosis, effect=effect):
+    """Return what the values that count rest on, as a line; none where what is left is noise."""
+    effect = values_that_count(fit, diagnosis).name == "effect"
+    if not fit.get("estimates") or not values_conditional(fit, diagnosis, effect=effect):
         return []
     which = "The values with the effect" if effect else "The fitted values"
     return [f"{which} hold only if nothing else is missing: what remains is more than the noise."]
+
+
+def counting_line(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> str:
+    """Return which of the fitted values count, in a sentence; empty where there is only one set of them."""
+    counts = values_that_count(fit, diagnosis)
+    if counts.name == "effect":
+        return (
+            f"The values that count are those with {counts.added}: fitted-values.* and `hvdc-ident export` take them."
+        )
+    if counts.name == "fit" and counts.doubt:
+        with_it = f" --values effect takes those with {counts.added}." if counts.added else ""
+        return f"fitted-values.* and `hvdc-ident export` take the values of the fit without an effect: {counts.doubt}.{with_it}"
+    return ""
 
 
 def next_step(found: Mapping[str, Mapping[str, Any]]) -> str:

@@ -16,8 +16,8 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.files import csv_text, json_text, write_text
 from hvdc_ident.study.examples import write_demo
 from hvdc_ident.study.export import SSV, ssv
-from hvdc_ident.study.stages.fit import values_csv
 from hvdc_ident.study.study import load_study
+from hvdc_ident.study.value_files import values_csv
 
 
 def test_json_keeps_every_digit_and_has_no_infinity() -> None:
@@ -52,7 +52,7 @@ def test_ssv_is_xml_with_every_digit() -> None:
 def test_tables_quote_names_and_leave_nothing_for_none() -> None:
     assert csv_text(["a,b", "c"], [[0.1 + 0.2, None]]) == '"a,b",c\n0.30000000000000004,\n'
     text = values_csv({"K": 2.0}, {"K": "pu"}, {"K": {"std": 0.5, "ci95": [1.0, None]}}, {})
-    assert text.splitlines()[1] == "K,2.0,pu,0.5,1.0,,"
+    assert text.splitlines()[1] == "K,2.0,pu,0.5,1.0,,,fit"
 
 
 def test_the_demo_is_the_same_for_a_seed_and_holds_together(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.files import csv_text
 from hvdc_ident.report.results import Results
-from hvdc_ident.study.stages.fit import values_csv
+from hvdc_ident.study.value_files import values_csv
 
 
 def test_no_cell_of_the_fitted_values_is_a_formula():
@@ -20,8 +20,8 @@ def test_no_cell_of_the_fitted_values_is_a_formula():
         {"=k": "-1 is\nheld"},
     )
     rows = list(csv.reader(io.StringIO(text)))
-    assert rows[1] == ["k", "-2.5", "'=HYPERLINK(1)", "0.5", "-3.5", "-1.5", ""]  # numbers stay numbers
-    assert rows[2] == ["'=k", "1.0", "'@SUM(A1)", "", "", "", "'-1 is held"]
+    assert rows[1] == ["k", "-2.5", "'=HYPERLINK(1)", "0.5", "-3.5", "-1.5", "", "fit"]  # numbers stay numbers
+    assert rows[2] == ["'=k", "1.0", "'@SUM(A1)", "", "", "", "'-1 is held", "fit"]
 
 
 def test_the_report_finds_a_column_by_its_own_name(tmp_path):

@@ -27,7 +27,8 @@ from hvdc_ident.cli import app
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.report.letter import letter_of
 from hvdc_ident.report.results import Results
-from hvdc_ident.study.export import SSV, value_set
+from hvdc_ident.study.export import SSV
+from hvdc_ident.study.value_sets import value_set
 
 GIVEN = {"K": 11.0, "T": 0.05, "g": 1.0}
 START = {"K": 30.0, "T": 0.02, "g": 2.0}

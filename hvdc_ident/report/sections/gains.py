@@ -31,7 +31,7 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
     for v in found.values:
         line, own = fit["candidates"][v.name], (fit.get("estimates") or {}).get(v.name) or {}
         fitted, interval = estimate(v.fitted, own.get("ci95"))
-        after, later = estimate(v.effect, v.interval) if v.effect is not None else ("", "")
+        after, later = estimate(v.effect, v.effect_interval) if v.effect is not None else ("", "")
         rows.append(
             [
                 f"<strong>{text(v.name)}</strong>",
@@ -51,9 +51,17 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
     conditions = ", if nothing else is missing: what remains is more than the noise" if found.conditional else ""
     told = (
         "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
-        f"effect: the same with the finding in the model; these are the values that count{conditions}.</p>"
+        f"effect: the same with the finding in the model; {_counting(found)}{conditions}.</p>"
     )
     return table(header, rows, words=(0, 9)) + (told if refitted else "") + _notes(fit)
+
+
+def _counting(found: Answers) -> str:
+    """Clause on which of the values count."""
+    counts = found.counting
+    if counts.name == "effect":
+        return "these are the values that count"
+    return f"{text(counts.doubt)}, so exports take the fitted ones unless --values effect asks for these"
 
 
 def _notes(fit: dict[str, Any]) -> str:

@@ -32,7 +32,7 @@ def _render(results: Results) -> str:
     shown = found or given
     point = shown.get("operating_point") or {}
     return (
-        _which(given, results.get("fit"))
+        _which(given, results.get("fit"), results.get("discrepancy"))
         + _point(shown, point)
         + _modes(given["modes"], found)
         + _limits(point)
@@ -44,7 +44,7 @@ def _render(results: Results) -> str:
     )
 
 
-def _which(given: dict[str, Any], fit: dict[str, Any]) -> str:
+def _which(given: dict[str, Any], fit: dict[str, Any], diagnosis: dict[str, Any]) -> str:
     """At which values the linear models stand."""
     fitted, note = given.get("fitted") or {}, str(given.get("fitted_note") or "")
     if fitted.get("modes"):
@@ -54,6 +54,8 @@ def _which(given: dict[str, Any], fit: dict[str, Any]) -> str:
         lines = [f"At the <strong>given</strong> values{': ' if why else ''}{text(why)}."]
     if fit.get("fingerprint") and fit["fingerprint"] != fitted.get("fit"):
         lines.append("A fit has run since: `hvdc-ident linearize` takes it in.")
+    elif fitted and diagnosis.get("fingerprint", "") != fitted.get("diagnosis", ""):
+        lines.append("A diagnosis has run since: `hvdc-ident linearize` takes it in.")
     return f"<p>{' '.join(lines)}</p>"
 
 
@@ -87,7 +89,7 @@ def _modes(given: list[dict[str, Any]], fitted: dict[str, Any] | None) -> str:
     if fitted is None:
         rows = [[*_numbers(m), *_words(m)] for m in given if m["eigenvalue"][1] >= 0]
         return table([*head, *rest], rows, words=(3, 4, 5))
-    if len(fitted["modes"]) != len(given):  # an effect that has no size there has no states
+    if len(fitted["modes"]) != len(given):  # the fitted model has an effect with states
         return "".join(
             f"<h3>Modes at the {name} values</h3>{_modes(modes, None)}"
             for name, modes in (("fitted", fitted["modes"]), ("given", given))

@@ -6,6 +6,7 @@ from typing import Any
 
 from hvdc_ident.report.html import number, table, text
 from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.values_that_count import values_that_count
 
 LOW = 0.01
 """A p below this is marked."""
@@ -16,7 +17,6 @@ def _render(results: Results) -> str:
     tests = fit.get("residual_tests") or {}
     if not tests:
         return ""
-    rows = [_row(o, e, line, fit) for o, by_name in tests.items() for e, line in by_name.items()]
     head = [
         "output",
         "experiment",
@@ -31,7 +31,19 @@ def _render(results: Results) -> str:
         f"<p class='small'>p: the chance of such a value from white noise (Ljung and Box; Wald and Wolfowitz; cross-"
         f"correlation with inputs, each filtered by itself). Below {LOW:g} it is marked: something is left over.</p>"
     )
-    return _goodness(fit) + table(head, rows, words=(0, 1, 7)) + told
+
+    def tested(by_output: dict[str, Any], of: dict[str, Any]) -> str:
+        rows = [_row(o, e, line, of) for o, by_name in by_output.items() for e, line in by_name.items()]
+        return table(head, rows, words=(0, 1, 7))
+
+    diagnosis = results.get("discrepancy")
+    with_effect = diagnosis.get("residual_tests_after") or {}
+    if not with_effect or values_that_count(fit, diagnosis).name != "effect":
+        return _goodness(fit) + tested(tests, fit) + told
+    return (
+        f"<h3>With the effect, at the values that count</h3>{tested(with_effect, {})}"
+        f"<h3>Fitted without it</h3>{_goodness(fit)}{tested(tests, fit)}{told}"
+    )
 
 
 def _goodness(fit: dict[str, Any]) -> str:

@@ -83,6 +83,11 @@ def two_by_group(study: Study) -> int:
     return 2 * max(1, len(study.settings.fit.groups if study.settings.fit else ()))
 
 
+def no_files(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
+    """Return no files, for a result on which no file of another stage rests."""
+    return {}
+
+
 @dataclass(frozen=True)
 class Stage:
     """One stage.
@@ -94,7 +99,8 @@ class Stage:
     takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
     from its JSON; told_in_part: also where a part of the work failed. verdict: the same in one phrase, for the screen of a run.
     searches: whether it also runs at the start values, where a search begins; all run at the given ones. phases: how many
-    things it counts, one after the other, as progress.
+    things it counts, one after the other, as progress. follow: the files that rest on its result and on those beside it in the
+    folder, whatever its end was, given the study, the folder and its JSON.
     """
 
     name: str
@@ -111,6 +117,7 @@ class Stage:
     searches: bool = False
     told_in_part: bool = False
     phases: Callable[[Study], int] = one_phase
+    follow: Callable[[Study, Path, Mapping[str, Any]], Mapping[str, str]] = no_files
 
 
 @cache

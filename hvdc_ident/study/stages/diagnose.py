@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError
@@ -99,8 +100,17 @@ def diagnosed(
     return replace(found, notes=(*found.notes, note))
 
 
+def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
+    """Return the files of fitted values: with the effect if the diagnosis named one, else those of the fit."""
+    from hvdc_ident.study.value_files import after_diagnosis
+
+    return after_diagnosis(study, folder, data)
+
+
 def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The verdict, what is missing, what it changes, and what to measure to be sure."""
+    from hvdc_ident.study.run_summary import counting_line
+
     if "verdict" not in data:
         return [str(data.get("message", ""))]
     lines = [f"{data['verdict']}: {data['text']}"]
@@ -128,6 +138,8 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     lines += [f"Parameters, refitted without and with it: {', '.join(moved)}."] if moved else []
     if moved and data.get("beyond_noise"):
         lines.append("These values hold only if nothing else is missing: what remains is more than the noise.")
+    counting = counting_line({"status": "converged"}, data) if moved else ""
+    lines += [counting] if counting else []
     told = "Next: `hvdc-ident letter STUDY` writes one page on this for the model's owner."
     return [*lines, *data["notes"], *([told] if data["augmented_model"] else [])]
 
@@ -149,4 +161,5 @@ STAGE = Stage(
     tell=lines_of,
     verdict=verdict,
     searches=True,
+    follow=follow,
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
@@ -41,7 +42,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     data["derived"] = fitting.derived(study, result)
     if study.responses:
         data["responses"] = compared(study, {"given": study.given, "fitted": result.values})
-    files = _files(study, result, data, curves)
+    files = _files(study, data, curves)
     return StageResult(data, files, failed=result.message if result.status == "not-converged" else "")
 
 
@@ -64,46 +65,20 @@ def _context(
     }
 
 
-def _files(
-    study: Study, result: FitResult, data: Mapping[str, Any], curves: Mapping[str, Mapping[str, Curve]]
-) -> dict[str, str]:
+def _files(study: Study, data: Mapping[str, Any], curves: Mapping[str, Mapping[str, Curve]]) -> dict[str, str]:
     """The values to paste, and the waveforms at the estimates; of an experiment that fails there is none."""
-    from hvdc_ident.study.export import ssv
     from hvdc_ident.study.fitting import curves_csv
+    from hvdc_ident.study.value_files import value_files
 
-    values = {n: float(result.values[n]) for n in study.candidates if n in result.values}
-    units = {n: study.model.parameters[n].unit for n in values}
-    follow = [f"# {n} = {d['expression']} = {d['value']!r}" for n, d in data["derived"].items()]
-    files = {
-        "fitted-values.toml": _head(study, values) + result.to_toml_values() + "".join(f"{line}\n" for line in follow),
-        "fitted-values.csv": values_csv(values, units, data["estimates"], result.held),
-        "fitted-values.ssv": ssv(values, study.name, f"fitted values of study '{study.name}' (fit {result.status})"),
-    }
-    return files | {f"fit.{e.name}.csv": curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
+    waveforms = {f"fit.{e.name}.csv": curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
+    return {**value_files(study, data), **waveforms}
 
 
-def values_csv(
-    values: Mapping[str, float], units: Mapping[str, str], estimates: Mapping[str, Any], held: Mapping[str, str]
-) -> str:
-    """CSV text with a row for each fitted or held parameter: value, unit, std, interval, and why it is held."""
-    from hvdc_ident.files import csv_text
+def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
+    """Return the files of fitted values with the effect, where a diagnosis that stands named one."""
+    from hvdc_ident.study.value_files import after_fit
 
-    rows: list[list[Any]] = []
-    for name, value in values.items():
-        e = estimates.get(name) or {}
-        low, high = e.get("ci95") or (None, None)
-        rows.append([name, value, units.get(name, ""), e.get("std"), low, high, held.get(name, "")])
-    return csv_text(["parameter", "value", "unit", "std", "ci95_low", "ci95_high", "held"], rows)
-
-
-def _head(study: Study, values: Mapping[str, float]) -> str:
-    """Comments above the fitted values: what pasting them does, and the given values, which are then no longer the model's."""
-    given = ", ".join(f"{n} {study.candidates[n].given!r}" for n in values)
-    return (
-        f"# Fitted values of study '{' '.join(study.name.split())}'. Given were {given}.\n"
-        "# In [model.values] they become the given values of a study, what its results are compared with, unless [parameters]\n"
-        "# says otherwise: NAME = {given = ...}. `hvdc-ident export --values fitted` needs no pasting.\n"
-    )
+    return after_fit(study, folder, data)
 
 
 def lines_of(data: Mapping[str, Any]) -> list[str]:
@@ -195,4 +170,5 @@ STAGE = Stage(
     verdict=verdict,
     searches=True,
     phases=two_by_group,
+    follow=follow,
 )

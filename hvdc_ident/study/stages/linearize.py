@@ -10,8 +10,8 @@ from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
-    from hvdc_ident.study.export import ValueSet
     from hvdc_ident.study.study import Study
+    from hvdc_ident.study.value_sets import ValueSet
 
 CHECKS = {
     "symbolic": "complex step of 1e-30 through the equations, relative to each row's largest entry",
@@ -23,11 +23,12 @@ CHECKS = {
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """The operating point, A, B, C, D, the modes with their derivatives, and every transfer function asked for.
 
-    All of it at the given values, and under `fitted` at the fitted ones where a fit stands in the folder.
+    All of it at the given values, and under `fitted` at the fitted ones where they stand in the folder: of the model with the
+    effect where a diagnosis named one.
     """
     from hvdc_ident.errors import HvdcIdentError
     from hvdc_ident.study.checks import at_given
-    from hvdc_ident.study.export import fitted_values, value_set
+    from hvdc_ident.study.value_sets import fitted_values, value_set
 
     given = value_set(study, "given")
     with at_given(study):
@@ -39,9 +40,11 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     try:
         other, more = _described(study, linear_model(study, found), found, options, like=data["modes"])
     except HvdcIdentError as e:  # the given model is the answer all the same
-        other, more = {"values": found.name, "parameters": dict(found.values), "message": f"no linear model: {e}"}, {}
+        about = {"values": found.name, "set": found.of, "parameters": dict(found.values)}
+        other, more = {**about, "message": f"no linear model: {e}"}, {}
     files |= {f"fitted.{name}": text for name, text in more.items()}
-    return StageResult({**data, "fitted": {**other, "fit": found.fit}, "fitted_note": found.note}, files)
+    marks = {"fit": found.fit, "diagnosis": found.diagnosis}
+    return StageResult({**data, "fitted": {**other, **marks}, "fitted_note": found.note}, files)
 
 
 def _described(
@@ -52,12 +55,14 @@ def _described(
     from hvdc_ident.study.linear_analysis import MOST_CHANNELS, analyses, modes_of
     from hvdc_ident.study.measured_responses import compared
 
+    study = with_model(study, selected)
     point = model.point
     assert point is not None
     options.progress(1, 3, "modes and transfer functions")
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
     data = {
         "values": selected.name,
+        "set": selected.of,
         "parameters": dict(selected.values),
         **model.to_dict(),
         "operating_point": point.to_dict(),
@@ -96,11 +101,14 @@ def _ordered(modes: list[dict[str, Any]], like: Sequence[Mapping[str, Any]]) -> 
 
 
 def linear_model(study: Study, selected: ValueSet) -> LinearModel:
-    """The linear model that a study's [linearize] asks for, at these values; without that table between all inputs and outputs."""
+    """The linear model that a study's [linearize] asks for, at these values; without that table between all inputs and outputs.
+
+    Of values that hold with an effect it is the linear model of the model with that effect.
+    """
     from hvdc_ident.linearize import linearize
     from hvdc_ident.study.linear_analysis import operating_point
 
-    asked = study.settings.linearize
+    asked, study = study.settings.linearize, with_model(study, selected)
     model = linearize(
         study.model,
         operating_point(study, selected.values),
@@ -110,6 +118,11 @@ def linear_model(study: Study, selected: ValueSet) -> LinearModel:
         sensitivities=list(study.candidates),
     )
     return replace(model, provenance=model.provenance | {"values": selected.note})
+
+
+def with_model(study: Study, selected: ValueSet) -> Study:
+    """The study with the model that the values hold in."""
+    return study if selected.model is None else replace(study, model=selected.model)
 
 
 def lines_of(data: Mapping[str, Any]) -> list[str]:
@@ -152,8 +165,8 @@ STAGE = Stage(
     summary="Linearise the model; compute its modes and transfer functions.",
     run=run,
     wanted=lambda study: study.settings.linearize is not None or bool(study.responses),
-    order=45,
-    uses=("fit",),
+    order=55,
+    uses=("fit", "diagnose"),
     tell=lines_of,
     verdict=verdict,
 )

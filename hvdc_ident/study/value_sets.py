@@ -1,0 +1,205 @@
+"""The sets of values of a study's parameters, by name.
+
+given: the values the model came with, the vendor's; everything is simulated with them and compared with them.
+start: where a search begins. fit: what the fit in a folder of results estimated, with what it held. effect: what its diagnosis
+estimated together with an effect, and the model with that effect. fitted: whichever of the last two counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from hvdc_ident.errors import StudyError
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import AnyModel
+from hvdc_ident.report.values_that_count import NO_ESTIMATES, ValuesThatCount, values_that_count
+from hvdc_ident.study.augmented import augmented_model
+from hvdc_ident.study.study import Study
+from hvdc_ident.text import figures, listed, percentage
+
+SetName = Literal["given", "start", "fitted", "effect", "fit"]
+SETS: tuple[SetName, ...] = get_args(SetName)
+
+NOT_BY_ITSELF = ("two-optima",)
+"""Ends of a fit that gives several answers that are as good: its best one is taken only where it is asked for."""
+NONE = "no fit has run"
+
+
+@dataclass(frozen=True)
+class ValueSet:
+    """Values of a study's parameters, in their units.
+
+    name: as it was asked for: given, start, fitted, effect or fit. of: what they are: given, start, fit or effect. note: what is
+    to be said of them, in words that stand alone: where they come from, and why they are not the fitted ones where those might
+    be expected. fit, diagnosis: the fingerprints of the results that they come from. model: that they hold in, where it has an
+    effect that the study's model lacks; None where it is the study's own.
+    """
+
+    name: SetName
+    values: FrozenMap[float]
+    note: str
+    of: Literal["given", "start", "fit", "effect"]
+    fit: str = ""
+    diagnosis: str = ""
+    model: AnyModel | None = None
+
+
+def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> ValueSet:
+    """The set of that name; None: the fitted values where they stand in the folder, else the given ones.
+
+    folder: of results, by default the study's own. A result stands where it came to an end on the study, the files and the
+    software as they are now. Raises StudyError for another name, and where values are asked for that do not stand.
+    """
+    if wanted is not None and wanted not in SETS:
+        raise StudyError(
+            "no such set of values",
+            where="--values",
+            expected=", ".join(SETS),
+            got=repr(wanted),
+            hint="--values given: those the model came with; start: where a search begins; fitted: those that count of a fit "
+            "and a diagnosis; effect: those with the effect that a diagnosis found; fit: those of the fit without one",
+        )
+    if wanted == "given":
+        return _given(study)
+    if wanted == "start":
+        note = f"start values of study '{study.name}', where a search begins"
+        return ValueSet("start", study.start, note, "start")
+    results = _Results.of(study, folder or study.folder)
+    if wanted == "effect":
+        return _asked(results, results.with_effect("effect") if results.counts.added else None, results.no_effect)
+    if wanted == "fit":
+        return _asked(results, results.of_fit("fit") if results.fit else None, results.no_fit)
+    found, why = results.fitted()
+    if wanted == "fitted":
+        return _asked(results, found, why)
+    if found is not None and not why:
+        return found
+    return _given(study, "" if why == NONE else why)
+
+
+def fitted_values(study: Study, folder: Path) -> tuple[ValueSet | None, str]:
+    """The fitted values that count; and why they are not to be taken unasked, "" where they are.
+
+    Those with the effect where a diagnosis in the folder named one, else those of its fit. None where there are none to take at
+    all: no fit, one of another state of the study, or one that failed.
+    """
+    return _Results.of(study, folder).fitted()
+
+
+def _asked(results: _Results, found: ValueSet | None, why: str) -> ValueSet:
+    """The values that were asked for by name. Raises StudyError, with the reason, where there are none."""
+    if found is not None:
+        return found
+    command = "diagnose" if why == results.no_effect else "fit"
+    raise StudyError(
+        f"there are no {'values with an effect' if command == 'diagnose' else 'fitted values'}: {why}",
+        where=results.study.path.name,
+        expected=f"a finished {command} of the study and its files as they are now, in {results.folder}",
+        hint=f"hvdc-ident {command} {results.study.path}, or --values given",
+    )
+
+
+def _given(study: Study, why: str = "") -> ValueSet:
+    note = f"given values of study '{study.name}'" + (f"; {why}" if why else "")
+    return ValueSet("given", study.given, note, "given")
+
+
+@dataclass(frozen=True)
+class _Results:
+    """The fit and the diagnosis that stand in a folder, as JSON, each empty where there is none, and why."""
+
+    study: Study
+    folder: Path
+    fit: Mapping[str, Any]
+    no_fit: str
+    diagnosis: Mapping[str, Any]
+    stale: str
+
+    @classmethod
+    def of(cls, study: Study, folder: Path) -> _Results:
+        """Return what stands in the folder."""
+        from hvdc_ident.study.pipeline import standing
+
+        fit, no_fit = standing(study, "fit", folder)
+        if not no_fit and fit.get("status") in NO_ESTIMATES:
+            no_fit = f"the fit in {folder} ended as {fit['status']}: {fit.get('message', '')}"
+        diagnosis, why = standing(study, "diagnose", folder)
+        stale = why if diagnosis else ""
+        return cls(study, folder, {} if no_fit else fit, no_fit, {} if why else diagnosis, stale)
+
+    @property
+    def counts(self) -> ValuesThatCount:
+        """Which values count."""
+        return values_that_count(self.fit, self.diagnosis)
+
+    @property
+    def no_effect(self) -> str:
+        """Why there are no values with an effect, where there are none."""
+        if not self.diagnosis:
+            return self.stale or "no diagnose has run"
+        return f"the diagnosis in {self.folder} found none to put into the model ({self.diagnosis['verdict']})"
+
+    def fitted(self) -> tuple[ValueSet | None, str]:
+        """Return the values that count, and why they are not to be taken unasked."""
+        if not self.counts.name:
+            return None, self.no_fit
+        found = self.with_effect("fitted") if self.counts.name == "effect" else self.of_fit("fitted")
+        if self.fit.get("status") in NOT_BY_ITSELF:
+            end = f"the fit in {self.folder} ended as {self.fit['status']}: {self.fit['message']}"
+            return found, f"{end}; --values fitted takes the best"
+        return found, ""
+
+    def of_fit(self, name: Literal["fitted", "fit"]) -> ValueSet:
+        """Return the values of the fit, by that name."""
+        study, fit, counts = self.study, self.fit, self.counts
+        values = study.given | {n: float(fit["values"][n]) for n in study.candidates if n in fit["values"]}
+        if name == "fitted" and not counts.doubt:
+            note = f"fitted values of study '{study.name}' ({_outcome(fit)})"
+        else:
+            note = f"{'fitted values' if name == 'fitted' else 'fit values'} of study '{study.name}', without an effect ({_outcome(fit)})"
+        why = counts.doubt
+        if counts.added:
+            why += f"{'; ' if why else ''}--values effect takes those with {counts.added}"
+        note += f": {why}" if why else ""
+        note += f"; {self.stale}" if self.stale else ""
+        return ValueSet(name, values, note, "fit", fit["fingerprint"], self.diagnosis.get("fingerprint", ""))
+
+    def with_effect(self, name: Literal["fitted", "effect"]) -> ValueSet:
+        """Return the values fitted together with the effect, by that name, and the model that they hold in."""
+        study, own = self.study, self.study.model.parameters
+        model = augmented_model(study, self.diagnosis, self.folder)
+        moved = {n: q.value for n, q in model.parameters.items() if n not in own or q.value != own[n].value}
+        values = FrozenMap({n: model.parameters[n].value for n in study.given} | moved)
+        note = f"{name} values of study '{study.name}', with {self.counts.added} in the model, {self._standing_of_effect()}"
+        marks = self.fit.get("fingerprint", ""), self.diagnosis["fingerprint"]
+        return ValueSet(name, values, note, "effect", *marks, model)
+
+    def _standing_of_effect(self) -> str:
+        """Return how sure the diagnosis is of the effect, and of its places, in words."""
+        if self.counts.name != "effect":
+            return f"the best that was found, and not certain: {self.counts.doubt}"
+        places = [
+            listed(f"{', '.join(p['at'])} ({percentage(p['probability'])})" for p in f["places"])
+            for f in self.diagnosis.get("findings") or ()
+            if len(f.get("places") or ()) > 1
+        ]
+        rest = (
+            f"; its likely places: {'; '.join(places)}; at another one than this the values may differ"
+            if places
+            else ""
+        )
+        return f"as the diagnosis named it{rest}"
+
+
+def _outcome(fit: Mapping[str, Any]) -> str:
+    """Return how a fit ended, and how far above the noise: what a reader has to know of its values."""
+    held = [n for n in fit.get("candidates", {}) if n not in (fit.get("fitted") or [])]
+    chi = fit.get("chi2_per_dof")
+    verdict = str((fit.get("adequacy") or {}).get("verdict", ""))
+    parts = [f"fit {fit['status']}", *(["the model does not fit these records"] if verdict == "does-not-fit" else [])]
+    parts += [f"chi2/dof {figures(chi, 3)}"] if isinstance(chi, int | float) else []
+    parts += [f"held: {', '.join(held)}"] if held else []
+    return ", ".join(parts)
