@@ -460,7 +460,8 @@ def diagnose(
 def check(model: ModelLike, data: DataLike | None = None, parameters: ParametersLike | None = None) -> Summary:
     """Return what was found in a study, or in a model, data and parameters: rows, event, noise, levels before the event.
 
-    No stage is run. What does not hold together raises an InputError: what, where, expected, got, what to try.
+    No stage is run; the model is, once an experiment, and what hinders a run or a fit is told. What does not hold together raises
+    an InputError: what, where, expected, got, what to try.
 
     >>> import hvdc_ident as hi
     >>> hi.check("vsc-hvdc-link").to_dict()["sizes"]["states"]
@@ -469,7 +470,7 @@ def check(model: ModelLike, data: DataLike | None = None, parameters: Parameters
     from hvdc_ident.study.assemble import study_of
     from hvdc_ident.study.summary import Summary
 
-    return Summary.of(study_of(model, data, parameters))
+    return Summary.of(study_of(model, data, parameters), in_python=True)
 
 
 def export(

@@ -111,7 +111,7 @@ def check(
 ) -> None:
     """Validate study, model and data; run no stage.
 
-    The levels before each event are compared with the model's.
+    The levels before each event are compared with the model's. What would hinder a run is told at the end.
 
     For an FMU, list its variables and what it offers, and report what a short run finds.
     """

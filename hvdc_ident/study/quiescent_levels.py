@@ -96,6 +96,13 @@ class QuiescentLevel:
     suggestion: str | None = None
     text: str = ""
 
+    @property
+    def is_mistake(self) -> bool:
+        """Whether the recording seems wrong, not the model: a positive factor may as well be a gain of the model."""
+        if self.suggestion is None or self.suggestion in PLAIN:
+            return False
+        return self.suggestion != "factor" or (self.factor or 0.0) < 0.0
+
     @classmethod
     def of(cls, record: RecordedOutput) -> QuiescentLevel:
         """Return the level as far as it is known without the model."""
@@ -114,18 +121,25 @@ class QuiescentLevels:
     @property
     def lines(self) -> list[str]:
         """Sentences to be read before anything is fitted; what several experiments show alike is told once."""
+        return [*self.failures, *(line for _, line in self._told())]
+
+    @property
+    def mistakes(self) -> list[str]:
+        """Those of the lines that suspect a mistake of the recording: its sign, unit or time, or columns exchanged."""
+        return [line for first, line in self._told() if first.is_mistake]
+
+    def _told(self) -> Iterator[tuple[QuiescentLevel, str]]:
+        """Yield a level of each group that is told alike, and the line."""
         groups: dict[tuple[str, str | None, str], list[QuiescentLevel]] = {}
         for level in self.levels:
             if level.text:
                 suggestion = level.suggestion if level.suggestion not in PLAIN else ""
                 groups.setdefault((level.channel, suggestion, f"{level.factor or 0:.2g}"), []).append(level)
-        lines = list(self.failures)
         for group in groups.values():
             first = max(group, key=lambda level: abs(level.noise_units or 0.0))
             others = list(dict.fromkeys(level.experiment for level in group if level.experiment != first.experiment))
             shown = listed(others[:3]) if len(others) <= 3 else f"{len(others)} more experiments"
-            lines.append(f"{first.experiment}: {first.text}" + (f" (and so in {shown})" if others else ""))
-        return lines
+            yield first, f"{first.experiment}: {first.text}" + (f" (and so in {shown})" if others else "")
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return one table an output and experiment, as the results keep them; failures are tables without an output."""
@@ -175,12 +189,30 @@ def compare_levels(
             failures += _input_after_failure(simulator, e)
             continue
         comparisons += [Comparison.of(r, run[r.output]) for r in records]
+        failures += [f"{e.name}: {line}" for r in records if (line := _run_away(r, run[r.output]))]
     if comparisons:
         quantile = float(norm.isf(FALSE_ALARMS / 2.0 / len(comparisons)))
         by_name = {e.name: e for e in experiments}
         for level in _judged(simulator, by_name, candidates, comparisons, quantile):
             levels[level.experiment, level.output] = level
     return QuiescentLevels(tuple(levels.values()), tuple(remarks), tuple(failures))
+
+
+def _run_away(record: RecordedOutput, simulated: Array) -> str:
+    """Return in words that the model grows without bound where the recording does not; empty where it stays near it.
+
+    No two units of one quantity that are confused lie further apart than LARGEST.
+    """
+    recorded = record.values[np.isfinite(record.values)]
+    bound = float(np.abs(recorded).max(initial=0.0))
+    largest = float(np.abs(simulated).max(initial=0.0))
+    if not bound or largest <= LARGEST * bound:
+        return ""
+    unit = f" {record.unit}" if record.unit else ""
+    return (
+        f"{record.output} of the model runs away to {largest:.3g}{unit} where the recording stays within {bound:.3g}{unit}: "
+        "is a sign in the model, or a value, wrong?"
+    )
 
 
 def _judged(

@@ -1,4 +1,5 @@
-"""The summary of a study that `check` prints: what it holds, and whether recordings and model begin at the same levels."""
+"""The summary of a study that `check` prints: what it holds, whether recordings and model begin at the same levels, and what
+hinders a run."""
 
 from __future__ import annotations
 
@@ -9,23 +10,25 @@ from typing import Any
 
 from hvdc_ident.data import Experiment, recording_lines
 from hvdc_ident.study.checks import steady_notes
+from hvdc_ident.study.hindrances import hindrances
 from hvdc_ident.study.measured_responses import described
 from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.quiescent_levels import quiescent_levels
 from hvdc_ident.study.stages import stages
 from hvdc_ident.study.study import Study, candidate_lines
-from hvdc_ident.text import quantity
+from hvdc_ident.text import one_of, quantity
 
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """A study in numbers and lines. data: as `check --json` prints it."""
+    """A study in numbers and lines. data: as `check --json` prints it. in_python: whether the next step is a call or a command."""
 
     data: Mapping[str, Any]
+    in_python: bool = False
 
     @classmethod
-    def of(cls, study: Study, seed: int = 0) -> Summary:
-        """Return the summary of a study. The model is run, for its levels before each event against the recorded ones."""
+    def of(cls, study: Study, seed: int = 0, *, in_python: bool = False) -> Summary:
+        """Return the summary of a study. The model is run once an experiment, and once more where the start values differ."""
         model, levels = study.model, quiescent_levels(study)
         sizes = {n: len(getattr(model, n)) for n in ("states", "parameters", "inputs", "outputs")}
         return cls(
@@ -39,7 +42,9 @@ class Summary:
                 "stages": [s.name for s in stages() if s.wanted(study)],
                 "rest_levels": levels.to_list(),
                 "rest_lines": [*levels.lines, *levels.remarks],
-            }
+                "hindrances": hindrances(study, levels),
+            },
+            in_python,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -49,7 +54,9 @@ class Summary:
     def __str__(self) -> str:
         found = self.data
         sizes = ", ".join(f"{n} {k}" for k, n in found["sizes"].items())
-        lines = [f"study {found['study']}: good", f"model {found['model']}: {sizes}"]
+        wrong = found["hindrances"]
+        good = "good" if not wrong else "to be mended before a run: see the end"
+        lines = [f"study {found['study']}: {good}", f"model {found['model']}: {sizes}"]
         for name, c in found["candidates"].items():
             unit = f" {c['unit']}" if c["unit"] else ""
             given = f"given {c['given']:g}{unit} ({c['given_by']})"
@@ -62,7 +69,7 @@ class Summary:
                 f"experiment {name} ({e['role']}): {e['rows']} rows, {start:g} to {end:g} s, {event}; noise {noise}"
             )
         lines += _recording_lines({name: recording_lines(e["recording"]) for name, e in found["experiments"].items()})
-        lines += found["rest_lines"]
+        lines += [line for line in found["rest_lines"] if line not in wrong]
         lines += [f"steady state, {line}" for line in found["steady_state"]]
         for name, r in found["responses"].items():
             low, high = r["band_hz"]
@@ -74,7 +81,14 @@ class Summary:
                 f"frequencies, {low:.4g} to {high:.4g} Hz; noise {noise}"
             )
         lines.append(f"a run does: {', '.join(found['stages']) or 'nothing but the report'}")
-        if found["stages"]:
+        if wrong:
+            lines += ["before a run:", *wrong]
+            again = "`hi.check(...)`" if self.in_python else "`hvdc-ident check STUDY`"
+            lines.append(f"Next: answer or mend what stands above, then {again}")
+        elif self.in_python:
+            verbs = [f"`hi.{s}(...)`" for s in found["stages"] if s != "screen"]
+            lines += [f"Next: {one_of(verbs, len(verbs))}"] if verbs else []
+        elif found["stages"]:
             lines.append("Next: `hvdc-ident run STUDY`")
         return "\n".join(lines)
 

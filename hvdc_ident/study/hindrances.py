@@ -1,0 +1,57 @@
+"""What keeps a study from being run, or its results from being right, found before a stage runs: `check` ends with it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.simulate import ModelSimulator
+from hvdc_ident.study.checks import need_start
+from hvdc_ident.study.level_comparison import outputs_of
+from hvdc_ident.study.linear_analysis import operating_point
+from hvdc_ident.study.quiescent_levels import QuiescentLevels
+from hvdc_ident.study.stages import stages
+
+if TYPE_CHECKING:
+    from hvdc_ident.study.study import Study
+
+
+def hindrances(study: Study, levels: QuiescentLevels) -> list[str]:
+    """Return what hinders a run, in sentences; empty where nothing was found.
+
+    levels: of this study; they come from a run of every recorded experiment at the given values, whose failures they hold, with
+    the recordings that seem to have another sign or unit. Besides these, experiments without a recording are run at the given
+    values, and all at the start values where these differ and a search begins there.
+    """
+    found = [*levels.failures, *levels.mistakes, *_bounds(study)]
+    found += _runs(study, at_start=False)
+    searches = any(s.searches and s.wanted(study) for s in stages())
+    if searches and study.start != study.given:
+        found += _runs(study, at_start=True)
+    for begins, asked in ((searches, need_start), (study.settings.linearize is not None, operating_point)):
+        if begins and not found:
+            try:
+                asked(study)
+            except HvdcIdentError as error:
+                found.append(str(error))
+    return list(dict.fromkeys(found))
+
+
+def _bounds(study: Study) -> list[str]:
+    """Return a sentence for each candidate whose given value lies outside the bounds of its search."""
+    units = {n: study.model.parameters[n].unit for n in study.candidates}
+    return [
+        f"parameters.{n}: the given value {c.given:.6g} lies outside the bounds of the search, {c.min:.6g} to "
+        f"{c.max:.6g} {units[n]}".rstrip()
+        + ", so no fit can return it: is it right, and are they?"
+        for n, c in study.candidates.items()
+        if not c.min <= c.given <= c.max
+    ]
+
+
+def _runs(study: Study, *, at_start: bool) -> list[str]:
+    """Return why experiments cannot be simulated: all at the start values, or at the given ones those without a recording."""
+    simulator, values = ModelSimulator(study.model), dict(study.start if at_start else study.given)
+    where = ", at the start values" if at_start else ""
+    runs = {e.name: outputs_of(simulator, e, values) for e in study.experiments if at_start or not e.outputs}
+    return [f"{name}{where}: {run}" for name, run in runs.items() if isinstance(run, str)]
