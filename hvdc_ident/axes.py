@@ -69,10 +69,12 @@ def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> No
 
 
 def _decades(low: float, high: float) -> list[float]:
-    """0 and powers of ten on both sides of it, at most about four a side, from above low up to high."""
+    """0 and powers of ten on both sides of it, at most about four a side, from above low up to high; one or two numbers of the
+    series 1, 2, 5 a side where no power of ten lies between."""
     first, last = int(np.floor(np.log10(low))) + 1, int(np.floor(np.log10(high)))
-    powers = range(last, first - 1, -max(1, (last - first + 4) // 4))
-    sides = [10.0**k for k in powers]
+    sides = [10.0**k for k in range(last, first - 1, -max(1, (last - first + 4) // 4))]
+    if not sides:
+        sides = [m * 10.0**k for k in (last, last - 1) for m in (5, 2, 1) if m * 10.0**k <= high][:2]
     return sorted([-s for s in sides] + [0.0] + sides)
 
 

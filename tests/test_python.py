@@ -11,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hvdc_ident as hi
+from hvdc_ident.axes import draw_intervals
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit import Problem
 from hvdc_ident.study.assemble import experiments_of
@@ -66,6 +67,18 @@ def test_the_fit_is_gated_and_agrees_with_scipy(report: Any, fit: Any) -> None:
         assert low < true < high
     forced = hi.fit(LAG, RECORD, {"T": (0.1, 10.0), "unseen": (0.1, 5.0)}, force="unseen", starts=1)
     assert "unseen" in forced.fitted or forced.status == "failed"
+
+
+@pytest.mark.parametrize("half", [0.02, 0.9, 1.2, 3.0, 40.0, 900.0])
+def test_the_axis_of_intervals_has_ticks_on_both_sides(half: float) -> None:
+    plt = pytest.importorskip("matplotlib.pyplot")
+    verdict = {"verdict": "identifiable", "value": 100.0, "scale": 100.0, "ci95": [100.0 - half, 100.0 + 1.1 * half]}
+    axes = plt.subplots()[1]
+    draw_intervals(axes, {"k": verdict})
+    low, high = axes.get_xlim()
+    shown = [t for t in axes.get_xticks() if low <= t <= high]
+    assert 3 <= len(shown) <= 11 and shown == [-t for t in reversed(shown)]
+    plt.close("all")
 
 
 def test_tables_and_lists_are_the_same_data() -> None:

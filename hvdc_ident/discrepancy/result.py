@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal
 from hvdc_ident.display import Shown, data_frame
 from hvdc_ident.display import Table as TextTable
 from hvdc_ident.effects import effects
-from hvdc_ident.errors import SteadyStateError
+from hvdc_ident.errors import InputError, SteadyStateError
 from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import interval_text, interval_words, percentage
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from hvdc_ident.model import AnyModel
 
 
@@ -294,13 +292,18 @@ class Diagnosis(Shown):
         }
         return data_frame(columns)
 
-    def plot(self) -> Figure:
-        """Bar charts: the pooled gap of the three models on fitted and held-out data, and the BIC of the best candidates."""
-        import numpy as np
-        from matplotlib.figure import Figure
+    def plot(self, ax: Any = None) -> Any:
+        """Draw bar charts and return their two axes: the pooled gap of the three models on fitted and held-out data, and the BIC of
+        the best candidates. ax: two axes to draw on.
 
-        fig = Figure(figsize=(10.0, 4.2), layout="constrained")
-        left, right = fig.subplots(1, 2, width_ratios=[1.0, 1.4])
+        Raises InputError for another number of axes.
+        """
+        import numpy as np
+
+        axes = np.ravel(ax if ax is not None else _two_axes())
+        if axes.size != 2:
+            raise InputError("a diagnosis is drawn on two axes", where="ax", expected="two axes", got=str(axes.size))
+        left, right = axes
         names = ["nominal", "refitted", "augmented"]
         width = 0.38
         for k, (part, label) in enumerate((("fit", "fitted"), ("holdout", "held out"))):
@@ -324,12 +327,20 @@ class Diagnosis(Shown):
         else:
             right.set_axis_off()
             right.text(0.5, 0.5, "no candidate was refitted", ha="center", va="center", transform=right.transAxes)
-        fig.suptitle(
-            f"{self.verdict}: {', '.join(e.text for e in self.effects) or self.text}",
-            fontsize="medium",
-            wrap=True,
-        )
-        return fig
+        headline = f"{self.verdict}: {', '.join(e.text for e in self.effects) or self.text}"
+        if ax is None:
+            left.figure.suptitle(headline, fontsize="medium", wrap=True)
+        else:
+            left.set_title(headline, fontsize="small", wrap=True)
+        return axes
+
+
+def _two_axes() -> Any:
+    """Return two axes beside each other on a new figure."""
+    import matplotlib.pyplot as plt
+
+    settings: dict[str, Any] = {"figsize": (10.0, 4.2), "layout": "constrained", "width_ratios": [1.0, 1.4]}
+    return plt.subplots(1, 2, **settings)[1]
 
 
 def _named(value: FoundEffect | Rival | Line | Place) -> dict[str, Any]:

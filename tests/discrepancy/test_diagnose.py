@@ -100,7 +100,7 @@ def test_the_augmented_card_loads_and_runs(lagged: Diagnosis, tmp_path) -> None:
 
 
 def test_it_draws_itself(lagged: Diagnosis) -> None:
-    assert len(lagged.plot().axes) == 2
+    assert lagged.plot().shape == (2,)
 
 
 @pytest.mark.parametrize("noise", ["white", "ar", "quantised"])
