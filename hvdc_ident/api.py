@@ -6,10 +6,11 @@ a verb is called.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from functools import wraps
+from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeAlias, TypeVar
 
 # The rooms are there before the package binds the verbs of the same names: an import of a room would replace them later.
 import hvdc_ident.fit
@@ -35,6 +36,26 @@ if TYPE_CHECKING:
 Values: TypeAlias = "Mapping[str, float] | FitResult | None"
 Names: TypeAlias = "str | Iterable[str] | None"
 Workers: TypeAlias = "Executor | int | None"
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+
+def _verb(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return the function with the commands in the hints of its errors as Python calls."""
+
+    @wraps(function)
+    def verb(*arguments: Arguments.args, **settings: Arguments.kwargs) -> Result:
+        from hvdc_ident.errors import HvdcIdentError
+        from hvdc_ident.text import in_python
+
+        try:
+            return function(*arguments, **settings)
+        except HvdcIdentError as error:
+            error.hint = in_python(error.hint)
+            error.args = (str(error),)
+            raise
+
+    return verb
 
 
 def simulate(
@@ -120,6 +141,7 @@ def find_operating_point(
     return find(plant, fixed, names_of(free, "parameter or input") or (), outputs=outputs, at=at, **search)
 
 
+@_verb
 def linearize(
     model: ModelLike,
     point: OperatingPoint | None = None,
@@ -265,6 +287,7 @@ def sensitivities(
     )
 
 
+@_verb
 def sweep(
     model: ModelLike,
     parameters: Any = None,
@@ -322,6 +345,7 @@ def sweep(
         )
 
 
+@_verb
 def identify(
     model: ModelLike,
     data: DataLike | None = None,
@@ -336,7 +360,7 @@ def identify(
 
     model: a Study, or a Model, a shipped name or a path. data: experiments, a study, or a table whose columns are named like
     the model's inputs and outputs. parameters: names, or by name bounds (min, max), a start value, or a line as in a
-    study's [parameters]; a study has its own. pair: two of them whose common profile is wanted too.
+    study's [parameters], as {"k": (0, 10)} or [("k", 0, 10)]; a study has its own. pair: two of them whose common profile is wanted too.
     executor, progress: as in `fit`.
 
     Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated.
@@ -360,6 +384,7 @@ def identify(
         return judged(study, seed=seed, executor=pool, progress=told)
 
 
+@_verb
 def fit(
     model: ModelLike | Problem,
     data: DataLike | None = None,
@@ -411,6 +436,7 @@ def fit(
         return replace(result, message=in_python(result.message))
 
 
+@_verb
 def diagnose(
     model: ModelLike,
     data: DataLike | None = None,
@@ -457,6 +483,7 @@ def diagnose(
         return diagnosed(study, found.to_dict(), seed=seed, executor=pool, progress=told)
 
 
+@_verb
 def check(model: ModelLike, data: DataLike | None = None, parameters: ParametersLike | None = None) -> Summary:
     """Return what was found in a study, or in a model, data and parameters: rows, event, noise, levels before the event.
 
@@ -473,6 +500,7 @@ def check(model: ModelLike, data: DataLike | None = None, parameters: Parameters
     return Summary.of(study_of(model, data, parameters), in_python=True)
 
 
+@_verb
 def export(
     source: ModelLike | LinearModel,
     path: str | Path,

@@ -118,8 +118,9 @@ def with_study(text: str, study: str, *options: str) -> str:
 
 
 def in_python(text: str) -> str:
-    """Return the text with the commands in it as Python calls, and the option --force as an argument."""
-    text = re.sub(r"`hvdc-ident ([a-z]+) STUDY`", r"`hi.\1(...)`", text)
+    """Return the text with the commands in it as Python calls, and their options as arguments."""
+    text = re.sub(r"hvdc-ident ([a-z]+) STUDY(?: --to FILE)?", r"hi.\1(...)", text)
+    text = re.sub(r"--values ([a-z]+)", r'values="\1"', text)
     return text.replace("--force NAME", 'force=["NAME"]')
 
 

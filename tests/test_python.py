@@ -69,6 +69,30 @@ def test_the_fit_is_gated_and_agrees_with_scipy(report: Any, fit: Any) -> None:
     assert "unseen" in forced.fitted or forced.status == "failed"
 
 
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"T": [0.1, 10.0], "k": 2.5},
+        [("T", 0.1, 10.0), ("k", 2.5)],
+        [["T", 0.1, 10.0], ["k", {"start": 2.5}]],
+        (("T", (0.1, 10.0)), ("k", 2.5)),
+    ],
+)
+def test_bounds_may_be_a_mapping_or_a_list(parameters: Any) -> None:
+    found = hi.check(LAG, RECORD, parameters).to_dict()["candidates"]
+    assert (found["T"]["min"], found["T"]["max"], found["k"]["start"]) == (0.1, 10.0, 2.5)
+
+
+def test_python_is_told_calls_and_no_commands(tmp_path: Any) -> None:
+    hi.export(LAG, tmp_path / "lag.toml")
+    (tmp_path / "s.toml").write_text('schema = 1\n[model]\nsource = "lag.toml"\n')
+    with pytest.raises(InputError, match=r'values="given"') as caught:
+        hi.export(tmp_path / "s.toml", tmp_path / "x.toml", values="fitted")
+    assert "--values" not in str(caught.value)
+    told = str(hi.check(LAG, RECORD, {"T": (2.0, 3.0)}))
+    assert told.splitlines()[-1].endswith("`hi.check(...)`") and "hvdc-ident" not in told
+
+
 @pytest.mark.parametrize("half", [0.02, 0.9, 1.2, 3.0, 40.0, 900.0])
 def test_the_axis_of_intervals_has_ticks_on_both_sides(half: float) -> None:
     plt = pytest.importorskip("matplotlib.pyplot")
@@ -193,6 +217,10 @@ WRONG: list[tuple[str, Any]] = [
     ("wrong order", lambda: hi.fit(LAG, RECORD, {"T": (10.0, 1.0)})),
     (r"no bounds; expected \(min, max\)", lambda: hi.fit(LAG, RECORD, {"T": "a"})),
     ("is an input, not a parameter", lambda: hi.fit(LAG, RECORD, "u")),
+    (r'no parameter; expected names like "k".*got 3', lambda: hi.fit(LAG, RECORD, 3)),
+    (r"no parameter; expected .*got \('T',\)", lambda: hi.fit(LAG, RECORD, [("T",)])),
+    ("no bounds", lambda: hi.fit(LAG, RECORD, {"T": [0.1, 1.0, 10.0]})),
+    ("parameter 'T' stands there twice", lambda: hi.fit(LAG, RECORD, ["T", ("T", 0.1, 10.0)])),
     ("no data; expected", lambda: hi.fit(LAG, TIME, "T")),
     ("unknown key 'start'.*'starts'", lambda: hi.fit(LAG, RECORD, "T", start=3)),
     ("no optimiser 'lm'", lambda: hi.fit(LAG, RECORD, "T", optimiser="lm")),

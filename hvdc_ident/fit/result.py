@@ -16,6 +16,7 @@ from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.files import plain
 from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import in_python
 
 NOT_ASKED = "not a candidate"
 """Reason of a parameter that is held because it was not asked for."""
@@ -151,7 +152,7 @@ class FitResult(Shown):
             (f"{o}, {x}", *((c.get(o) or {}).get(x) for c in columns)) for o, line in self.rmse.items() for x in line
         ]
         yield Table(("RMSE of", "given", "start", "fitted"), tuple(errors)) if errors else ""
-        yield f"Next: {self.adequacy.next}" if self.adequacy is not None and self.adequacy.next else ""
+        yield f"Next: {in_python(self.adequacy.next)}" if self.adequacy is not None and self.adequacy.next else ""
 
     def _quality(self) -> str:
         """Return the verdict on the residuals, in a line."""

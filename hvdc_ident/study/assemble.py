@@ -29,7 +29,7 @@ ModelLike: TypeAlias = "AnyModel | Study | str | Path"
 DataLike: TypeAlias = "Experiment | Trajectory | Study | str | Path | Iterable[Any] | Any"
 """Experiments, a study's, a table whose columns are named like the model's inputs and outputs, or the path of one."""
 ParametersLike: TypeAlias = str | Iterable[Any] | Mapping[str, Any]
-"""Parameter names; or by name bounds (min, max), a start value, or a line as in a study's [parameters]."""
+"""Parameter names; or by name, in a mapping or as tuples, bounds (min, max), a start value, or a line as in a study's [parameters]."""
 
 
 def is_study(subject: object) -> TypeGuard[Study]:
@@ -188,19 +188,51 @@ def lines_of(parameters: ParametersLike, model: AnyModel) -> dict[str, dict[str,
     """Return the lines of a study's [parameters] that are meant.
 
     A name alone is estimated from the model's value within the model's bounds. (min, max) are bounds; where the model's value
-    lies outside them the search begins in their middle. A number is where it begins.
+    lies outside them the search begins in their middle. A number is where it begins. In a list, ("k", 0, 10) and
+    ("k", (0, 10)) are what {"k": (0, 10)} is. Raises StudyError for what is none of these.
     """
     if isinstance(parameters, str):
         parameters = (parameters,)
-    if not isinstance(parameters, Mapping):  # names, or the parameters of a fit
-        parameters = {getattr(p, "name", p): None if isinstance(p, str) else p for p in parameters}
+    if not isinstance(parameters, Mapping):
+        items = parameters if isinstance(parameters, Iterable) else (parameters,)
+        listed = [_named(item) for item in items]
+        parameters = dict(listed)
+        if len(parameters) < len(listed):
+            names = [name for name, _ in listed]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise StudyError(f"parameter '{twice}' stands there twice", where="parameters", expected="each name once")
     for name in parameters:
+        if not isinstance(name, str):
+            raise _no_parameter(name)
         if name in model.inputs and name not in model.parameters:
             raise StudyError(
                 f"'{name}' is an input, not a parameter", where="parameters", hint="an experiment's inputs"
             )
     require_known("parameter", parameters, model.parameters, f"model '{model.name}'")
     return {name: _line(name, given, model.parameters[name].value) for name, given in parameters.items()}
+
+
+def _named(item: Any) -> tuple[str, Any]:
+    """Return the name of a parameter and what is said of it. Raises StudyError for what is neither a name, a tuple, nor of a fit."""
+    if isinstance(item, str):
+        return item, None
+    if isinstance(item, Sequence) and item and isinstance(item[0], str):
+        name, *said = item
+        if len(said) in (1, 2):
+            return name, said[0] if len(said) == 1 else tuple(said)
+    name = getattr(item, "name", None)
+    if not isinstance(name, str):
+        raise _no_parameter(item)
+    return name, item
+
+
+def _no_parameter(given: Any) -> StudyError:
+    return StudyError(
+        "no parameter",
+        where="parameters",
+        expected='names like "k", bounds by name like {"k": (min, max)} or [("k", min, max)], or parameters of a fit',
+        got=repr(given)[:60],
+    )
 
 
 def _line(name: str, given: Any, value: float) -> dict[str, Any]:
