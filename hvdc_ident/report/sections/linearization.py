@@ -20,6 +20,14 @@ CHECKS = {
     "finite-difference": "differences of another step size",
 }
 """Second Jacobian that one of each method was compared with."""
+EARLIER = {
+    "verdict": "not decided",
+    "rightmost": None,
+    "unstable_roots": None,
+    "method": "an earlier version",
+    "reason": "these results are of an earlier version: hvdc-ident linearize makes them again",
+}
+"""Stands for the stability in results that have none."""
 
 
 def _render(results: Results) -> str:
@@ -60,7 +68,7 @@ def _which(given: dict[str, Any], fit: dict[str, Any], diagnosis: dict[str, Any]
 
 
 def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
-    found = data["stability"]
+    found = data.get("stability") or EARLIER
     right = f", rightmost real part {number(found['rightmost'][0])} 1/s" if found["rightmost"] else ""
     verdict = "not shown to be stable or unstable" if found["verdict"] == "not decided" else found["verdict"]
     why = "" if found["method"] == "eigenvalues of A" else f"; {text(found['method'])}{_count(found)}"
@@ -176,8 +184,10 @@ def _hertz(omega: Any) -> str:
     return number(omega / (2 * np.pi)) if isinstance(omega, int | float) else number(omega)
 
 
-def _limit(margin: dict[str, Any], factor: float = 1.0) -> tuple[str, str]:
+def _limit(margin: dict[str, Any] | None, factor: float = 1.0) -> tuple[str, str]:
     """A margin and its frequency as text; no value is no limit, and no frequency an infinite one."""
+    if margin is None:
+        return "–", ""
     if margin["value"] is None:
         return "unlimited", ""
     return number(factor * margin["value"]), "infinite" if margin["omega"] is None else _hertz(margin["omega"])
@@ -190,24 +200,24 @@ def _margins(data: dict[str, Any]) -> str:
         return ""
     page = "<h3>Margins</h3>"
     if found.get("stable") is False:
-        s = found["stability"]
+        s = found.get("stability") or EARLIER
         count = f" ({_count(s).removeprefix(': ')})" if s["verdict"] == "unstable" else ""
         page += f"<p>The closed loops are {text(s['verdict'])}{count}: they have no margins.</p>"
     elif found.get("stable") is None and found.get("loops"):
         page += (
             "<p>Whether the closed loops are stable cannot be told, so that no margins are given: "
-            f"{text(found['stability']['reason'])}.</p>"
+            f"{text((found.get('stability') or EARLIER)['reason'])}.</p>"
         )
     elif found.get("loops"):
         rows = []
         for name, m in found["loops"].items():
-            gain, lower, phase = m["gain_margin"], m["lower_gain_margin"], m["phase_margin_deg"]
+            gain, lower, phase = m["gain_margin"], m.get("lower_gain_margin"), m["phase_margin_deg"]
             delay, disk = m["delay_margin_s"], m["disk_margin"]
             rows.append(
                 [
                     text(name),
                     *_limit(gain),
-                    *(("unlimited", "") if lower["value"] == 0 else _limit(lower)),
+                    *(("unlimited", "") if lower and lower["value"] == 0 else _limit(lower)),
                     *_limit(phase),
                     _limit(delay, 1e3)[0],
                     number(m["modulus_margin"]["value"], 3),
