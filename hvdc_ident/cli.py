@@ -321,12 +321,14 @@ def convert(
         {
             "schema": 1, "file": to.as_posix(), "rows": len(written), "signals": list(written.names),
             "rows_in_file": total or len(written), "dropped": omitted, "time": [start, end], "not_recorded": gaps,
+            "notes": list(written.origin.notes),
         }
     )  # fmt: skip
     rows = f"{len(written)} rows" if len(written) == total else f"{len(written)} of {total} rows"
     dropped = f" ({omitted} of the file dropped: a third of one instant, or outside another record)" if omitted else ""
     console.say(f"{to}: {rows}{dropped}, {start:g} to {end:g} s, {len(written.names)} signals")
     console.say(*(f"{name}: {number} of {len(written)} rows not recorded" for name, number in gaps.items()))
+    console.say(*written.origin.notes)
 
 
 def models(*, console: Console) -> None:

@@ -175,10 +175,11 @@ class Experiment(Shown):
 
     @property
     def recording(self) -> dict[str, Any]:
-        """Return what became of the file's rows: {rows, dropped, jumps, time_unit, time_column, converted, not_recorded}.
+        """Return what became of the file's rows: {rows, dropped, jumps, time_unit, time_column, converted, notes, not_recorded}.
 
         rows: compared or not. dropped: of the file, left out. jumps: instants with two rows. time_unit: as the file or
-        the study says it, None where neither does (then s). not_recorded: by output the number of rows without a value.
+        the study says it, None where neither does (then s). notes: what else the reader of the file has to tell.
+        not_recorded: by output the number of rows without a value.
         """
         origin = self.measured.origin if self.measured is not None else Origin()
         gaps = {o: self.measured.gaps(o) for o in self.outputs} if self.measured is not None else {}
@@ -189,6 +190,7 @@ class Experiment(Shown):
             "time_unit": origin.time_unit or None,
             "time_column": origin.time_column or None,
             "converted": list(origin.converted),
+            "notes": list(origin.notes),
             "not_recorded": {o: n for o, n in gaps.items() if n},
         }
 
@@ -205,7 +207,7 @@ def recording_lines(recording: Mapping[str, Any]) -> list[str]:
         lines.append(f"time in {unit}, converted to s")
     elif unit == "date":
         lines.append("dates, counted in s from the first row")
-    lines += recording["converted"]
+    lines += [*recording["converted"], *recording.get("notes", ())]
     if (n := recording["jumps"]) > 0:
         lines.append(f"{n} instant{'s' if n > 1 else ''} with two rows: a jump, both kept")
     if (n := recording["dropped"]) > 0:

@@ -23,7 +23,7 @@ class Origin:
     rows: number in the file; 0 where there is none. dropped: number left out, the third and later rows of an instant and
     those that only some records of several rates cover. time_unit: as the file states it, "" where it does not; times are in
     s in any case. time_column: the column that the time came from, where it was not the first. converted: the signals whose
-    unit was changed to the model's, in words.
+    unit was changed to the model's, in words. notes: what else a reader has to tell, in words.
     """
 
     rows: int = 0
@@ -31,6 +31,7 @@ class Origin:
     time_unit: str = ""
     time_column: str = ""
     converted: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)

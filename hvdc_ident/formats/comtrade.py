@@ -2,8 +2,10 @@
 
 IEEE C37.111-1991, -1999 and -2013 (IEC 60255-24), data as ASCII, BINARY, BINARY32 or FLOAT32. The header and the data
 are taken apart by the package `comtrade`, in double precision; before it is asked, the number of channels and rows the
-header claims is held against what the file has, since the package would set memory aside for any claim. Times are
-computed here: from the sampling rates where the header gives them, else from the time stamps.
+header claims is held against what the file has, since the package would set memory aside for any claim, and the fields of
+the header that no waveform depends on are made plain (`_comtrade_header`). Times are computed here: from the sampling rates
+where the header gives them, with the pauses that the time stamps tell of, else from the time stamps. A sample outside the
+range of its channel in the header cannot be what was measured.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
 from hvdc_ident.formats._columns import check_size, damaged, decoded, own_names, package
+from hvdc_ident.formats._comtrade_header import Range, plain_header, ranges
+from hvdc_ident.formats._stamps import placed
 
 NAME = "comtrade"
 SUMMARY = "COMTRADE 1991, 1999 and 2013 of recorders and relays, ASCII, binary, float32, or all in one .cff"
@@ -32,6 +36,7 @@ SUFFIXES = (".cfg", ".cff")
 _MAX_HEADER = 32 * 1024**2  # bytes
 _MAX_CHANNELS = 100_000
 _BYTES = {"BINARY": 2, "BINARY32": 4, "FLOAT32": 4}
+_NO_STAMP = 2**32 - 1  # all bits set
 _COUNTS = re.compile(r"\s*(\d{1,6})\s*,\s*(\d{1,6})\s*A\s*,\s*(\d{1,6})\s*D\s*", re.IGNORECASE)
 _SECTION = re.compile(rb"^[ \t]*---[ \t]*file type:[ \t]*(\w+)(?:[ \t]+(\w+))?[ \t]*(?::[ \t]*(\d+))?[^\n]*---[ \t]*\r?$",
                       re.IGNORECASE | re.MULTILINE)  # fmt: skip
@@ -40,7 +45,11 @@ _REFUSALS = (ValueError, TypeError, IndexError, KeyError, AttributeError, Overfl
 
 @dataclass(frozen=True)
 class _Record:
-    """A record, its header taken apart. data: the bytes of the .dat part. names: analog channels, then digital ones."""
+    """A record, its header taken apart.
+
+    text: the header as the package is given it. data: the bytes of the .dat part. names: analog channels, then digital ones.
+    ranges: of the analog channels.
+    """
 
     path: Path
     text: str
@@ -48,6 +57,7 @@ class _Record:
     data: bytes
     names: tuple[str, ...]
     units: tuple[str, ...]
+    ranges: tuple[Range | None, ...]
 
 
 def recognises(path: Path) -> bool:
@@ -66,14 +76,16 @@ def recognises(path: Path) -> bool:
 def signals(path: Path) -> list[tuple[str, str]]:
     """Name and unit of every channel, digital ones last, without a unit."""
     text, _, _ = _parts(path, data=False)
-    _, names, units = _header(path, text)
+    _, names, units = _header(path, plain_header(text, _checked_counts(path, text)))
     return list(zip(names, units, strict=True))
 
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     """The channels, all or those named in that order: a x + b in the header's unit, digital ones 0 or 1.
 
-    Primary or secondary values as recorded. A channel's skew moves it by interpolation. Time starts at 0.
+    Primary or secondary values as recorded. A channel's skew moves it by interpolation. Time starts at 0; a pause that the
+    time stamps tell of between samples at the sampling rates is kept. One number outside the range that the header gives a
+    channel is a mark for what was not recorded: NaN. `origin.notes` tells of both, and of what is kept outside the range.
     Raises WaveformError for a header or data part that does not hold together.
     """
     record = _open(path)
@@ -81,17 +93,18 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     rows = _rows(record)
     check_size(rows, len(record.names), path)
     content = _content(record)
-    time = _time(record, content, rows)
-    analog = record.header.analog_count
-    columns = [
-        _skewed(time, content.analog[i], record.header.analog_channels[i].skew)
-        if i < analog
-        else content.status[i - analog]
-        for i in wanted
-    ]
+    time, notes = _time(record, content, rows)
+    columns = []
+    for i in wanted:
+        if i >= record.header.analog_count:
+            columns.append(content.status[i - record.header.analog_count])
+            continue
+        samples, note = _within_range(record, i, np.array(content.analog[i], dtype=float))
+        notes = (*notes, note) if note else notes
+        columns.append(_skewed(time, samples, record.header.analog_channels[i].skew))
     values = np.column_stack([np.asarray(c, dtype=float) for c in columns]) if columns else np.empty((rows, 0))
     names, units = tuple(record.names[i] for i in wanted), tuple(record.units[i] for i in wanted)
-    return Trajectory(time, values, names, units, Origin(time_unit="s"))
+    return Trajectory(time, values, names, units, Origin(time_unit="s", notes=notes))
 
 
 def files(path: Path) -> list[Path]:
@@ -115,11 +128,13 @@ def sample(path: Path) -> None:
 
 
 def _open(path: Path) -> _Record:
-    text, data, form = _parts(path)
+    stated, data, form = _parts(path)
+    counts = _checked_counts(path, stated)
+    text = plain_header(stated, counts)
     header, names, units = _header(path, text)
     if form and form != header.ft.upper():
         raise damaged(path, "the sections contradict the header", expected=f"data {header.ft}", got=form)
-    return _Record(path, text, header, data, names, units)
+    return _Record(path, text, header, data, names, units, ranges(stated, counts))
 
 
 def _parts(path: Path, data: bool = True) -> tuple[str, bytes, str]:
@@ -164,19 +179,25 @@ def _sections(path: Path) -> tuple[str, bytes, str]:
     return decoded(found["CFG"][0]), *found["DAT"]
 
 
-def _header(path: Path, text: str) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
-    """The header as the package reads it, and the names and units of all channels."""
+def _checked_counts(path: Path, text: str) -> tuple[int, int, int]:
+    """Channels, analog and digital ones. Raises WaveformError where the header does not count them, or has not as many."""
     counts = _counts(text)
+    lines = text.splitlines()
     if counts is None:
-        lines = text.splitlines()
         got = f"'{lines[1][:60]}'" if len(lines) > 1 else "no second line"
         raise damaged(path, "line 2 does not count the channels", expected="as in '3,2A,1D'", got=got)
     total, analog, digital = counts
-    if total != analog + digital or total > _MAX_CHANNELS or total > len(text.splitlines()):
+    if total != analog + digital or total > _MAX_CHANNELS or total > len(lines):
         raise damaged(path, "the number of channels does not fit", got=f"{total} channels, {analog}A, {digital}D")
+    return counts
+
+
+def _header(path: Path, text: str) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
+    """The header as the package reads it, and the names and units of all channels."""
     with _refusals(path, "the header"):
         header = package("comtrade", path).Cfg(ignore_warnings=True)
         header.read(text)
+    analog, digital = header.analog_count, header.status_count
     if header.ft.upper() not in ("ASCII", *_BYTES):
         raise damaged(path, "no such kind of data", expected="ASCII, BINARY, BINARY32 or FLOAT32", got=f"'{header.ft}'")
     _check_numbers(path, header)
@@ -195,7 +216,9 @@ def _check_numbers(path: Path, header: Any) -> None:
         raise damaged(path, "a number in the header is not finite")
     ends = [end for _, end in header.sample_rates]
     if any(rate < 0 for rate, _ in header.sample_rates) or ends != sorted(set(ends)) or ends[0] < 1:
-        raise damaged(path, "the sampling rates do not fit", expected="rates above 0, last samples that increase")
+        raise damaged(
+            path, "the sampling rates do not fit", expected="rates above 0, last samples that do not decrease"
+        )
     if not header.timestamp_critical and any(rate == 0 for rate, _ in header.sample_rates):
         raise damaged(path, "a sampling rate of 0", expected="0 rates, for time stamps that count, or rates above 0")
     if header.timemult <= 0:
@@ -209,13 +232,17 @@ def _rows(record: _Record) -> int:
     if header.ft.upper() == "ASCII":
         available = sum(1 for line in record.data.splitlines() if line.strip(b" \t\x1a"))
     else:
-        width = 8 + _BYTES[header.ft.upper()] * header.analog_count + 2 * math.ceil(header.status_count / 16)
-        available = len(record.data) // width
+        available = len(record.data) // _width(header)
     if available < claimed:
         raise damaged(
             record.path, "the data end early", expected=f"{claimed} samples as in the header", got=f"{available}"
         )
     return claimed
+
+
+def _width(header: Any) -> int:
+    """The bytes of a sample of binary data: its number, its stamp, the analog channels, 16 digital ones in a word."""
+    return int(8 + _BYTES[header.ft.upper()] * header.analog_count + 2 * math.ceil(header.status_count / 16))
 
 
 def _content(record: _Record) -> Any:
@@ -229,19 +256,52 @@ def _content(record: _Record) -> Any:
         return reader
 
 
-def _time(record: _Record, content: Any, rows: int) -> Array:
-    """(n,) in s from the first sample: sample by sample at the rates of the header, else the time stamps."""
+def _time(record: _Record, content: Any, rows: int) -> tuple[Array, tuple[str, ...]]:
+    """(n,) in s from the first sample, by the rates of the header and the pauses of the stamps, else the stamps; remarks."""
     header = record.header
     if header.timestamp_critical:
         stamps = np.asarray(content.time, dtype=float)[:rows]
-        return stamps - stamps[0]
-    steps, before = [], 1
-    for rate, end in header.sample_rates:
-        steps.append(np.full(int(end) - before, 1.0 / rate))
-        before = int(end)
-    if len(steps) == 1:  # a multiple, not a sum: no rounding adds up
-        return np.arange(rows) / header.sample_rates[0][0]
-    return np.concatenate([[0.0], np.cumsum(np.concatenate(steps))])
+        return stamps - stamps[0], ()
+    ends = [0, *(int(end) for _, end in header.sample_rates)]
+    rates = np.repeat([rate for rate, _ in header.sample_rates], np.diff(ends))[1:]
+    return placed(rates, _stamps(record, rows), header.timemult * header.time_base)
+
+
+def _stamps(record: _Record, rows: int) -> Array:
+    """(n,) the time stamps as they stand, NaN where there is none."""
+    if record.header.ft.upper() == "ASCII":
+        lines = [line for line in record.data.splitlines() if line.strip(b" \t\x1a")][:rows]
+        cells = [line.split(b",", 2)[1].strip() for line in lines]
+        stamps = np.array([float(cell) if cell else math.nan for cell in cells])
+    else:
+        row = np.dtype([("number", "<u4"), ("stamp", "<u4"), ("samples", f"V{_width(record.header) - 8}")])
+        stamps = np.frombuffer(record.data, row, rows)["stamp"].astype(float)
+    return np.where(stamps == _NO_STAMP, math.nan, stamps)
+
+
+def _within_range(record: _Record, channel: int, values: Array) -> tuple[Array, str]:
+    """The values of an analog channel, NaN where a mark stands in for one, and a remark on what lies outside its range.
+
+    A mark is one and the same number above the range, or below. Different numbers there are a signal that the header
+    gives too narrow a range: they stay.
+    """
+    limits, about = record.ranges[channel], record.header.analog_channels[channel]
+    if limits is None or about.a == 0:
+        return values, ""
+    raw = (values - about.b) / about.a
+    notes = []
+    for outside in limits.outside(raw):
+        if not outside.any():
+            continue
+        low, high = float(raw[outside].min()), float(raw[outside].max())
+        n = int(np.count_nonzero(outside))
+        samples = f"{n} sample{'s' if n > 1 else ''} outside the range of the header, {limits}"
+        if high - low <= 1e-9 * abs(high):
+            values = np.where(outside, math.nan, values)
+            notes.append(f"{samples}: {high:.10g} is taken as the mark of what was not recorded")
+        else:
+            notes.append(f"{samples}: kept, for they are different numbers, {low:.10g} to {high:.10g}")
+    return values, f"{record.names[channel]}: {'; '.join(notes)}" if notes else ""
 
 
 def _skewed(time: Array, values: Any, skew: float) -> Array:
