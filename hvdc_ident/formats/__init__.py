@@ -37,6 +37,7 @@ __all__ = [
     "once",
     "pick",
     "read_waveforms",
+    "unit_since_1970",
     "write_csv",
 ]
 
@@ -120,15 +121,19 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
 def _from_first_row(found: Trajectory) -> Trajectory:
     """The waveforms with a time since 1970 counted from the first row; others as they are.
 
-    Three years are no record's own clock. Where the file states no unit it is the largest of s, ms, us and ns that puts
-    the first row before 2100.
+    Three years are no record's own clock.
     """
     first = float(found.time[0])
     if first < LONGEST:
         return found
-    scale = 1.0 if found.origin.time_unit else next((s for s in (1.0, 1e-3, 1e-6) if first * s < _YEAR_2100), 1e-9)
+    scale = 1.0 if found.origin.time_unit else unit_since_1970(first)
     time = scaled(found.time - first, scale)
     return replace(found, time=time, origin=replace(found.origin, time_unit="date"))
+
+
+def unit_since_1970(number: float) -> float:
+    """The unit in s of a time since 1970 that a file states no unit of: the largest of s, ms, us and ns before 2100."""
+    return next((s for s in (1.0, 1e-3, 1e-6) if number * s < _YEAR_2100), 1e-9)
 
 
 def files_of(path: str | os.PathLike[str]) -> tuple[Path, ...]:

@@ -5,15 +5,24 @@ from __future__ import annotations
 import contextlib
 import datetime
 import re
+import unicodedata
 from functools import lru_cache
 
+_MONTH = r"[A-Za-z\u00c0-\u00ff]{3,10}\.?"  # a word, with accents
+_DAY_FIGURES = r"\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4}"
+_NAMED_MONTH = rf"\d{{1,2}}[-/. ]{{1,2}}{_MONTH}[-/. ]\d{{2}}(?:\d{{2}})?|{_MONTH} \d{{1,2}},? \d{{4}}"
 _CLOCK = re.compile(
-    r"(?:(?P<date>\d{4}[-/.]\d{1,2}[-/.]\d{1,2}|\d{1,2}[-/.]\d{1,2}[-/.]\d{4})[T ]\s*)?"
+    rf"(?:(?P<date>{_DAY_FIGURES}|{_NAMED_MONTH})[T ]\s*)?"
     r"(?P<h>\d{1,2}):(?P<m>\d{2}):(?P<s>\d{2})(?:[.,](?P<fraction>\d{1,12}))?"
     r"\s*(?P<half>AM|PM)?\s*(?P<zone>Z|UTC|[+-]\d{2}:?\d{2})?",
     re.ASCII | re.IGNORECASE,
 )
-_DATE = re.compile(r"\d{4}([-/.])\d{1,2}\1\d{1,2}|\d{1,2}([-/.])\d{1,2}\2\d{4}", re.ASCII)
+_DATE = re.compile(rf"\d{{4}}([-/.])\d{{1,2}}\1\d{{1,2}}|\d{{1,2}}([-/.])\d{{1,2}}\2\d{{4}}|{_NAMED_MONTH}", re.ASCII)
+_MONTHS = (
+    "jan gen ene", "feb fev", "mar mrt mrz maa", "apr avr abr", "may mai mag mei maj", "jun juin giu", "jul juil lug",
+    "aug aou ago", "sep set", "oct okt ott out", "nov", "dec dez dic",
+)  # fmt: skip
+"""How the names of the months begin in the languages that read a decimal comma or point, without accents."""
 _DAY = 86400.0  # s
 
 
@@ -23,7 +32,7 @@ def is_clock(text: str) -> bool:
 
 
 def is_date(text: str) -> bool:
-    """Return whether the text is a date alone, in figures."""
+    """Return whether the text is a date alone."""
     return _DATE.fullmatch(text) is not None
 
 
@@ -31,12 +40,12 @@ class Clock:
     """Seconds from the first time asked; a time of day that falls back has passed midnight.
 
     A date that does not begin with the year may be day first or month first: of two dates of a record the order is the
-    one that puts the later row the fewest days after the first. Days and seconds are kept apart, so that a fraction of a
-    second loses no digits to the date.
+    one that puts the later row the fewest days after the first. Days, seconds and fractions of a second are kept apart, so
+    that these lose no digits to those.
     """
 
     def __init__(self) -> None:
-        self._first: tuple[str, float] | None = None
+        self._first: tuple[str, float, float] | None = None
         self._last = 0.0
         self._midnights = 0
 
@@ -48,7 +57,7 @@ class Clock:
         if int(match["h"]) > 23 or int(match["m"]) > 59 or int(match["s"]) > 60:
             raise ValueError("no time of day")
         time_of_day = 3600.0 * int(match["h"]) + 60 * int(match["m"]) + int(match["s"]) - _zone(match["zone"])
-        time_of_day += float(f"0.{match['fraction']}") if match["fraction"] else 0.0
+        fraction = float(f"0.{match['fraction']}") if match["fraction"] else 0.0
         if match["half"]:  # 12:30 AM is half past midnight
             time_of_day += 43200.0 * ((match["half"].upper() == "PM") - (int(match["h"]) == 12))
         date = match["date"] or ""
@@ -56,10 +65,10 @@ class Clock:
         if self._first is None:
             if date:
                 _days_between(date, date)  # refuses what is none
-            self._first = (date, time_of_day)
+            self._first = (date, time_of_day, fraction)
         elif date:
             day = _days_between(self._first[0], date)
-        return day * _DAY + (time_of_day - self._first[1])
+        return day * _DAY + (time_of_day - self._first[1]) + (fraction - self._first[2])
 
     def _day_of(self, time_of_day: float) -> int:
         if time_of_day < self._last - _DAY / 2:
@@ -84,10 +93,25 @@ def _days_between(first: str, later: str) -> int:
 
 
 def _day(text: str, month_first: bool) -> int:
-    """The number of a date, year first, else day or month first."""
-    a, b, c = (int(x) for x in re.split(r"[-/.]", text))
+    """The number of a date, year first, else day or month first where the month is a figure too."""
+    words = re.split(r"[-/., ]+", text)
+    named = [word for word in words if not word.isdigit()]
+    if named:
+        words.remove(named[0])
+        day, year = (int(x) for x in words)
+        return datetime.date(year if year > 99 else 2000 + year, _month(named[0]), day).toordinal()
+    a, b, c = (int(x) for x in words)
     year, month, day = (a, b, c) if a > 31 else (c, a, b) if month_first else (c, b, a)
     return datetime.date(year, month, day).toordinal()
+
+
+def _month(name: str) -> int:
+    """The number of a month by its name, shortened or not. Raises ValueError for a word that is none."""
+    plain = unicodedata.normalize("NFKD", name.lower()).encode("ascii", "ignore").decode()
+    for number, beginnings in enumerate(_MONTHS, start=1):
+        if plain.startswith(tuple(beginnings.split())):
+            return number
+    raise ValueError(f"'{name}' is no month")
 
 
 def _zone(text: str | None) -> float:

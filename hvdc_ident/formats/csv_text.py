@@ -15,7 +15,8 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from decimal import Decimal
 from itertools import islice
 from pathlib import Path
 
@@ -23,7 +24,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Origin, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import LONGEST, event_rows, once, pick
+from hvdc_ident.formats import LONGEST, event_rows, once, pick, unit_since_1970
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
 from hvdc_ident.formats._labels import merged, names_and_units, time_column
 
@@ -39,9 +40,9 @@ _SEPARATORS = (";", "\t", ",")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _MISSING = {
     "", "nan", "-nan", "+nan", "na", "n/a", "#n/a", "#na", "#nv", "#n/d", "null", "none", "<na>", "1.#qnan", "-1.#qnan",
-    "1.#ind", "-1.#ind", "--", "---",
+    "1.#ind", "-1.#ind", "--", "---", "n. def.", "non numérique", "non un numero reale",
 }  # fmt: skip
-"""Texts, in lower case, of cells in which nothing was recorded: those that pandas reads so, and Excel's."""
+"""Texts, in lower case, of cells in which nothing was recorded: those that pandas reads so, Excel's, and .NET's."""
 _QUOTED_COMMA = re.compile(r'(?:^|,)\s*"[^",]*,[^"]*"\s*(?:,|$)')
 _EMPTY = ' \t,;"\r\n'
 _DIRECTIVE = re.compile(r'"?sep=."?', re.IGNORECASE)
@@ -54,7 +55,9 @@ class _Layout:
     """Layout of a file as its top declares it. labels: the header cells as they stand, the time's included.
 
     units: the time's included, as the header says them. time: the column of times; scale: s in its unit. date: the
-    column of dates beside it, -1 where there is none. absolute: whether its times are dates or times of day.
+    column of dates beside it, -1 where there is none. absolute: whether its times are dates or times of day. since: where
+    the times are numbers counted since 1970, that of the first row, which the readers take off before a double is made:
+    1.7e18 ns has more digits than a double.
     """
 
     path: Path
@@ -69,6 +72,7 @@ class _Layout:
     scale: float = 1.0
     date: int = -1
     absolute: bool = False
+    since: Decimal | None = None
 
     def column(self, i: int) -> str:
         return f"column {i + 1} ('{_short(self.labels[i])}')"
@@ -112,12 +116,14 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         raise WaveformError("too few rows", where=str(path), expected="at least 2 rows of numbers", got=f"{len(table)}")
     _check_times(layout, table[:, 0])
     names = tuple(signals) if signals is not None else tuple(layout.names[i] for i in known)
-    unit = "date" if layout.absolute else layout.units[layout.time]
+    dated = layout.absolute or layout.since is not None
+    unit = "date" if dated else layout.units[layout.time]
     origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "")
-    time, first = table[:, 0], table[0, 0] * layout.scale
-    if unit and first >= LONGEST:  # since 1970: taken off before the unit is, for a double has no digits to lose there
-        time, origin = time - time[0], replace(origin, time_unit="date")
-    time = scaled(time, layout.scale)
+    scale = layout.scale
+    if layout.since is not None and not layout.units[layout.time]:
+        scale = unit_since_1970(float(layout.since))
+    time = table[:, 0] - table[0, 0] if dated else table[:, 0]
+    time = scaled(time, scale)
     return once(Trajectory(time, table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]), origin))
 
 
@@ -156,7 +162,7 @@ def _layout(path: Path) -> _Layout:
         labels[0] = "row"  # the index that some packages write first and without a name
     _check_labels(labels, path, number)
     names, units = names_and_units(labels)
-    cells = [c.strip(' "') for c in row.split(separator)]
+    cells = [c.strip(' "') for c in _split(row, separator)]
     absolute, date = False, -1
     if len(cells) >= len(labels) > 1:
         absolute = is_clock(cells[time])
@@ -175,9 +181,16 @@ def _layout(path: Path) -> _Layout:
             got=f"'{_short(labels[time])}'",
             hint="put the column of times first, or name it 'time [s]'",
         )
+    since = None if absolute or len(cells) <= time else _since_1970(cells[time], scale)
     return _Layout(
-        path, encoding, number, separator, trailing, tuple(labels), names, units, time, scale, date, absolute
+        path, encoding, number, separator, trailing, tuple(labels), names, units, time, scale, date, absolute, since
     )
+
+
+def _since_1970(cell: str, scale: float) -> Decimal | None:
+    """The time of a cell where it is a number counted since 1970, else None. scale: s in its unit."""
+    text = cell if "." in cell else cell.replace(",", ".", 1)
+    return Decimal(text) if _NUMBER.fullmatch(text) and float(text) * scale >= LONGEST else None
 
 
 def _is_row(line: str) -> bool:
@@ -324,13 +337,23 @@ def _check_labels(labels: Sequence[str], path: Path, line: int) -> None:
 def _fast(layout: _Layout, columns: list[int]) -> Array | None:
     """(n, columns) the numbers, or None where anything about the file is not as it should be."""
     try:
-        table = np.loadtxt(_rows(layout), delimiter=layout.separator, comments=None, ndmin=2, dtype=float)
+        table = np.loadtxt(
+            _rows(layout), delimiter=layout.separator, comments=None, ndmin=2, dtype=float, encoding=None,
+            converters=None if layout.since is None else {layout.time: lambda cell: _after(cell.strip(), layout.since)},
+        )  # fmt: skip
     except (ValueError, StopIteration):
         return None
     if table.shape[1] != len(layout.labels):
         return None
     table = table[:, columns] if columns != list(range(table.shape[1])) else table
     return table if np.isfinite(table[:, 0]).all() and not np.isinf(table).any() else None
+
+
+def _after(cell: str, since: Decimal | None) -> float:
+    """The number of a cell less `since`, taken off in decimal figures. Raises ValueError where it is no number."""
+    if since is None or not _NUMBER.fullmatch(cell):
+        return float(cell)
+    return float(Decimal(cell) - since)
 
 
 def _rows(layout: _Layout) -> Iterator[str]:
@@ -414,19 +437,25 @@ def _clock_time(clock: Clock, cell: str, layout: _Layout, line: int) -> float:
         raise WaveformError(
             f"{error} where the time stands",
             where=f"{layout.path}, line {line}, {layout.column(layout.time)}",
-            expected="as in 2026-11-21 10:15:00.020 (or 21/11/2026, day first)",
+            expected="as in 2026-11-21 10:15:00.020, 21/11/2026 10:15:00 or 21-Nov-2026 10:15:00",
             got=f"'{_short(cell)}'",
             hint="write the time in seconds",
         ) from None
 
 
 def _cells(line: str, layout: _Layout) -> list[str]:
-    cells = line.split(layout.separator)
-    if layout.separator == "," and _QUOTED_COMMA.search(line):
-        (cells,) = csv.reader([line], skipinitialspace=True)
+    cells = _split(line, layout.separator)
     if layout.trailing and len(cells) == len(layout.labels) + 1 and not cells[-1].strip():
         cells.pop()
     return [cell.strip().strip('"').strip() for cell in cells]
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    """The cells of a line, at its separators outside quotes where there are commas in quotes."""
+    if separator == "," and _QUOTED_COMMA.search(line):
+        (cells,) = csv.reader([line], skipinitialspace=True)
+        return cells
+    return line.split(separator)
 
 
 def _ragged(layout: _Layout, line: int, got: int) -> WaveformError:
@@ -442,13 +471,22 @@ def _ragged(layout: _Layout, line: int, got: int) -> WaveformError:
 
 
 def _number(cell: str, layout: _Layout, line: int, column: int) -> float:
-    value = float(cell) if _NUMBER.fullmatch(cell) else math.nan
+    since = layout.since if column == layout.time else None
+    value = _after(cell, since) if _NUMBER.fullmatch(cell) else math.nan
     if math.isfinite(value) or (column != layout.time and cell.lower() in _MISSING):
         return value
     lowered = cell.lower().lstrip("+-")
     what = "an empty cell" if not cell else "a value that is not finite" if lowered[:3] in ("nan", "inf") else "text"
     if _NUMBER.fullmatch(cell):
         what = "a number too large"
+    if column == layout.time and ":" in cell:
+        raise WaveformError(
+            "the time is a date in no known form",
+            where=f"{layout.path}, line {line}, {layout.column(column)}",
+            expected="as in 2026-11-21 10:15:00.020, 21/11/2026 10:15:00 or 21-Nov-2026 10:15:00; or a number",
+            got=f"'{_short(cell)}'",
+            hint="write the dates with the month as a number, or the time in seconds",
+        )
     raise WaveformError(
         f"{what} where a number belongs",
         where=f"{layout.path}, line {line}, {layout.column(column)}",
