@@ -139,15 +139,14 @@ class Work:
     """Options of the stages' work."""
 
     workers: Annotated[
-        int,
+        int | None,
         option(
             "--workers",
             "N",
-            "Processes to work with, at most 4096.",
-            show_default=True,
+            "Processes to work with, at most 4096; default one for each core, once the work has taken longer than their start.",
             parser=_number("--workers", "", "2", 1, 4096, whole=True),
         ),
-    ] = 1
+    ] = None
     executor: Annotated[str, option("--executor", "WHERE", "local, or dask://HOST:PORT: where the work is done.")] = ""
     seed: Seed = 0
 

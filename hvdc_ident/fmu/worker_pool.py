@@ -26,7 +26,18 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError, require_known
 from hvdc_ident.fmu.archive import Folder, shared_folder, unpacked_folder
 from hvdc_ident.fmu.description import Description, Setup
-from hvdc_ident.processes import MIB, Budget, ChildProcess, Ending, Message, Supervisor, Watch, packed, unpacked
+from hvdc_ident.processes import (
+    MIB,
+    Budget,
+    ChildProcess,
+    Ending,
+    Message,
+    Supervisor,
+    Watch,
+    available_cores,
+    packed,
+    unpacked,
+)
 from hvdc_ident.processes.server import is_worker
 from hvdc_ident.processes.supervisor import last_line
 
@@ -429,12 +440,11 @@ def idle_cores(busy: int) -> int:
     """
     if is_worker() or multiprocessing.parent_process() is not None:
         return 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         others = max(os.getloadavg()[0] - busy, 0.0)
     except OSError:
         others = 0.0
-    return max(1, round(cores - others))
+    return max(1, round(available_cores() - others))
 
 
 CALL = re.compile(r"\b(fmi[23][A-Z]\w*)\s*\(|\b_(dlopen)\(")

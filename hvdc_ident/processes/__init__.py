@@ -4,7 +4,25 @@ They are forked from a process that has loaded what they need (`Supervisor`), en
 killed, and it is said how they ended. FMUs' machine code and the work of pools run in them.
 """
 
+import os
+
 from hvdc_ident.processes.messages import Message, packed, unpacked
 from hvdc_ident.processes.supervisor import MIB, Budget, ChildProcess, Ending, Supervisor, Watch
 
-__all__ = ["MIB", "Budget", "ChildProcess", "Ending", "Message", "Supervisor", "Watch", "packed", "unpacked"]
+__all__ = [
+    "MIB",
+    "Budget",
+    "ChildProcess",
+    "Ending",
+    "Message",
+    "Supervisor",
+    "Watch",
+    "available_cores",
+    "packed",
+    "unpacked",
+]
+
+
+def available_cores() -> int:
+    """Return the number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

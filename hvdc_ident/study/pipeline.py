@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.executor import Progress, StageProgress
 from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
+from hvdc_ident.model import Model
 from hvdc_ident.study.checks import steady_notes, violations
 from hvdc_ident.study.executors import open_executor
 from hvdc_ident.study.quiescent_levels import quiescent_levels
@@ -24,6 +25,7 @@ from hvdc_ident.study.study import Study
 if TYPE_CHECKING:
     from hvdc_ident.study.executors.dask import DaskPool
     from hvdc_ident.study.executors.local import OpenPool
+    from hvdc_ident.study.executors.patient import PatientPool
 
 
 SCHEMA = 1
@@ -263,23 +265,28 @@ def _mark(study: Study, wanted: Stage, folder: Path, options: StageOptions) -> s
 
 
 @contextmanager
-def workers_of(options: StageOptions) -> Iterator[OpenPool | DaskPool | None]:
-    """The pool the options ask for; None where the work stays in this process."""
-    with open_executor(options.executor, options.workers) as pool:
+def workers_of(study: Study, options: StageOptions) -> Iterator[OpenPool | PatientPool | DaskPool | None]:
+    """The pool the options ask for; None where the work stays in this process.
+
+    An FMU has processes of its own, which share the cores; some FMUs run in one process only. More are started where they
+    are asked for.
+    """
+    workers = 1 if options.workers is None and not isinstance(study.model, Model) else options.workers
+    with open_executor(options.executor, workers) as pool:
         yield pool
 
 
 @contextmanager
 def executor_of(
     study: Study, options: StageOptions, name: str
-) -> Iterator[CachingExecutor | OpenPool | DaskPool | None]:
+) -> Iterator[CachingExecutor | OpenPool | PatientPool | DaskPool | None]:
     """An executor for a stage's work of that name, whose finished pieces are kept where the options name a folder.
 
     The name tells apart the kinds of work of a study; the study's files, the seed and what is forced tell apart its
     states.
     """
     with ExitStack() as stack:
-        pool = stack.enter_context(workers_of(options))
+        pool = stack.enter_context(workers_of(study, options))
         if options.folder is None:
             yield pool
             return

@@ -27,6 +27,18 @@ class Job:
         return x * x
 
 
+class OnlyIn:
+    """Squares numbers in one process, and fails in every other one."""
+
+    def __init__(self, process):
+        self.process = process
+
+    def __call__(self, x):
+        if os.getpid() != self.process:
+            raise RuntimeError("only one process may hold the licence")
+        return x * x
+
+
 class Unloadable:
     """Cannot be made in a worker."""
 

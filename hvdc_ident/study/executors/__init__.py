@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.study.executors.local import LocalPool, OpenPool
+from hvdc_ident.processes import available_cores
+from hvdc_ident.study.executors.local import LocalPool, OpenPool, can_start
+from hvdc_ident.study.executors.patient import PatientPool, beginning
 
 if TYPE_CHECKING:
     from hvdc_ident.study.executors.dask import DaskPool
 
 
-__all__ = ["LocalPool", "check_executor", "open_executor"]
+__all__ = ["LocalPool", "PatientPool", "check_executor", "open_executor"]
 
 
 LOCAL = "local"
@@ -33,15 +35,20 @@ def check_executor(name: str) -> None:
 
 
 @contextmanager
-def open_executor(name: str, workers: int) -> Iterator[OpenPool | DaskPool | None]:
+def open_executor(name: str, workers: int | None) -> Iterator[OpenPool | PatientPool | DaskPool | None]:
     """Yield the executor, open; None where the work stays in this process.
 
     name: "" or "local" for this machine, with so many workers; "dask://HOST:PORT" or "dask+tls://HOST:PORT" for the
-    workers of a dask scheduler. Raises InputError for another name, or where the scheduler cannot be used.
+    workers of a dask scheduler. workers: None for one on each core available to this process, once the work has proved long
+    enough, and for as long as it takes. Raises InputError for another name, or where the scheduler cannot be used.
     """
     check_executor(name)
     if name in ("", LOCAL):
-        if workers <= 1:
+        if workers is None and can_start() and available_cores() > 1:
+            with closing(PatientPool(LocalPool(available_cores(), timeout=None), beginning())) as patient:
+                yield patient
+            return
+        if workers is None or workers <= 1:
             yield None
             return
         with LocalPool(workers).open() as pool:

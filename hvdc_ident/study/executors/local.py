@@ -247,6 +247,11 @@ class _Session:
             self.queue.appendleft((index, item))
 
 
+def can_start() -> bool:
+    """Return whether this process can start workers."""
+    return sys.platform == "linux" and not is_worker()
+
+
 def _supervisor() -> Supervisor:
     """Return what starts this process's workers, with the environment of its first pool. Raises InputError, ComputationError."""
     global _shared

@@ -31,7 +31,8 @@ def unheard(lines: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class StageOptions:
-    """Options of a run. workers: processes; seed: of every random number; progress: who is told.
+    """Options of a run. workers: processes, None for one on each available core where the work is long enough; seed: of every
+    random number; progress: who is told.
 
     announce: who is told, in lines, what to know before the work begins, or while a long one goes on.
     keep: who writes a first answer, so that it stands where the work is interrupted; the stage runner sets it.
@@ -40,7 +41,7 @@ class StageOptions:
     answer at any time begins nothing further; None: as the study says.
     """
 
-    workers: int = 1
+    workers: int | None = 1
     seed: int = 0
     progress: Progress = silent
     force: tuple[str, ...] = ()

@@ -68,6 +68,7 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     from hvdc_ident.fit import Problem
     from hvdc_ident.fit.frequency_data import with_responses
     from hvdc_ident.identifiability.pilot_fit import cramer_rao_bounds
+    from hvdc_ident.processes import available_cores
     from hvdc_ident.study.study import candidate_lines
     from hvdc_ident.text import duration
 
@@ -78,7 +79,7 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     except SimulationError as error:
         options.announce([f"There is no first answer at the given values: {error}"])
         return
-    rest = starts * A_START * first.seconds / options.workers
+    rest = starts * A_START * first.seconds / (options.workers or available_cores())
     if rest < SOON:
         return
     about = (

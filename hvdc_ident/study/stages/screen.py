@@ -34,7 +34,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             expected="min and max",
             hint=f"{open_ended[0]} = {{min = ..., max = ...}}, or leave it out of [screening] parameters",
         )
-    with workers_of(options) as pool:
+    with workers_of(study, options) as pool:
         common: dict[str, Any] = {
             "against": asked.against,
             "values": study.given,

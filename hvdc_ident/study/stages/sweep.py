@@ -33,7 +33,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         need_experiments(study, "sweep")
     with (
         Store(options.folder) if options.folder is not None else nullcontext() as store,
-        workers_of(options) as pool,
+        workers_of(study, options) as pool,
     ):
         result = sweep(
             study.model,
