@@ -83,7 +83,7 @@ def check_size(rows: int, columns: int, path: Path) -> None:
 
 
 def package(name: str, path: Path) -> Any:
-    """The package, imported; WaveformError naming the extra where it is not installed."""
+    """The package, imported; WaveformError naming the extra, with which all of them come, where it is not installed."""
     try:
         return importlib.import_module(name)
     except ImportError:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +25,22 @@ def sample(module: Format, tmp_path: Path) -> Path:
     path = tmp_path / f"sample{module.SUFFIXES[0]}"
     module.sample(path)
     return path
+
+
+def test_a_plain_installation_reads_every_format_but_parquet() -> None:
+    """What a reader imports late is a dependency, and the extra `formats` has what is left."""
+    root = Path(__file__).resolve().parents[2]
+    project = tomllib.loads((root / "pyproject.toml").read_text("utf-8"))["project"]
+    late = {
+        name
+        for file in (root / "hvdc_ident" / "formats").glob("*.py")
+        for name in re.findall(r'package\("(\w+)', file.read_text("utf-8"))
+    }
+    plain, extra = (
+        {re.split(r"[<>=]", d)[0] for d in listed}
+        for listed in (project["dependencies"], project["optional-dependencies"]["formats"])
+    )
+    assert {"comtrade", "h5py"} <= plain and late - plain == extra == {"pyarrow"}
 
 
 def test_there_are_formats() -> None:

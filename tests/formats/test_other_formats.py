@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -54,7 +55,6 @@ def test_structures_of_two_rates_are_joined_over_the_finer(tmp_path: Path) -> No
 
 
 def test_version_7_3(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py")
     path = tmp_path / "s.mat"
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in (("t", TIME[None, :]), ("y", Y[None, :]), ("u", np.vstack([Y, -Y]))):
@@ -101,7 +101,7 @@ def test_times_that_are_none_are_refused_alike(tmp_path: Path, times: list[float
         (tmp_path / name).write_text('PGB(1) Output Desc="y" Group="" Max=2.0 Min=-2.0 Units=""\n', "utf-8")
         (tmp_path / "a_01.out").write_text("\n" + "".join(f"{t} 0.0\n" for t in times), "utf-8")
     elif name == "a.h5":
-        with pytest.importorskip("h5py").File(tmp_path / name, "w") as file:
+        with h5py.File(tmp_path / name, "w") as file:
             file["time"], file["y"] = times, y
     else:
         from scipy.io import savemat
@@ -126,7 +126,6 @@ def test_netcdf_of_both_kinds(tmp_path: Path) -> None:
 
 
 def test_hdf5_groups_without_a_time_use_the_one_above(tmp_path: Path) -> None:
-    h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["time"] = TIME
         file["left/P"] = Y

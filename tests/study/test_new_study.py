@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -232,7 +233,6 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
     """Names that would end a comment, a string or a table of the study: they come back as they were, and add nothing."""
     evil = ['x"]\n[fit]\nstarts = 1 #', "y\u2028[diagnose]", "a\\", "=1+1", "näme 7"]
     path = tmp_path / "evil.hdf5"
-    h5py = pytest.importorskip("h5py")
     with h5py.File(path, "w") as file:
         file["time"] = np.arange(50) * 0.01
         for number, name in enumerate((*evil, "Vdc1")):
