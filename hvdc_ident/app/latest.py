@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from nicegui import background_tasks, run
+from nicegui import background_tasks, context, run
 
 REST = 0.25
 """Seconds without a request, after which what takes longer than a frame begins."""
@@ -35,7 +35,7 @@ class Latest:
         self._number += 1
         if not self._busy:
             self._busy = True
-            background_tasks.create(self._catch_up())
+            background_tasks.create(self._catch_up(), context=context.client)  # which shows what it raises
 
     async def _catch_up(self) -> None:
         try:

@@ -130,8 +130,10 @@ def _page(desk: Desk) -> None:
     """Build the page for a browser that has come."""
     from nicegui import ui
 
+    from hvdc_ident.app.page_errors import show_errors
     from hvdc_ident.app.plot import HEAD
 
+    show_errors()
     ui.add_head_html(HEAD)
     ui.colors(primary="#1f5fa8", negative="#d64545")
     with ui.header().classes("items-center q-py-none"):

@@ -237,10 +237,17 @@ class Mapper:
         await self._guarded(keep)
 
     async def _choose_model(self, source: str) -> None:
-        model = await run.io_bound(hi.load_model, source, self._desk.trust)
-        self._desk, self._source = replace(self._desk, model=model, source=source), source
-        if self._map is not None and self._record is not None:
-            await self._propose(Path(self._map.data), self._map.data, self._record)
+        """Map the recording to another model; where that fails, the one before stays, and is the one that is shown."""
+        before = self._desk, self._source
+        try:
+            model = await run.io_bound(hi.load_model, source, trust=self._desk.trust)
+            self._desk, self._source = replace(self._desk, model=model, source=source), source
+            if self._map is not None and self._record is not None:
+                await self._propose(Path(self._map.data), self._map.data, self._record)
+        except Exception:
+            self._desk, self._source = before
+            self._show_files()
+            raise
 
     # --- the file ---
 
@@ -367,6 +374,8 @@ class Mapper:
         self._files.set_options(files, value=self._map.data if self._map and self._map.data in files else None)
         self._files.visible = bool(files)
         self._model.visible = study is None
+        if study is None:
+            self._model.value = self._source
 
     def _show(self) -> None:
         """Show all of what is open."""
@@ -629,10 +638,10 @@ class Mapper:
         self._ask_which(f"Changes to '{self._map.name}' are not written.", ways)
 
     def _in_background(self, work: Callable[[], Awaitable[None]]) -> None:
-        background_tasks.create(self._guarded(work))
+        background_tasks.create(self._guarded(work), context=self._place)
 
     async def _guarded(self, work: Callable[[], Awaitable[None]]) -> None:
-        """Do some work; an error of the package is told on the page."""
+        """Do some work; an error of the package is told beside the fields, any other as `page_errors` shows it."""
         with self._place:
             self._trouble.text = ""
             self._working += 1
