@@ -29,6 +29,11 @@ class Range:
     low_digit: float
     high_digit: float
 
+    @property
+    def digit(self) -> float:
+        """Return the smaller of the two units."""
+        return min(self.low_digit, self.high_digit)
+
     def outside(self, raw: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return (n,) which samples lie below and which above, by a unit of the limit's last digit at least.
 

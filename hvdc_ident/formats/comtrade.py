@@ -200,7 +200,8 @@ def _header(path: Path, text: str) -> tuple[Any, tuple[str, ...], tuple[str, ...
     analog, digital = header.analog_count, header.status_count
     if header.ft.upper() not in ("ASCII", *_BYTES):
         raise damaged(path, "no such kind of data", expected="ASCII, BINARY, BINARY32 or FLOAT32", got=f"'{header.ft}'")
-    _check_numbers(path, header)
+    with _refusals(path, "a number in the header"):
+        _check_numbers(path, header)
     channels = [*header.analog_channels, *header.status_channels]
     plain = [c.name.strip() or f"{'A' if i < analog else 'D'}{c.n}" for i, c in enumerate(channels)]
     double = {name for name in plain if plain.count(name) > 1} if len(set(plain)) < len(plain) else set()
@@ -211,7 +212,8 @@ def _header(path: Path, text: str) -> tuple[Any, tuple[str, ...], tuple[str, ...
 
 def _check_numbers(path: Path, header: Any) -> None:
     numbers = [x for c in header.analog_channels for x in (c.a, c.b, c.skew)]
-    numbers += [x for rate in header.sample_rates for x in rate] + [header.timemult]
+    numbers += [x for rate in header.sample_rates for x in rate] + [2.0**64 * header.timemult]
+    numbers += [end / rate for rate, end in header.sample_rates if rate]
     if not all(map(math.isfinite, numbers)):
         raise damaged(path, "a number in the header is not finite")
     ends = [end for _, end in header.sample_rates]
@@ -276,7 +278,7 @@ def _stamps(record: _Record, rows: int) -> Array:
     else:
         row = np.dtype([("number", "<u4"), ("stamp", "<u4"), ("samples", f"V{_width(record.header) - 8}")])
         stamps = np.frombuffer(record.data, row, rows)["stamp"].astype(float)
-    return np.where(stamps == _NO_STAMP, math.nan, stamps)
+    return np.where((stamps == _NO_STAMP) | (np.abs(stamps) >= 2.0**53), math.nan, stamps)
 
 
 def _within_range(record: _Record, channel: int, values: Array) -> tuple[Array, str]:
@@ -286,7 +288,9 @@ def _within_range(record: _Record, channel: int, values: Array) -> tuple[Array, 
     gives too narrow a range: they stay.
     """
     limits, about = record.ranges[channel], record.header.analog_channels[channel]
-    if limits is None or about.a == 0:
+    if (
+        limits is None or not np.spacing(abs(about.b)) < 1e-6 * abs(about.a) * limits.digit
+    ):  # else the offset swallows it
         return values, ""
     raw = (values - about.b) / about.a
     notes = []

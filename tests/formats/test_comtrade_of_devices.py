@@ -205,6 +205,22 @@ def test_different_numbers_outside_the_range_are_a_signal_and_told(tmp_path: Pat
     assert "kept, for they are different numbers, 8300 to 8400" in found.origin.notes[0]
 
 
+@pytest.mark.parametrize("scale", ["0,-3", "1e-18,-3", "1e-310,-3"])
+def test_samples_that_the_offset_swallows_have_no_marks(tmp_path: Path, scale: str) -> None:
+    head = header("1\n500,3").replace("0.25,-3", scale)
+    found = read_waveforms(put(tmp_path, head, rows([0, 2000, 4000], [1, 40000, 3])))
+    np.testing.assert_allclose(found["Idc"], -3.0, rtol=1e-12)
+    assert found.origin.notes == ()
+
+
+@pytest.mark.parametrize(
+    "change", [("1\n500,3", "1\n1e-310,3"), ("ASCII\n1\n", "ASCII\n1e300\n"), ("500,3", f"500,{10**400}")]
+)
+def test_times_beyond_all_numbers_are_refused(tmp_path: Path, change: tuple[str, str]) -> None:
+    with pytest.raises(WaveformError, match="a number in the header"):
+        read_waveforms(put(tmp_path, header("1\n500,3").replace(*change), rows([0, 2000, 4000])))
+
+
 @pytest.mark.parametrize("limits", ["0,0", "8191,-8192", ",", "none,none", "nan,nan", "-inf,inf"])
 def test_a_header_without_a_range_makes_no_marks(tmp_path: Path, limits: str) -> None:
     head = header("1\n500,3").replace("-8192,8191", limits)
