@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.nonsmooth import SLIGHT, roughness, trend_of
 from hvdc_ident.fit.uncertainty import TWO_SIDED
 from hvdc_ident.identifiability.assess import identifiability
+from hvdc_ident.study.checks import violations
 from tests.fit.simulators import Closed, decay, parameters, recorded
 
 T = np.linspace(0.0, 3.0, 31)
@@ -97,6 +99,24 @@ def test_the_starts_of_a_rough_cost_end_on_teeth_of_one_optimum():
     assert result.status == "converged"
     assert "no step reaches" not in "".join(s.message for s in result.starts)
     assert "jump from one parameter value to the next" in str(result)
+
+
+@pytest.mark.parametrize(("formula", "seed"), [(saw(1e-2), 0), (late(0.1), 2)], ids=["rows apart", "rows together"])
+def test_the_trends_estimate_is_plausible_though_a_start_ended_lower(formula, seed):
+    """The interval of the trend holds the truth; the lowest local minimum that a start found is no better answer."""
+    result = fit(problem(seed, formula), starts=6)
+    told = result.to_dict()
+    assert result.status == "converged" and all(low <= TRUTH[n] <= high for n, (low, high) in intervals(told).items())
+    assert min(s.cost for s in result.starts) < result.cost - TWO_SIDED
+    assert violations("fit", told) == []
+    far = copy.deepcopy(told)  # beyond what luck explains, and not within the intervals
+    far["starts"][1] |= {"cost": told["cost"] - 100.0, "end": {"a": 3.0, "k": 1.5}}
+    assert len(violations("fit", far)) == 1
+    assert len(violations("fit", told | {"roughness": {}})) == 1  # of a smooth cost the lowest point is the optimum
+
+
+def intervals(told):
+    return {n: e["ci95"] for n, e in told["estimates"].items()}
 
 
 def test_the_profile_of_a_rough_cost_is_its_trends():
