@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import re
@@ -11,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,16 @@ from hvdc_ident.errors import ComputationError, InputError, ModelError
 from hvdc_ident.fmu.archive import check_archive, check_identifier, unpack
 from hvdc_ident.fmu.description import has_sources, parsed
 
+LIBRARY = "compiled.library"
 COMPILERS = ("cc", "gcc", "clang")
 EXPORT_FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden")
 LANGUAGES = {"C89", "C90", "C99", "C11", "C17", "C23"}
 TIME_LIMIT = 600  # s for one binary: Dymola's sources are a single file of 100 000 lines
+PLAIN_NAMES = ("-DFMI2_FUNCTION_PREFIX=", "-DFMI2_OVERRIDE_FUNCTION_PREFIX", "-DFMI3_OVERRIDE_FUNCTION_PREFIX")
+"""Definitions that give functions the names of a shared library, fmi2DoStep. Sources are meant to be linked with others
+too, where the functions' names begin with the model's."""
+UNDEFINED = re.compile(r"undefined (?:reference to|symbol:?) [`'\"]?_?(\w+)")
+"""A symbol that the linker did not find, in the words of GNU, LLVM and Apple."""
 
 
 def compiler() -> list[str] | None:
@@ -68,7 +75,7 @@ def compile_fmu(path: Path, target: Path | None = None) -> Path:
 
     target: default, the name with "-compiled" beside the old file, which is never changed. The compiler runs, the FMU
     does not. Raises InputError without sources, without a compiler or where the target exists, ComputationError where
-    the compiler refuses the sources.
+    the compiler refuses the sources, or the binary made of them lacks functions of FMI.
     """
     new = target or path.with_name(f"{path.stem}-compiled.fmu")
     names = check_archive(path)
@@ -88,7 +95,8 @@ def compile_fmu(path: Path, target: Path | None = None) -> Path:
         for build in description.buildConfigurations or [_default_build(description, Path(place, "sources"))]:
             identifier = check_identifier(path, build.modelIdentifier)
             library = f"binaries/{binary_folder(description.fmiVersion)}/{identifier}{library_suffix()}"
-            binaries[library] = _binary(command, Path(place), build.sourceFileSets, path)
+            needed = _functions(description, identifier)
+            binaries[library] = _binary(command, Path(place), build.sourceFileSets, path, identifier, needed)
         _write(path, new, binaries)
     return new
 
@@ -107,8 +115,23 @@ def _default_build(description: Any, sources: Path) -> Any:
     )
 
 
-def _binary(command: list[str], folder: Path, sets: list[Any], path: Path) -> bytes:
-    """Return the shared library of an unpacked FMU's sets of source files."""
+def _functions(description: Any, identifier: str) -> list[str]:
+    """Return the functions of FMI that the library of a model identifier has to have: those that FMPy binds."""
+    from fmpy.fmi2 import FMU2Model, FMU2Slave
+    from fmpy.fmi3 import FMU3Model, FMU3Slave
+
+    two = description.fmiMajorVersion == 2
+    bindings = {"modelExchange": FMU2Model if two else FMU3Model, "coSimulation": FMU2Slave if two else FMU3Slave}
+    offered = [
+        b for kind, b in bindings.items() if identifier == getattr(getattr(description, kind), "modelIdentifier", None)
+    ]
+    return sorted({n for b in offered for n in dir(b) if n.startswith(f"fmi{description.fmiMajorVersion}")})
+
+
+def _binary(
+    command: list[str], folder: Path, sets: list[Any], path: Path, identifier: str, needed: Sequence[str]
+) -> bytes:
+    """Return the shared library of an unpacked FMU's sets of source files, with the functions that are needed."""
     import fmpy
 
     sources, headers = folder / "sources", Path(fmpy.__file__).parent / "c-code"
@@ -122,26 +145,67 @@ def _binary(command: list[str], folder: Path, sets: list[Any], path: Path) -> by
     includes = [f"-I{f}" for f in (sources, *(sources / d for d in sets[0].includeDirectories), headers)]
     defines = [f"-D{d.name}={d.value or ''}" for d in sets[0].preprocessorDefinitions]
     standard = [f"-std=gnu{sets[0].language[1:]}"] if sets[0].language else []
-    flags = ["-shared", "-fPIC", "-O2", "-w", *standard, *defines, *includes]
+    flags = ["-shared", "-fPIC", "-O2", "-w", *standard, *PLAIN_NAMES, *defines, *includes]
     hint = "its maker knows which headers or compiler they need; else have it exported for this machine"
     refusal = "the C compiler refuses the FMU's sources", str(path), hint
-    return _library(command, [*flags, *map(str, files)], folder, refusal)
+    arguments = [*flags, *map(str, files)]
+    library = _library(command, arguments, folder, refusal)
+    lacking = _lacking(command, folder, needed)
+    if lacking and set(lacking) <= set(needed):  # sources that define the prefix themselves: plain names beside theirs
+        aliases = [f"-Wl,--defsym,{n}={identifier}_{n}" for n in lacking]
+        with contextlib.suppress(ComputationError):  # there are no such functions either
+            library = _library(command, [*arguments, *aliases], folder, refusal)
+            lacking = _lacking(command, folder, needed)
+    if lacking:
+        some = ", ".join(lacking[:4]) + (f" and {len(lacking) - 4} more" if len(lacking) > 4 else "")
+        raise ComputationError(
+            "the binary made of the FMU's sources cannot be loaded",
+            where=str(path),
+            expected=f"the {len(needed)} functions of FMI that its interfaces have, and all that its own code calls",
+            got=f"without {some}",
+            hint="its maker knows which files and libraries they are in; else have it exported for this machine",
+        )
+    return library
+
+
+def _lacking(command: list[str], folder: Path, needed: Sequence[str]) -> list[str]:
+    """Return the symbols that the library just made lacks: functions that are needed, or that it calls itself.
+
+    The linker tells; nothing of the library is run.
+    """
+    if not needed:
+        return []
+    lines = [*(f"void {n}(void);" for n in needed), f"void (*needed[])(void) = {{{', '.join(needed)}}};"]
+    (folder / "needed.c").write_text("\n".join([*lines, "int main(void) { return needed[0] == 0; }"]) + "\n")
+    line = [*command, "needed.c", LIBRARY, "-lm", "-o", "needed"]
+    run = _compiler_run(line, folder)
+    if run.returncode == 0:
+        return []
+    return list(dict.fromkeys(UNDEFINED.findall(run.stderr))) or [_first_error(run)]
 
 
 def _library(command: list[str], arguments: list[str], folder: Path, refusal: tuple[str, str, str]) -> bytes:
     """Return the shared library that the compiler makes. refusal: what, where and hint of the error where it makes none."""
-    library = folder / "compiled.library"
-    line = [*command, *arguments, "-lm", "-o", library.name]
-    try:
-        run = subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT, check=False)
-    except (OSError, subprocess.TimeoutExpired) as e:
-        raise ComputationError("the C compiler did not run", where=shlex.join(command), got=str(e)[:200]) from None
+    library = folder / LIBRARY
+    run = _compiler_run([*command, *arguments, "-lm", "-o", library.name], folder)
     if run.returncode or not library.is_file():
-        errors = re.findall(r"error: (.*)", run.stderr) or run.stderr.strip().splitlines()
-        got = str(errors[0])[:300] if errors else f"exit code {run.returncode}"
         what, where, hint = refusal
-        raise ComputationError(what, where=where, got=got, hint=hint)
+        raise ComputationError(what, where=where, got=_first_error(run), hint=hint)
     return library.read_bytes()
+
+
+def _compiler_run(line: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Return a finished run of the compiler in a folder. Raises ComputationError where it does not run."""
+    try:
+        return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=TIME_LIMIT, check=False)
+    except (OSError, subprocess.TimeoutExpired) as e:
+        raise ComputationError("the C compiler did not run", where=line[0], got=str(e)[:200]) from None
+
+
+def _first_error(run: subprocess.CompletedProcess[str]) -> str:
+    """Return the first error that a compiler has told."""
+    errors = re.findall(r"error: (.*)", run.stderr) or run.stderr.strip().splitlines()
+    return str(errors[0])[:300] if errors else f"exit code {run.returncode}"
 
 
 def _write(path: Path, new: Path, binaries: dict[str, bytes]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -101,6 +102,58 @@ def test_sources_are_compiled_with_consent_into_a_new_file(foreign):
     assert simulate(load_model(new), step)["y"] == pytest.approx(response(time), abs=1e-4)
     again = run(foreign, "--compile")
     assert again.exit_code == 2 and "there already" in again.output
+
+
+PREFIXED = """
+#define PASTE(a, b) a ## b
+#define JOINED(a, b) PASTE(a, b)
+#if defined(FMI2_FUNCTION_PREFIX)
+#define NAMED(f) JOINED(FMI2_FUNCTION_PREFIX, f)
+#else
+#define NAMED(f) f
+#endif
+"""
+"""Names of functions as the header of FMI 2.0 makes them: with the model's before them where sources ask for it."""
+PREFIX = "#define FMI2_FUNCTION_PREFIX spring_"
+
+
+def with_source(path, name, change):
+    """The path of a copy of an FMU whose fmu.c is changed."""
+    copy = path.with_name(name)
+    with zipfile.ZipFile(path) as old, zipfile.ZipFile(copy, "w") as z:
+        for entry in old.namelist():
+            text = old.read(entry)
+            z.writestr(entry, change(text.decode()) if entry == "sources/fmu.c" else text)
+    return copy
+
+
+@pytest.mark.parametrize("asked", [f"#ifndef FMI2_FUNCTION_PREFIX\n{PREFIX}\n#endif", PREFIX], ids=["default", "set"])
+def test_functions_whose_names_begin_with_the_models_are_compiled_under_their_own(foreign, asked):
+    """Sources are meant to be linked with others too: the prefix is theirs where nobody sets it, or always."""
+    names = sorted(set(re.findall(r"\bfmi2[A-Z]\w+", SOURCE.read_text())))
+    head = "\n".join([asked, PREFIXED, *(f"#define {n} NAMED({n})" for n in names), ""])
+    result = run(with_source(foreign, "prefixed.fmu", lambda text: head + text), "--compile")
+    assert result.exit_code == 0 and "two short runs: equal" in result.output, result.output
+    new = foreign.with_name("prefixed-compiled.fmu")
+    time = np.linspace(0.0, 4.0, 41)
+    step = experiment("step", time, {"u": InputSignal.step(1.0, 0.0, 1.0)})
+    assert simulate(load_model(new), step)["y"] == pytest.approx(response(time), abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "lacks"),
+    [
+        (lambda text: text.replace("UNUSED(fmi2CancelStep)", ""), "without fmi2CancelStep."),
+        (lambda text: text.replace("int fmi2Terminate(", "static int fmi2Terminate("), "without fmi2Terminate."),
+        (lambda text: f"double elsewhere(double);\n{text.replace('m->t = 0;', 'm->t = elsewhere(0);')}", "elsewhere"),
+    ],
+    ids=["missing", "static", "elsewhere"],
+)
+def test_a_binary_that_lacks_functions_is_not_done(foreign, change, lacks):
+    result = run(with_source(foreign, "lacking.fmu", change), "--compile")
+    words = " ".join(result.output.split())
+    assert result.exit_code == 1 and "cannot be loaded" in words and lacks in words, words
+    assert not foreign.with_name("lacking-compiled.fmu").exists()
 
 
 def test_what_cannot_be_compiled_is_one_message(foreign, monkeypatch):
