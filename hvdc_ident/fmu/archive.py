@@ -80,10 +80,16 @@ def check_archive(path: Path) -> tuple[str, ...]:
 
 
 def check_identifier(path: Path, identifier: str | None) -> str:
-    """Return a model identifier that is a plain file name. Raises ModelError for any other."""
-    if identifier is None or not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", identifier):
+    """Return a model identifier that is a plain file name. Raises ModelError for any other.
+
+    The standard asks for an identifier of C, which not every tool exports; only the library's name is made of it.
+    """
+    if identifier is None or not re.fullmatch(r"\w[\w .-]*", identifier):
         raise _refused(
-            path, "the model identifier is none", "letters, digits and _, the first no digit", repr(identifier)[:80]
+            path,
+            "the model identifier is no name of a file",
+            "letters, digits, '_', '-', '.' and blanks, a letter, a digit or '_' first",
+            repr(identifier)[:80],
         )
     return identifier
 

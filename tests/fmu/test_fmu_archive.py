@@ -173,8 +173,8 @@ def test_hostile_xml_is_refused(tmp_path, name):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.fmu", "canary"]
 
 
-@pytest.mark.parametrize("name", ["../lag", "a/b", "", "9lag", "lag.so", "la g", "..\\lag"])
-def test_the_model_identifier_is_an_identifier(tmp_path, name):
+@pytest.mark.parametrize("name", ["../lag", "a/b", "", "..", ".lag", "-lag", "..\\lag"])
+def test_a_model_identifier_that_is_no_name_of_a_file_is_refused(tmp_path, name):
     text = description(PLAIN, 2).replace('modelIdentifier="lag"', f'modelIdentifier="{name}"')
     with pytest.raises(ModelError, match="model identifier"):
         load_model(written(tmp_path / "a.fmu", text))

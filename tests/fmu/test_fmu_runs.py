@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 
+import fmpy
 import numpy as np
 import pytest
 from c_fmu import build, needs_compiler
@@ -19,6 +20,7 @@ pytestmark = needs_compiler
 TIME = np.linspace(0.0, 5.0, 251)
 STEP = experiment("step", TIME, {"u": InputSignal.step(1.0, 0.0, 1.0)})
 BOTH = ["model-exchange", "co-simulation"]
+STEP_OF_FMPY = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (5.0, 1.0)], dtype=[("time", float), ("u", float)])
 
 
 @pytest.mark.parametrize("interface", BOTH)
@@ -42,6 +44,18 @@ def test_what_is_taken_over(fmu, version):
     assert model.insertion_points == ("u", "y", "twice")
     with pytest.raises(Exception, match="'stiffness' is another name of 'k'"):
         model.with_values({"stiffness": 1.0})
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("name", ["two-lag", "9 springs", "spring.1"])
+def test_an_identifier_that_is_none_of_c_is_run_as_fmpy_runs_it(tmp_path, name, version):
+    path = build(spring(name, own=False), tmp_path, version)
+    free = {"stop_time": 5.0, "output_interval": 0.02, "input": STEP_OF_FMPY, "output": ["y"]}
+    wanted = fmpy.simulate_fmu(str(path), validate=False, fmi_type="CoSimulation", **free)
+    model = read_fmu(path, interface="co-simulation")
+    found = simulate(model, STEP)["y"]
+    model.pool.close()
+    assert wanted["time"] == pytest.approx(TIME) and np.abs(found[51:] - wanted["y"][51:]).max() < 2e-7
 
 
 @pytest.mark.parametrize("interface", BOTH)
