@@ -187,9 +187,9 @@ def read_capabilities(path: str | Path) -> Capabilities:
     """Return an FMU's capabilities as it describes them, without running it. Raises ModelError for no FMU of FMI 2.0 or 3.0."""
     file = Path(path)
     names = check_archive(file)
-    described = read_description(file, binary=False)
-    groups = _groups(described)
     given = parsed(file)
+    described = read_description(file, binary=False, known=given)
+    groups = _groups(described)
     try:
         check_binary(file, names, described.version, described.identifier)
         problem = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 import zipfile
 from collections.abc import Iterable, Mapping
@@ -16,6 +17,10 @@ from hvdc_ident.immutable import FrozenMap
 
 Interface = Literal["model-exchange", "co-simulation"]
 INTERFACES: tuple[Interface, ...] = ("model-exchange", "co-simulation")
+ELEMENTS: Mapping[str, Interface] = {"ModelExchange": "model-exchange", "CoSimulation": "co-simulation"}
+"""Interfaces by their element of the model description."""
+RELEASED = re.compile(r"2\.0|3\.\d+(\.\d+)?")
+"""Versions that are read: those before a release, 3.0-beta.2, have other functions and attributes."""
 REAL = ("Real", "Float64", "Float32")
 WHOLE = ("Integer", "Enumeration", "Int8", "UInt8", "Int16", "UInt16", "Int32", "UInt32", "Int64", "UInt64", "Boolean")
 
@@ -105,6 +110,21 @@ class Description:
         return known[name]
 
 
+class Header(NamedTuple):
+    """What stands in a model description before its variables: quick to read, however many these are.
+
+    attributes: of the whole. interfaces: attributes of each one that is offered.
+    """
+
+    attributes: Mapping[str, str]
+    interfaces: Mapping[Interface, Mapping[str, str]]
+
+    @property
+    def version(self) -> int:
+        """Return 2 or 3."""
+        return int(self.attributes["fmiVersion"].partition(".")[0])
+
+
 class Setup(NamedTuple):
     """Setup of a worker: an FMU's description, and the folder that it is unpacked into, whose lock is inherited."""
 
@@ -112,27 +132,22 @@ class Setup(NamedTuple):
     folder: Folder
 
 
-def read_description(path: Path, interface: Interface | None = None, *, binary: bool = True) -> Description:
+def read_description(
+    path: Path, interface: Interface | None = None, *, binary: bool = True, known: Any = None
+) -> Description:
     """Check an FMU and return its description; model exchange where it offers both interfaces and none is named.
 
-    binary: whether it must have one for this machine. Raises ModelError where the archive is refused, the XML makes no
-    sense, or something that is needed is missing.
+    binary: whether it must have one for this machine. known: its model description, where it is `parsed` already.
+    Raises ModelError where the archive is refused, the XML makes no sense, or something that is needed is missing.
     """
     names = check_archive(path)
-    given = parsed(path)
-    if given.fmiMajorVersion not in (2, 3):
-        raise ModelError(
-            "this version of FMI is not read",
-            where=str(path),
-            expected="FMI 2.0 or 3.0",
-            got=f"FMI {given.fmiVersion}",
-            hint=f"export it again as FMI 2.0 {_tool_words(given)}; the results of another simulator of FMI 1.0, as a CSV "
-            "file, can be an experiment's data",
-        )
-    kind, chosen = _interface(path, given, interface)
-    identifier = check_identifier(path, chosen.modelIdentifier)
+    header = read_header(path)
+    kind = _interface(path, header, interface)
+    identifier = check_identifier(path, header.interfaces[kind].get("modelIdentifier"))
     if binary:
-        check_binary(path, names, given.fmiMajorVersion, identifier)
+        check_binary(path, names, header.version, identifier)
+    given = known or parsed(path)
+    chosen = given.modelExchange if kind == "model-exchange" else given.coSimulation
     _refuse_clocks(path, given.modelVariables)
     states, derivatives = _states(path, given) if kind == "model-exchange" else (FrozenMap(), ())
     numbers = [v for v in given.modelVariables if v.type in (*REAL, *WHOLE)]
@@ -154,7 +169,7 @@ def read_description(path: Path, interface: Interface | None = None, *, binary: 
         derivatives=derivatives,
         indicators=int(given.numberOfEventIndicators),
         completed_step=bool(getattr(chosen, "needsCompletedIntegratorStep", False)),
-        directional=bool(chosen.providesDirectionalDerivative) or _says_directional(path, kind),
+        directional=bool(chosen.providesDirectionalDerivative),
         variable_step=bool(getattr(chosen, "canHandleVariableCommunicationStepSize", True)),
         interpolates=bool(getattr(chosen, "canInterpolateInputs", False)) and given.fmiMajorVersion == 2,
         step=_number(getattr(chosen, "fixedInternalStepSize", None))
@@ -169,13 +184,45 @@ def read_description(path: Path, interface: Interface | None = None, *, binary: 
     )
 
 
+def read_header(path: Path) -> Header:
+    """Return the header of a checked archive's model description. Raises ModelError for a version that is not read."""
+    from xml.etree import ElementTree
+
+    first: Mapping[str, str] | None = None
+    interfaces: dict[Interface, Mapping[str, str]] = {}
+    with zipfile.ZipFile(path) as archive, archive.open(DESCRIPTION) as text:
+        for _, element in ElementTree.iterparse(text, events=("start",)):
+            if element.tag == "ModelVariables":
+                break
+            first = dict(element.attrib) if first is None else first
+            kind = ELEMENTS.get(element.tag)
+            if kind is not None:
+                interfaces[kind] = dict(element.attrib)
+    attributes = first or {}
+    version, tool = attributes.get("fmiVersion", ""), attributes.get("generationTool", "")
+    if not RELEASED.fullmatch(version):
+        raise ModelError(
+            "this version of FMI is not read",
+            where=str(path),
+            expected="FMI 2.0 or 3.0, as they were released",
+            got=f"FMI {version}" if version else "no fmiVersion",
+            hint=f"export it again as FMI 2.0 {f'from {tool}' if tool else 'from the tool it comes from'}; the results of"
+            " another simulator, as a CSV file, can be an experiment's data",
+        )
+    return Header(attributes, interfaces)
+
+
 def parsed(path: Path) -> Any:
-    """Return the model description as FMPy reads it, without its validation, which refuses what can be used, as a missing start."""
+    """Return the model description as FMPy reads it, without its validation, which refuses what can be used, as a missing start.
+
+    FMI 3.0 calls one attribute otherwise than FMI 2.0, and FMPy reads it under the old name alone: the new one is put there.
+    """
     from fmpy import read_model_description
     from lxml import etree
 
+    header = read_header(path)
     try:
-        return read_model_description(str(path), validate=False)
+        given = read_model_description(str(path), validate=False)
     except (etree.LxmlError, ValueError, TypeError, KeyError, IndexError, AttributeError) as e:
         raise ModelError(f"the model description makes no sense: {_said(e)}", where=str(path)) from None
     except Exception as e:  # FMPy raises bare Exceptions for what it does not support
@@ -187,35 +234,21 @@ def parsed(path: Path) -> Any:
             where=str(path),
             hint=f"export it again from its tool, or mend its {DESCRIPTION}: the standard forbids what is said there",
         ) from None
-
-
-def _tool_words(given: Any) -> str:
-    """Return the tool that made the FMU, for a sentence."""
-    return f"from {given.generationTool}" if given.generationTool else "from the tool it comes from"
-
-
-def _says_directional(path: Path, kind: Interface) -> bool:
-    """Return FMI 3.0's attribute for directional derivatives, which FMPy does not read."""
-    from xml.etree import ElementTree
-
-    with zipfile.ZipFile(path) as archive, archive.open(DESCRIPTION) as text:
-        for _, element in ElementTree.iterparse(text, events=("start",)):
-            if element.tag == {"model-exchange": "ModelExchange", "co-simulation": "CoSimulation"}[kind]:
-                return element.get("providesDirectionalDerivatives") in ("true", "1")
-            if element.tag == "ModelVariables":
-                break
-    return False
+    if header.version == 3:
+        for kind, interface in zip(INTERFACES, (given.modelExchange, given.coSimulation), strict=True):
+            if interface is not None:
+                said = header.interfaces.get(kind, {}).get("providesDirectionalDerivatives")
+                interface.providesDirectionalDerivative = said in ("true", "1")
+    return given
 
 
 def _said(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
-def _interface(path: Path, given: Any, asked: Interface | None) -> tuple[Interface, Any]:
-    """Return the interface to use, and FMPy's description of it. Raises ModelError where it is not offered."""
-    offered = {
-        k: v for k, v in zip(INTERFACES, (given.modelExchange, given.coSimulation), strict=True) if v is not None
-    }
+def _interface(path: Path, header: Header, asked: Interface | None) -> Interface:
+    """Return the interface to use. Raises ModelError where it is not offered."""
+    offered = [k for k in INTERFACES if k in header.interfaces]
     wanted = asked or next(iter(offered), None)
     if wanted is None or wanted not in offered:
         expected = asked or "model exchange or co-simulation"
@@ -225,7 +258,7 @@ def _interface(path: Path, given: Any, asked: Interface | None) -> tuple[Interfa
             expected=expected,
             got=", ".join(offered) or "scheduled execution only",
         )
-    return wanted, offered[wanted]
+    return wanted
 
 
 def has_sources(names: Iterable[str]) -> bool:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import stat
 import zipfile
 from itertools import pairwise
 
+import fmpy
 import pytest
 from c_fmu import CModel, Var, description
 from fmpy import platform, platform_tuple, sharedLibraryExtension
@@ -15,7 +17,7 @@ from hypothesis import strategies as st
 from hvdc_ident import load_model
 from hvdc_ident.errors import InputError, ModelError
 from hvdc_ident.fmu import archive as checks
-from hvdc_ident.fmu import read_description
+from hvdc_ident.fmu import compile_fmu, read_capabilities, read_description
 
 PLAIN = CModel(
     "lag",
@@ -178,6 +180,36 @@ def test_a_model_identifier_that_is_no_name_of_a_file_is_refused(tmp_path, name)
     text = description(PLAIN, 2).replace('modelIdentifier="lag"', f'modelIdentifier="{name}"')
     with pytest.raises(ModelError, match="model identifier"):
         load_model(written(tmp_path / "a.fmu", text))
+
+
+@pytest.mark.parametrize("version", ["1.0", "2.1", "3.0-beta.2", "3.0-alpha.5", "4.0", ""])
+def test_versions_that_are_not_read_are_named(tmp_path, version):
+    """One before a release has other functions: its binary would be blamed on a token."""
+    for text in (description(PLAIN, 2), description(PLAIN, 3)):
+        text = re.sub(r'fmiVersion="[^"]*"', f'fmiVersion="{version}" generationTool="Maker 7"', text)
+        path = written(tmp_path / "a.fmu", text, entries=[("sources/lag.c", "int lag;")])
+        for work in (load_model, read_capabilities, compile_fmu):
+            with pytest.raises(ModelError) as caught:
+                work(path)
+            assert "this version of FMI is not read" in str(caught.value) and "from Maker 7" in str(caught.value)
+            assert (f"got FMI {version}" if version else "got no fmiVersion") in str(caught.value)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.fmu"]
+
+
+@pytest.mark.parametrize("version", ["3.0", "3.0.2", "3.1"])
+def test_releases_of_fmi_3_are_read(tmp_path, version):
+    text = description(PLAIN, 3).replace('fmiVersion="3.0"', f'fmiVersion="{version}"')
+    assert read_description(written(tmp_path / "a.fmu", text, version=3)).version == 3
+
+
+def test_a_missing_binary_is_told_before_the_variables_are_read(tmp_path, monkeypatch):
+    """A hundred thousand of them take seconds."""
+    path = tmp_path / "a.fmu"
+    with zipfile.ZipFile(path, "w") as z:
+        z.writestr("modelDescription.xml", description(PLAIN, 2))
+    monkeypatch.setattr(fmpy, "read_model_description", lambda *_, **__: pytest.fail("the variables were read"))
+    with pytest.raises(ModelError, match="no binary for this machine"):
+        load_model(path)
 
 
 def test_files_that_are_no_fmu(tmp_path):

@@ -52,6 +52,21 @@ def test_json_has_every_variable_and_what_was_found(tmp_path):
     assert "agree with differences, for all 7" in found["found"]["derivatives at the start"]
 
 
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("own", [True, False])
+def test_directional_derivatives_that_the_description_states_are_told(tmp_path, version, own):
+    """FMI 3.0 calls the attribute otherwise than FMI 2.0."""
+    path = build(spring(own=own), tmp_path, version)
+    assert ("providesDirectionalDerivative" in description(spring(own=own), version)) == own
+    found = read_capabilities(path)
+    assert {kind: said["directional derivatives"] for kind, said in found.interfaces.items()} == dict.fromkeys(
+        ("model-exchange", "co-simulation"), own
+    )
+    told = run(path).output
+    assert told.count(f"directional derivatives {'yes' if own else 'no'}") == 2
+    assert ("directional ones agree" in told) == own
+
+
 def test_derivatives_that_are_wrong_are_found(fmu):
     words = fmu(spring("skew", wrong=1.5)).capabilities
     assert "differ from differences for" in words.found["derivatives at the start"]
