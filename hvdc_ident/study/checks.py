@@ -192,8 +192,11 @@ def need_experiments(study: Study, stage: str, role: str | None = None, *, respo
 def need_candidates(study: Study, stage: str) -> None:
     """Raise StudyError where the study names no parameter to estimate."""
     if not study.candidates:
-        known = ", ".join(list(study.model.parameters)[:8])
-        hint = f"[parameters] with lines like NAME = {{given = 1, min = 0, max = 10}}; the model has {known}"
+        known = list(study.model.parameters)
+        hint = "[parameters] with lines like NAME = {given = 1, min = 0, max = 10}; the model has "
+        hint += ", ".join(known[:8]) + (" ..." if len(known) > 8 else "")
+        if not known:
+            hint = "a model with parameters: this one has none, so that nothing of it can be estimated"
         raise StudyError(
             f"{stage} needs parameters to estimate and the study names none", where=study.path.name, hint=hint
         )

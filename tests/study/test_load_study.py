@@ -6,7 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from hvdc_ident.cli import app
 from hvdc_ident.data import conversion, same_unit
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.study import recordings
@@ -172,3 +174,18 @@ def test_units() -> None:
     assert same_unit("", "pu") and same_unit("p.u.", "1") and not same_unit("kV", "V")
     assert conversion("kV", "V") == (1e3, 0.0) and conversion("ms", "s") == (1e-3, 0.0)
     assert conversion("kA", "pu") is None and conversion("m", "s") is None
+
+
+@pytest.mark.parametrize("stage", ["identify", "fit", "screen", "diagnose"])
+def test_a_model_without_parameters_is_said_to_have_none(tmp_path: Path, stage: str) -> None:
+    (tmp_path / "m.toml").write_text(
+        'schema = 1\nname = "lag"\n[inputs]\nu = {value = 0}\n[states]\nx = {derivative = "u - x"}\n[outputs]\ny = "x"\n'
+    )
+    np.savetxt(tmp_path / "d.csv", np.c_[TIME, TIME >= 0.2, TIME], delimiter=",", header="time,u,y", comments="")
+    (tmp_path / "s.toml").write_text(
+        'schema = 1\n[model]\nsource = "m.toml"\n[[experiment]]\nname = "e"\ndata = "d.csv"\ninputs = ["u"]\n'
+        'outputs = ["y"]\nnoise = {y = 0.01}\n[fit]\n[diagnose]\n[screening]\n[identifiability]\n'
+    )
+    result = CliRunner().invoke(app, [stage, str(tmp_path / "s.toml")])
+    words = " ".join(result.output.split())
+    assert result.exit_code == 2 and "needs parameters to estimate" in words and "this one has none" in words
