@@ -392,6 +392,8 @@ def _renamed(model: FmuModel, use: EffectUse) -> str:
 
 @lru_cache(maxsize=64)
 def _chain(count: int, uses: tuple[EffectUse, ...], values: Sequence[float], directed: bool) -> Model:
+    if count == 0:  # no model is without any signal: one that nothing enters and nobody reads
+        count, values = 1, (0.0,)
     inputs = {f"u{k}": Input(v) for k, v in enumerate(values)}
     outputs = {f"y{k}": symbol(f"u{k}") for k in range(count)}
     if directed:

@@ -100,6 +100,27 @@ static int bounce(double *r) { if (r[0] <= 0 && r[1] < 0) { r[0] = 0; r[1] = -r[
     1,
 )
 
+# x' = -a x from x0: nothing enters.
+DECAY = CModel(
+    "decay",
+    PLAIN
+    + """
+#define NR 4
+#undef INITIALIZE
+#define INITIALIZE(r) (r[0] = r[3])
+static void start(double *r) { r[2] = 1; r[3] = 1; }
+static void equations(double *r, double t) { r[1] = -r[2] * r[0]; }
+""",
+    (
+        Var("x", 0),
+        Var("der(x)", 1, more=(("derivative", "x"),)),
+        Var("a", 2, "parameter", "tunable", (("start", "1"), ("min", "0.01"))),
+        Var("x0", 3, "parameter", "fixed", (("start", "1"),)),
+        Var("y", 0, "output"),
+    ),
+    1,
+)
+
 # x' = s rate, s turned round at +-1: a triangle, 500 events in 1000 s.
 TRIANGLE = CModel(
     "triangle",

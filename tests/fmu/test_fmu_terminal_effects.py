@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from c_fmu import needs_compiler
-from c_models import FAULTY, TWIN, spring
+from c_models import DECAY, FAULTY, TWIN, spring
 
 from hvdc_ident import simulate
-from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.data import InputSignal, Trajectory, experiment
+from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.discrepancy.signatures.candidates import candidates
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import ModelError, UnknownNameError
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.fmu import Limits
 from hvdc_ident.immutable import FrozenMap
 
@@ -197,3 +199,45 @@ def test_places_that_are_none(fmu):
         apply_effects(fmu(spring()), [{"effect": "lagg", "at": "y"}])
     with pytest.raises((ModelError, UnknownNameError)):
         apply_effects(fmu(spring()), [{"effect": "lag", "at": "y", "parameters": {"TT": 1.0}}])
+
+
+@pytest.mark.parametrize("interface", ["model-exchange", "co-simulation"])
+def test_effects_at_the_outputs_of_an_fmu_without_inputs(fmu, interface):
+    """y = exp(-a t), through a lag T that begins at rest at y(0), and a gain k after it: in closed form."""
+    plain, time, a, lag = fmu(DECAY, 2, interface), np.linspace(0.0, 4.0, 201), 1.5, 0.2
+    assert plain.insertion_points == ("y",) and not plain.inputs
+    uses = [
+        {"effect": "lag", "at": "y", "parameters": {"T": lag}},
+        {"effect": "gain", "at": "y", "parameters": {"k": 1.3}},
+    ]
+    model = apply_effects(plain, uses)
+
+    def wanted(a, lag):
+        share = 1.0 / (1.0 - a * lag)
+        return 1.3 * ((1.0 - share) * np.exp(-time / lag) + share * np.exp(-a * time))
+
+    names = ["a", "lag_y_T", "gain_y_k"]
+    run = simulate(model, experiment("free", time), {"a": a}, names)
+    assert np.abs(run["y"] - wanted(a, lag)).max() < 1e-5
+    h = 1e-5
+    columns = [
+        (wanted(a + h, lag) - wanted(a - h, lag)) / (2 * h),
+        (wanted(a, lag + h) - wanted(a, lag - h)) / (2 * h),
+        wanted(a, lag) / 1.3,
+    ]
+    for j, column in enumerate(columns):
+        assert np.abs(run.gradient("y")[:, j] - column).max() < 1e-3, names[j]
+    with pytest.raises(UnknownNameError, match="no insertion point 'u'"):
+        apply_effects(plain, [{"effect": "lag", "at": "u", "parameters": {"T": lag}}])
+
+
+def test_an_effect_at_the_output_of_an_fmu_without_inputs_is_named(fmu):
+    """The record decays with a = 1.5 from 1.3 instead of 1: a gain of 1.3, with the parameter of the decay free."""
+    time = np.linspace(0.0, 4.0, 101)
+    y = 1.3 * np.exp(-1.5 * time) + 1e-3 * np.random.default_rng(2).standard_normal(time.size)
+    record = experiment("e", time, measured=Trajectory(time, y[:, None], ("y",), ("",)), noise={"y": 1e-3}, event=0.0)
+    free = [FitParameter("a", 1.0, 0.1, 5.0)]
+    found = diagnose(fmu(DECAY, 2, "model-exchange"), [record], free, effects=["gain", "lag"])
+    assert found.verdict == "named"
+    (effect,) = found.effects
+    assert effect.effect == "gain" and effect.parameters["k"].value == pytest.approx(1.3, abs=5e-3)
