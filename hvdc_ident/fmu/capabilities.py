@@ -23,6 +23,7 @@ from hvdc_ident.fmu.description import (
 from hvdc_ident.immutable import FrozenMap
 
 if TYPE_CHECKING:
+    from hvdc_ident.data import Array
     from hvdc_ident.fmu.model import FmuModel
 
 ROWS_SHOWN = 15  # of one group of variables, where not all are asked for: the groups together fill about a screen
@@ -253,13 +254,20 @@ def tested_capabilities(model: FmuModel, known: Capabilities | None = None) -> C
 def _two_runs(model: FmuModel, described: Capabilities) -> str:
     """Return in words whether a second run equals the first."""
     from hvdc_ident.data import experiment
+    from hvdc_ident.fmu.evaluate import simulate_without_effects
+    from hvdc_ident.simulate import Tolerance
 
     if not model.outputs:
         return ""
     start = described.experiment.get("start", 0.0)
     span = SHORT_RUN * max(described.experiment.get("stop", start + 1.0) - start, 0.0) or SHORT_RUN
     short = experiment("short", np.linspace(start, start + span, 11), {})
-    first, second = (model.simulate(short).trajectory.values for _ in range(2))
+
+    def run() -> Array:
+        names = tuple(model.outputs)
+        return simulate_without_effects(model, short, {}, (), names, Tolerance(), fresh=True).trajectory.values
+
+    first, second = run(), run()
     relative = np.abs(second - first).max(axis=0) / np.maximum(np.abs(first).max(axis=0), 1e-300)
     names = [n for n, r in zip(model.outputs, relative.tolist(), strict=True) if r > 0.0]
     length = f"{span:g} s from {start:g} s"

@@ -81,14 +81,16 @@ def simulate_without_effects(
     tolerance: Tolerance,
     *,
     partial: bool = False,
+    fresh: bool = False,
     noise_key: str = "",
     directions: Mapping[str, Direction] | None = None,
 ) -> Simulation:
     """Return the run of the FMU itself.
 
-    partial: whether the rows up to an end that the FMU asks for are accepted. noise_key: shared by runs whose noise and
-    difference steps are alike though their inputs differ. directions: in which all inputs move, by a name that is no
-    parameter's; derivatives along them come after those of the sensitivities.
+    fresh: whether it is run even where the last run was the same one, whose rows are given else. partial: whether the
+    rows up to an end that the FMU asks for are accepted. noise_key: shared by runs whose noise and difference steps are
+    alike though their inputs differ. directions: in which all inputs move, by a name that is no parameter's; derivatives
+    along them come after those of the sensitivities.
     """
     along = directions or {}
     signals = PackedInputs.of(list(inputs_of(model, experiment, given).values()))
@@ -105,6 +107,7 @@ def simulate_without_effects(
         "starts": starts,
         "tolerance": tolerance.rtol,
         "partial": partial,
+        "fresh": fresh,
         "noise key": noise_key,
         "directions": {n: d.key for n, d in along.items()},
     }

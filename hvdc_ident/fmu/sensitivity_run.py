@@ -83,6 +83,8 @@ class SensitivityRun:
         self.ended: tuple[float, int] | None = None  # instant of such an end, s, and the rows up to it
         self.notes: dict[str, str] = {}
         self.counts = model_exchange.Counts()
+        if heading.get("fresh"):
+            self.handler.last = None
         if "base" in arrays:
             self.handler.last = (self._key_of(self.values, self.signals), arrays["base"])
 

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from c_fmu import SOURCE, Var, build, description, needs_compiler
-from c_models import BALL, response, spring
+from c_models import BALL, CLOCK, begun, response, spring
 from typer.testing import CliRunner
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.fmu import read_capabilities
+from hvdc_ident.fmu import read_capabilities, read_fmu
 
 pytestmark = needs_compiler
 
@@ -65,6 +65,14 @@ def test_directional_derivatives_that_the_description_states_are_told(tmp_path, 
     told = run(path).output
     assert told.count(f"directional derivatives {'yes' if own else 'no'}") == 2
     assert ("directional ones agree" in told) == own
+
+
+def test_an_output_that_no_run_repeats_is_told(tmp_path):
+    """The second short run is run: the time that the computation took is another one."""
+    found = read_fmu(build(begun("timed", more=(CLOCK,)), tmp_path), interface="co-simulation")
+    assert "differ by up to" in found.capabilities.found["two short runs"]
+    assert "in cpu, " in found.capabilities.found["two short runs"]
+    found.pool.close()
 
 
 def test_derivatives_that_are_wrong_are_found(fmu):
