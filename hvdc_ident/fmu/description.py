@@ -126,10 +126,12 @@ class Header(NamedTuple):
 
 
 class Setup(NamedTuple):
-    """Setup of a worker: an FMU's description, and the folder that it is unpacked into, whose lock is inherited."""
+    """Setup of a worker: an FMU's description, the folder that it is unpacked into, whose lock is inherited, and the deadline
+    of one run, s."""
 
     description: Description
     folder: Folder
+    deadline: float
 
 
 def read_description(

@@ -1,14 +1,16 @@
 """One instance of an FMU, used for many runs, and the way in which it is reused. In worker processes only.
 
 Between runs an instance is reset, or replaced by a new one, or the whole process is replaced. The cheapest way is taken
-whose second run repeats the first run of a fresh process, over a whole run and in every output. This is found once for an
-FMU; values at the start alone do not tell, for the reset of some FMUs restores the start and nothing else. Outputs that
-two fresh processes do not repeat either, such as the time that the computation took, are not compared.
+whose second run repeats the first run of a fresh process, over a whole run and in every output; one that fails, crashes or
+hangs does not. This is found once for an FMU; values at the start alone do not tell, for the reset of some FMUs restores
+the start and nothing else. Outputs that two fresh processes do not repeat either, such as the time that the computation
+took, are not compared.
 """
 
 from __future__ import annotations
 
 import contextlib
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.fmi import DISCARD, ERROR, FATAL, FmiError, FmiLibrary, VariableGroup, quoted, refusal
+from hvdc_ident.processes import Watch
 from hvdc_ident.processes.messages import Message
 from hvdc_ident.processes.server import die_like, in_new_process
 
@@ -234,13 +237,19 @@ LoadFmu = Callable[[dict[str, Any]], Instance]
 """Loads the FMU into this process, with what is learned of it; what the instance finds out is added to that."""
 
 
-def isolated(work: Callable[[Callable[[Message], None]], None]) -> list[Message]:
+NewWatch = Callable[[], Watch]
+"""Begins to watch the progress of this process's runs, against the deadline of one."""
+
+
+def isolated(
+    work: Callable[[Callable[[Message], None]], None], hangs: Callable[[Sequence[Message]], bool] | None = None
+) -> list[Message]:
     """Return the messages that the work sends from a new process, at least one.
 
     work: called with the function that sends. Where it sends none, raises its failure as RunFailed, or ends this process
-    as the new one ended.
+    as the new one ended. hangs: called with the messages so far, whether to end the new process.
     """
-    messages, end = in_new_process(work, lambda e: failure(e).heading())
+    messages, end = in_new_process(work, lambda e: failure(e).heading(), hangs)
     if not messages and isinstance(end, dict):
         raise RunFailed.from_heading(end)
     if not messages:
@@ -248,34 +257,54 @@ def isolated(work: Callable[[Callable[[Message], None]], None]) -> list[Message]
     return messages
 
 
-def find_reuse(load: LoadFmu, run: Callable[[Instance], Array]) -> tuple[Reuse, Array]:
+def find_reuse(load: LoadFmu, run: Callable[[Instance], Array], new_watch: NewWatch) -> tuple[Reuse, Array]:
     """Return the way of reuse and the first run, (n, signals). Raises RunFailed where the first run fails.
 
     run: a run from the start, the same each time.
     """
-    first, reset = _run_twice(load, run, "reset")
+    first, reset = _run_twice(load, run, "reset", new_watch)
     if _repeats(reset, first, np.zeros(first.shape[1])):
         return "reset", first
-    fresh, instance = _run_twice(load, run, "instance")
+    fresh, instance = _run_twice(load, run, "instance", new_watch)
     noise = np.nan_to_num(np.abs(fresh - first)).max(axis=0, initial=0.0)
     if _repeats(reset, first, noise):
         return "reset", first
     return ("instance" if _repeats(instance, fresh, noise) else "process"), first
 
 
-def _run_twice(load: LoadFmu, run: Callable[[Instance], Array], reuse: Reuse) -> tuple[Array, Array | None]:
-    """Return the first run in a new process, and a second one of the reused instance; None where that one failed."""
+def _run_twice(
+    load: LoadFmu, run: Callable[[Instance], Array], reuse: Reuse, new_watch: NewWatch
+) -> tuple[Array, Array | None]:
+    """Return the first run in a new process, and a second one of the reused instance; None where that failed or hung."""
 
     def work(send: Callable[[Message], None]) -> None:
         instance = load({"restart": reuse})
         for _ in range(2):
+            begun = time.monotonic()
             with quoting(instance):
                 rows = run(instance)
             if instance.learned["restart"] == reuse:
-                send(({}, {"rows": rows}))
+                send(({"took": time.monotonic() - begun}, {"rows": rows}))
 
-    runs = [arrays["rows"] for _, arrays in isolated(work)]
+    runs = [arrays["rows"] for _, arrays in isolated(work, _second_hangs(new_watch()))]
     return runs[0], (runs[1] if len(runs) > 1 else None)
+
+
+def _second_hangs(watch: Watch) -> Callable[[Sequence[Message]], bool]:
+    """Return what tells whether the second of two equal runs hangs. A first one has the pool's deadline.
+
+    It hangs where it stands still at one instant for longer than the whole first run took, or where more than half of the
+    time is over that this one left until the deadline: then the pool would end more than the trial.
+    """
+
+    def hangs(runs: Sequence[Message]) -> bool:
+        over = watch.over()
+        if not runs:
+            return False
+        took, still = float(runs[0][0]["took"]), watch.still()
+        return over or (still is not None and still > took) or watch.elapsed() > 0.5 * (took + watch.deadline)
+
+    return hangs
 
 
 def difference(run: Array, other: Array) -> Array:

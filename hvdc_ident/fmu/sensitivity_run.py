@@ -141,12 +141,13 @@ class SensitivityRun:
 
             return run
 
-        reuse, rows = find_reuse(self.handler.load_fmu, run_on(self.signals))
+        reuse, rows = find_reuse(self.handler.load_fmu, run_on(self.signals), self.handler.new_watch)
         steps = [PERTURBATION * max(abs(v.start or 0.0), v.nominal) * v.continuous for v in d.inputs.values()]
         if any(steps) and not moving(rows).any():  # at rest throughout: the start of a run is its end
             third = float(self.time[0] + (self.time[-1] - self.time[0]) / 3.0)
             with contextlib.suppress(RunFailed):
-                reuse, _ = find_reuse(self.handler.load_fmu, run_on(self.signals.stepped(steps, third)))
+                moved = run_on(self.signals.stepped(steps, third))
+                reuse, _ = find_reuse(self.handler.load_fmu, moved, self.handler.new_watch)
         self.learned["restart"] = reuse
 
     def _find_calls(self) -> None:

@@ -21,8 +21,9 @@ from hvdc_ident.data import Array
 from hvdc_ident.fmu.derivatives import DifferenceStep, PointEvaluation
 from hvdc_ident.fmu.description import Description, Setup
 from hvdc_ident.fmu.fmi import VariableGroup, why_not_loaded
-from hvdc_ident.fmu.instance import Instance, LoadFmu, RunFailed, failure, isolated
+from hvdc_ident.fmu.instance import Instance, LoadFmu, NewWatch, RunFailed, failure, isolated
 from hvdc_ident.fmu.sensitivity_run import SensitivityRun
+from hvdc_ident.processes import Watch
 from hvdc_ident.processes.messages import BEGAN, NOW, PROCESS, START, STOP, Message, packed, unpacked
 from hvdc_ident.processes.server import resident, space
 
@@ -31,7 +32,8 @@ from hvdc_ident.processes.server import resident, space
 class RequestHandler:
     """A worker's answers to requests, and what it has learned of the FMU.
 
-    load_fmu: loads it into this process. restart_deadline: called between the runs of one request. learned: passed on to
+    load_fmu: loads it into this process. restart_deadline: called between the runs of one request. new_watch: begins to
+    watch them. learned: passed on to
     later workers by the pool, see `hvdc_ident.fmu.worker_pool`. steps, noise: of differences, by a digest of the
     experiment. last: digest and outputs of the last run. runs: of the present request.
     """
@@ -39,6 +41,7 @@ class RequestHandler:
     description: Description
     load_fmu: LoadFmu
     restart_deadline: Callable[[], None]
+    new_watch: NewWatch
     learned: dict[str, Any] = field(default_factory=dict)
     steps: dict[bytes, DifferenceStep] = field(default_factory=dict)
     noise: dict[bytes, Array] = field(default_factory=dict)
@@ -180,7 +183,10 @@ def serve(connection: Connection, progress: memoryview[float], setup: Setup, lea
             os._exit(0)
         return "done" in heading
 
-    handler = RequestHandler(setup.description, load, restart_deadline, dict(learned))
+    def new_watch() -> Watch:
+        return Watch(progress, setup.deadline)
+
+    handler = RequestHandler(setup.description, load, restart_deadline, new_watch, dict(learned))
     if not answer(handler.load):
         return
     while True:

@@ -360,7 +360,7 @@ class WorkerPool:
         if processes.supervisor is None:
             processes.supervisor = Supervisor(
                 "hvdc_ident.fmu.worker",
-                Setup(self.description, processes.folder),
+                Setup(self.description, processes.folder, self.limits.deadline),
                 memory=self.limits.memory,
                 keeps=[processes.folder.lock],
             )

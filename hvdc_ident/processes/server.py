@@ -40,7 +40,8 @@ from hvdc_ident.processes.messages import NOW, PROCESS, RESIDENT, SPACE, Message
 
 PATIENCE = 1.0  # s between looks after the owner where the system does not tell of its end
 DUMP = 0.5  # s that a worker has to begin the dump it is asked for; it takes about a millisecond
-PAUSE = 0.2  # s of silence after which a dump that was asked for is over: a process may have to wait for its turn
+PAUSE = 0.2
+"""s of silence after which a dump that was asked for is over, and a look is taken at a process: it may have to wait for its turn."""
 SENDER = struct.Struct("3i")  # process, user and group that the system puts to a message
 PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent ends
 
@@ -293,12 +294,15 @@ def _limit(memory: int | None) -> None:
 
 
 def in_new_process(
-    work: Callable[[Callable[[Message], None]], None], failure: Callable[[Exception], dict[str, Any]]
+    work: Callable[[Callable[[Message], None]], None],
+    failure: Callable[[Exception], dict[str, Any]],
+    hangs: Callable[[Sequence[Message]], bool] | None = None,
 ) -> tuple[list[Message], dict[str, Any] | int | None]:
     """Return the parts that the work handed over, and how it ended: None, its failure, or the code of its process.
 
     Runs in a worker, whose process is forked. work: called with what hands a part over. failure: what an error amounts
     to, as a heading. A negative code is the signal that ended the process, a code of 0 an end without a word.
+    hangs: called with the parts so far while the work is silent, whether to end its process.
     """
     inward, outward = os.pipe()
     parent = os.getpid()
@@ -319,6 +323,10 @@ def in_new_process(
     end: dict[str, Any] | int | None = 0
     with Connection(inward, writable=False) as heard, contextlib.suppress(EOFError):
         while True:
+            while hangs is not None and not heard.poll(PAUSE):
+                if hangs(parts):
+                    os.kill(child, signal.SIGKILL)
+                    break
             heading, arrays = unpacked(heard.recv_bytes())
             if "ended" in heading:
                 end = heading["failed"] if heading["ended"] else None

@@ -258,7 +258,11 @@ class Watch:
     def over(self) -> bool:
         """Return whether the work is past its deadline."""
         self._look()
-        return time.monotonic() >= self.progress[BEGAN] + self.deadline
+        return self.elapsed() >= self.deadline
+
+    def elapsed(self) -> float:
+        """Return the seconds since the work began."""
+        return time.monotonic() - self.progress[BEGAN]
 
     def instants(self) -> tuple[float, float, float]:
         """First, last and present instant of the run, s, nan where not known."""

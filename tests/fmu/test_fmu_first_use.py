@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +52,27 @@ def test_the_cheapest_restart_that_repeats_a_run_is_taken(tmp_path, way, model, 
     assert found.pool.started == 1
     there = pickle.loads(pickle.dumps(found))
     assert there.pool.learned["restart"] == way  # nobody tries it a second time
+    found.pool.close()
+
+
+@pytest.mark.parametrize("interface", BOTH)
+@pytest.mark.parametrize(
+    ("way", "model"),
+    [
+        ("instance", begun("waiting", "AT_RESET for (;;)")),
+        ("process", begun("stuck", "SPOILT ({ while (runs > 1 && r[0] < 0.5); 0.0; })")),
+        ("process", begun("stuck-at-once", "INITIALIZE(r) while (runs++)")),
+    ],
+    ids=lambda x: getattr(x, "name", x),
+)
+def test_a_trial_that_hangs_fails_no_run(tmp_path, way, model, interface):
+    """Where a reset, or each further run of a process, hangs, the next way is tried, against the closed form."""
+    found = read_fmu(build(model, tmp_path), interface=interface, limits=replace(PATIENT, deadline=8.0))
+    for lag in (0.1, 0.05, 0.1):
+        run = simulate(found, FREE, {"T": lag}, outputs=["out"])
+        assert np.abs(run["out"] - np.exp(-TIME / lag)).max() < 1e-6
+        assert found.pool.learned["restart"] == way
+    assert found.pool.started == 1
     found.pool.close()
 
 
