@@ -138,6 +138,18 @@ class PointEvaluation:
         """x' (nx,) and y (outputs,)."""
         return self._at(self.x, self.u)
 
+    def beside(self) -> Array:
+        """(nx + outputs,) x' and y a little beside the point, in every state and input: what stands still shows there."""
+        x, u = self.x.copy(), self.u.copy()
+        x += SHORT_STEP * np.maximum(np.abs(x), self.instance.nominals())
+        u[self._continuous] += SHORT_STEP * self._input_sizes()
+        return np.concatenate(self._at(x, u))
+
+    def _input_sizes(self) -> Array:
+        """(continuous inputs,) sizes of the inputs that a Jacobian has columns for."""
+        typical = np.array([v.nominal for v in self.instance.description.inputs.values()])
+        return np.maximum(np.abs(self.u), typical)[self._continuous]
+
     def _at(self, x: Array, u: Array) -> tuple[Array, Array]:
         library = self.instance.library
         library.set_states(x)
@@ -155,14 +167,12 @@ class PointEvaluation:
             directional = self._directional([])
             if directional is not None and np.isfinite(directional).all():
                 return PointJacobian(directional, np.ones(directional.shape[1], dtype=bool), 0.0, False)
-        typical = np.array([v.nominal for v in self.instance.description.inputs.values()])
-        u_scale = np.maximum(np.abs(self.u), typical)[self._continuous]
-        scale = np.concatenate([np.maximum(np.abs(self.x), self.instance.nominals()), u_scale])
+        scale = np.concatenate([np.maximum(np.abs(self.x), self.instance.nominals()), self._input_sizes()])
         columns = [self._difference(k, CENTRAL_STEP * s) for k, s in enumerate(scale)]
         others = [self._difference(k, 0.25 * CENTRAL_STEP * s) for k, s in enumerate(scale)]
         directional = self._directional(list(parameters))
         if parameters:  # some FMUs move a parameter as they give a derivative by it
-            self.instance.renew()
+            self.instance.renew(parameters)
         for name, size in zip(parameters, sizes, strict=True):
             columns.append(self._difference_by(name, CENTRAL_STEP * size))
             others.append(self._difference_by(name, 4.0 * CENTRAL_STEP * size))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -186,8 +186,14 @@ class Instance:
         if library.component is None:
             self.instantiate()
 
-    def renew(self) -> None:
-        """Free the instance: the next run begins with a new one."""
+    def renew(self, moved: Iterable[str] = ()) -> None:
+        """Let the next run begin with a new instance, or with a reset where that is known to suffice: some can be made once.
+
+        moved: parameters that the FMU may have moved itself; the next run sets them, for a reset may keep them.
+        """
+        if self.learned.get("restart") == "reset":
+            self._set |= self.description.parameters.keys() & set(moved)
+            return
         self.library.free()
         self._running = False
 

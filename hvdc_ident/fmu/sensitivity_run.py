@@ -312,7 +312,7 @@ class SensitivityRun:
             moved = not np.array_equal(before, parameters.get(), equal_nan=True)
         except (RunFailed, FmiError, model_exchange.SensitivitiesLost):
             moved = True
-        instance.renew()
+        instance.renew(names)
         size = np.abs(outputs).max(axis=0, initial=0.0)
         if moved or (rms(run.outputs - outputs) > NOISE_FACTOR * (noise + self.tolerance * size)).any():
             return {n: len(names) > 1 and self._confirmed([n])[n] for n in names}

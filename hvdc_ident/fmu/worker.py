@@ -21,7 +21,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.fmu.derivatives import DifferenceStep, PointEvaluation
 from hvdc_ident.fmu.description import Description, Setup
 from hvdc_ident.fmu.fmi import VariableGroup, why_not_loaded
-from hvdc_ident.fmu.instance import Instance, LoadFmu, NewWatch, RunFailed, failure, isolated
+from hvdc_ident.fmu.instance import Instance, LoadFmu, NewWatch, Reuse, RunFailed, failure, find_reuse, isolated
 from hvdc_ident.fmu.sensitivity_run import SensitivityRun
 from hvdc_ident.processes import Watch
 from hvdc_ident.processes.messages import BEGAN, NOW, PROCESS, START, STOP, Message, packed, unpacked
@@ -93,6 +93,8 @@ class RequestHandler:
         if heading["do"] == "simulate":
             result, out = SensitivityRun(self, heading, arrays).answer()
         else:
+            if heading["do"] == "point" and heading["parameters"]:
+                heading = {**heading, "restart": self._restart_at_point(heading, arrays)}
             work = {"point": self._point, "starts": self._starts}[heading["do"]]
             result, out = self._guarded(lambda: work(heading, arrays))
         found = {f"step {k.hex()}": astuple(s) for k, s in islice(self.steps.items(), known[0], None)}
@@ -110,11 +112,44 @@ class RequestHandler:
 
         return isolated(told)[0] if self.isolated else work()
 
+    def _restart_at_point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Reuse:
+        """Return how the FMU is brought back to its start for another value of a parameter at a point.
+
+        Where no run has shown it, or a whole run needs a new process each time, a trial at the point does. Raises RunFailed
+        where neither a reset nor a new instance repeats what the FMU gives there.
+        """
+        known: Reuse | None = self.learned.get("restart")
+        if known in (None, "process"):
+            known = self.learned.get("restart at a point")
+        if known is None:
+
+            def beside(instance: Instance) -> Array:
+                self.restart_deadline()
+                return self._evaluation(instance, heading, arrays).beside()[None]
+
+            known, _ = find_reuse(self.load_fmu, beside, self.new_watch)
+            self.learned["restart at a point"] = known
+        if known == "process":
+            raise RunFailed(
+                "there are no derivatives by parameters at a point: neither a reset nor a new instance brings the FMU back"
+                " to its start",
+                float(heading["time"]),
+                "leave the parameters out; derivatives of runs can be had, each run has a new process",
+            )
+        return known
+
+    def _evaluation(
+        self, instance: Instance, heading: Mapping[str, Any], arrays: Mapping[str, Array]
+    ) -> PointEvaluation:
+        """Return the FMU at the point of a request."""
+        names = tuple(heading["outputs"])
+        return PointEvaluation(instance, heading["values"], arrays.get("x"), arrays["u"], heading["time"], names)
+
     def _point(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """Return derivatives, outputs and their Jacobian at a point."""
-        point = PointEvaluation(
-            self.instance, heading["values"], arrays.get("x"), arrays["u"], heading["time"], tuple(heading["outputs"])
-        )
+        if self.isolated and "restart" in heading:  # of this process alone
+            self.learned = {**self.learned, "restart": heading["restart"]}
+        point = self._evaluation(self.instance, heading, arrays)
         derivatives, outputs = point.evaluate()
         jacobian = point.jacobian(heading["parameters"], heading["sizes"], check=heading["check"])
         return {"error": jacobian.error, "near": jacobian.near}, {

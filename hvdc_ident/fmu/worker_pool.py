@@ -122,7 +122,7 @@ class WorkerPool:
     """The workers of one FMU. A pickled pool has none; it starts its own where it is unpickled.
 
     learned: what was found out about the FMU in its first runs, for later workers: "restart", how it is brought back to
-    its start (see `hvdc_ident.fmu.instance`); "derivatives", by parameter whether a run confirmed the FMU's own.
+    its start (see `hvdc_ident.fmu.instance`), and "restart at a point"; "derivatives", by parameter whether a run confirmed the FMU's own.
     cache: runs that callers keep, see `hvdc_ident.fmu.terminal_effects`. memory: bytes of the first worker after its last
     answer. sensitivity_error: largest relative error of a derivative by differences. started: processes so far. runs:
     whole runs of the FMU so far, those for derivatives among them.

@@ -14,7 +14,7 @@ from fmu_limits import PATIENT
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fmu import read_fmu
+from hvdc_ident.fmu import at_point, read_fmu
 
 pytestmark = needs_compiler
 
@@ -147,3 +147,75 @@ def test_an_iteration_of_a_fit_takes_one_run_and_one_a_parameter(fmu):
         simulate(model, STEP, values)
         simulate(model, STEP, values, names)
     assert model.pool.runs - before == 4 * (len(names) + 1)
+
+
+ONCE = "static int count;\n#define AT_INSTANTIATE if (count++) abort()\n#include <stdlib.h>\n"
+"""An FMU that a process can make once: its tool ends the process at the second instance, and does not say so before."""
+
+
+def changed(name, *code, **how):
+    """The spring with its own derivatives, and code before it."""
+    model = spring(name, **how)
+    return replace(model, code="".join(code) + model.code)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_an_fmu_that_can_be_made_once_is_checked_and_run_by_resets(tmp_path, version):
+    """The derivatives by its parameters need other values of them, one after the other; columns as in closed form."""
+    found = read_fmu(build(changed("once", ONCE), tmp_path, version), interface="model-exchange", limits=PATIENT)
+    before = found.pool.started
+    told = found.capabilities.found
+    assert told["brought back to its start by"] == "reset" and told["two short runs"].startswith("equal")
+    assert told["derivatives at the start"].startswith("directional ones agree with differences, for all 7")
+    run = simulate(found, STEP, {}, ["m", "k"])
+    assert run.notes["sensitivities"] == "directional derivatives: m, k"
+    h = 1e-5
+    wanted = (response(STEP.time, m=2.0 + h) - response(STEP.time, m=2.0 - h)) / (2 * h)
+    assert np.abs(run.gradient("y")[:, 0] - wanted).max() < 1e-4
+    assert found.pool.started == before + 1
+    found.pool.close()
+
+
+def test_a_reset_that_keeps_a_parameter_which_the_fmu_moved_itself_restores_its_value(tmp_path):
+    """The mass moves with each question for its derivative, and a reset restores the states alone."""
+    kept = "#define AT_RESET M->r[0] = M->r[1] = 0; return 0\n"
+    found = read_fmu(
+        build(changed("keeps", kept, more=("SHIFTS=10",)), tmp_path), interface="model-exchange", limits=PATIENT
+    )
+    run = simulate(found, STEP, {}, ["m", "k"])
+    assert found.pool.learned["restart"] == "reset"
+    assert run.notes["sensitivities"] == "differences of runs: m; directional derivatives: k"
+    assert np.abs(run["y"] - response(STEP.time)).max() < 2e-7
+    found.pool.close()
+
+
+@pytest.mark.parametrize(
+    ("way", "code"),
+    [
+        ("reset", ONCE),
+        ("instance", "#define AT_RESET abort()\n#include <stdlib.h>\n"),
+        ("instance", "static int frozen;\n#define AT_RESET frozen = 1\n#define AT_INSTANTIATE frozen = 0\n"),
+        (
+            "process",
+            "static int frozen;\n#define AT_RESET frozen = 1\n#define AT_INSTANTIATE frozen = count++\nstatic int count;\n",
+        ),
+    ],
+    ids=["once", "fatal", "frozen", "spoilt"],
+)
+def test_derivatives_by_parameters_before_any_run_come_from_a_restart_that_repeats_the_point(tmp_path, way, code):
+    """At rest, where x' = 0 and v' = (k u - k x)/m = 0 whatever the model does: a reset is judged beside it."""
+    model = changed(f"spring-{way}", code, own=False)
+    frozen = "for (int i = 2; i < 4; i++) r[i] *= 1 - frozen;" if "frozen" in code else ""
+    model = replace(model, code=model.code.replace("    r[9] =", f"    {frozen}\n    r[9] ="))
+    found = read_fmu(build(model, tmp_path), interface="model-exchange", limits=PATIENT)
+    values, rest = {"u": 0.5, "k": 6.0}, np.array([0.4, 0.0])
+    if way == "process":
+        with pytest.raises(SimulationError, match="neither a reset nor a new instance brings the FMU back"):
+            at_point(found, values, rest, ["twice"], ["m", "k"])
+    else:
+        point = at_point(found, values, rest, ["twice"], ["m", "k"])
+        wanted = [[0, 1, 0, 0, 0], [-3, -0.25, 3, -0.15, 0.05], [0, 2, 0, 0, 0]]
+        assert point.jacobian == pytest.approx(np.array(wanted), abs=1e-6)
+        assert "restart" not in found.pool.learned
+        assert found.pool.learned["restart at a point"] == way
+    found.pool.close()
