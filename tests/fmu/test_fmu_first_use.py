@@ -182,8 +182,11 @@ def test_a_reset_that_keeps_a_parameter_which_the_fmu_moved_itself_restores_its_
     found = read_fmu(
         build(changed("keeps", kept, more=("SHIFTS=10",)), tmp_path), interface="model-exchange", limits=PATIENT
     )
-    run = simulate(found, STEP, {}, ["m", "k"])
+    simulate(found, STEP)
     assert found.pool.learned["restart"] == "reset"
+    point = at_point(found, {"u": 0.5, "k": 6.0}, np.array([0.4, 0.0]), ["twice"], ["k", "m"])
+    assert point.jacobian[:, 3:] == pytest.approx(np.array([[0.0, 0.0], [0.05, -0.15], [0.0, 0.0]]), abs=1e-6)
+    run = simulate(found, STEP, {}, ["m", "k"])
     assert run.notes["sensitivities"] == "differences of runs: m; directional derivatives: k"
     assert np.abs(run["y"] - response(STEP.time)).max() < 2e-7
     found.pool.close()
