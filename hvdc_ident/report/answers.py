@@ -157,10 +157,13 @@ class Answers:
 
     @property
     def condition(self) -> str:
-        """Sentence on what the values that count rest on; empty where what is left is noise."""
-        if not self.conditional:
-            return ""
-        return "They hold only if nothing else is missing: what remains is more than the noise."
+        """Sentences on what the values that count rest on; empty where the search was sure and what is left is noise."""
+        found = []
+        if self.counting.name == "fit" and (doubt := str(self.fit.get("search_doubt") or "")):
+            found.append(f"They may not be the best there are: {doubt}.")
+        if self.conditional:
+            found.append("They hold only if nothing else is missing: what remains is more than the noise.")
+        return " ".join(found)
 
     def interval_words(self, *, effect: bool) -> str:
         """What the intervals of the values with the effect, or else of the fitted ones, are called."""

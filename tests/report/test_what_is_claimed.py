@@ -182,6 +182,24 @@ def test_without_an_effect_the_values_of_the_fit_are_judged(tmp_path: Path) -> N
     assert "nothing is missing" in letter and "p = " not in letter and "score" not in letter
 
 
+def test_an_optimum_of_one_start_alone_is_doubted_on_every_page(tmp_path: Path) -> None:
+    doubt = "one start of 8 alone reached the lowest cost, 27.8 (7 ended at 5 higher costs from 113 to 5760)"
+    fit = {"status": "converged", "message": f"{doubt}; 1 of 8 runs reached this optimum", "search_doubt": doubt}
+    fit |= {
+        "fitted": ["Tg"],
+        "values": {"Tg": 0.2},
+        "held": {},
+        "estimates": {"Tg": {"value": 0.2, "ci95": [0.19, 0.21]}},
+    }
+    nothing = lagging(
+        verdict="no-evidence", effects=[], findings=[], augmented_model=None, text="No sign of an effect."
+    )
+    results = hydro(tmp_path, fit=fit, discrepancy=nothing)
+    assert f"They may not be the best there are: {doubt}." in tile(first_screen(results), "values")
+    page_of_letter = write_letter(tmp_path).read_text(encoding="utf-8")
+    assert f"The values may not be the best there are: {doubt}." in words(page_of_letter)
+
+
 MORE = {
     "remaining": {"adequate": False, "material": True},
     "remainder": {"share": 0.02, "p": 0.01, "held_out": 0.0, "at": "Ut", "below_tolerance": True},
