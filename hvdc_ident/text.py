@@ -124,6 +124,27 @@ def in_python(text: str) -> str:
     return text.replace("--force NAME", 'force=["NAME"]')
 
 
+def value_by_place(values: Sequence[Mapping[str, Any]]) -> str:
+    """Return a value that depends on what is missing where, as "0.1 s if the lag is at ya, 0.4 s if it is at a or b".
+
+    values: {value, unit, effect, at, from} by place, as `values_by_place` of a diagnosis has them. Places with the same value to
+    three digits stand together.
+    """
+    places: dict[str, dict[str, list[str]]] = {}
+    for v in values:
+        brought = f" with {v['from']}" if v.get("from") else ""
+        at = places.setdefault(f"{v['value']:.3g} {v.get('unit') or ''}".rstrip(), {}).setdefault(v["effect"], [])
+        at.append(f"{listed(v['at'])}{brought}")
+    one_effect = len({v["effect"] for v in values}) == 1
+    told = []
+    for k, (value, by_effect) in enumerate(places.items()):
+        where = " or ".join(
+            f"{'it' if one_effect and k else f'the {effect}'} is at {one_of(at)}" for effect, at in by_effect.items()
+        )
+        told.append(f"{value} if {where}")
+    return ", ".join(told)
+
+
 def form_of(effect: Mapping[str, Any]) -> str:
     """Return the name of an effect in the results, with its formula where it is outside the catalogue."""
     return f"{effect['effect']} {effect.get('expression', '')}".rstrip()

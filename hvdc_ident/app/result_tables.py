@@ -72,14 +72,14 @@ def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = F
 
 def finding_table(diagnosis: Mapping[str, Any]) -> Table:
     """Return what may be missing: effects with probabilities, sizes and likely places."""
-    rows = []
+    rows, depend = [], diagnosis.get("values_by_place") or {}
     for f in diagnosis.get("findings") or []:
         sizes = []
         for name, p in (f.get("parameters") or {}).items():
             within = interval_text(p.get("ci95"))
             value = f"{name} = {p['value']:.{figures_of(p.get('ci95'), 4)}g} {p.get('unit') or ''}".rstrip()
             sizes.append(f"{value} ({within})" if within else value)
-        places = [f"{at} ({percentage(p)})" for at, p in places_of(f["places"]).items()]
+        places = [f"{at} ({percentage(p)})" for at, p in places_of(f["places"], depend=depend).items()]
         more = [f"{len(places) - PLACES} more"] if len(places) > PLACES else []
         where = "; ".join([*places[:PLACES], *more])
         rows.append((one_of(f["same_as"]), percentage(f["probability"]), "; ".join(sizes), where))

@@ -36,8 +36,8 @@ class Supposition:
 def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) -> tuple[Supposition, ...]:
     """Return the models with what a diagnosis found missing: the best one, then those that explain the records as well.
 
-    The rivals have the parameters of the best one, for the results keep no others: `refitted` gives them their own. None
-    where nothing was put in; a rival that cannot be built here is left out.
+    The rivals have the parameters that their refits came to, and those of the best one where the results keep no others:
+    `refitted` gives them all. None where nothing was put in; a rival that cannot be built here is left out.
     """
     card = folder / Path(str(diagnosis.get("augmented_model") or "")).name
     if not diagnosis.get("augmented_model") or not card.is_file():
@@ -48,14 +48,19 @@ def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) ->
     gains = {n: v for n, v in (diagnosis.get("parameters_after") or {}).items() if n in study.model.parameters}
     plant = study.model.with_values(gains)
     for k, group in enumerate(diagnosis.get("ambiguity") or []):
-        for other in group[1:]:
+        for other in (r for r in group if k >= len(found) or _place_of(r) != _place_of(found[k])):
             effects = [*found[:k], other, *found[k + 1 :]]
+            own = {n: v["value"] for n, v in (other.get("values") or {}).items() if n in gains}
             try:
-                model = hi.apply_effects(plant, [use_of(e) for e in effects])
+                model = hi.apply_effects(plant.with_values(own), [use_of(e) for e in effects])
             except HvdcIdentError:  # a formula, or an unknown input: no effect that can be put in by its name
                 continue
             rivals.append(Supposition(_named(effects), model, _sizes(study, model), fitted=False))
     return tuple(rivals)
+
+
+def _place_of(effect: Mapping[str, Any]) -> tuple[str, tuple[str, ...], str]:
+    return effect["effect"], tuple(effect["at"]), effect.get("from", "")
 
 
 def refitted(study: hi.Study, rival: Supposition) -> Supposition:

@@ -12,6 +12,7 @@ import numpy as np
 
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
+from hvdc_ident.discrepancy.implied import TIED, apart, implied, nearest, off_given
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import Hypothesis, Rival
@@ -46,7 +47,9 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
         c = found.candidates[trial.pick.candidate]
         more = trial.refit.count - found.winner.refit.count
         spared = more == 1 and (not alone or _as_likely(found, c, options))
-        rival = Rival(c.effect, c.at, behind, FrozenMap(trial.refit.sizes(trial.refit.placed[-1])), c.source)
+        sizes = FrozenMap(trial.refit.sizes(trial.refit.placed[-1]))
+        values, off = implied(trial.refit), off_given(trial.refit)
+        rival = Rival(c.effect, c.at, behind, sizes, c.source, values=values, off_given=off)
         if good and behind <= options.set_bic + (found.ruler.price if spared else 0.0):
             group.append(rival)
         elif good and more <= 0 and trial.told >= (1.0 - TOLERANCE) * found.winner.told:
@@ -130,7 +133,10 @@ def formula_rivals(
 def _rival(trial: CandidateFit, behind: float) -> Rival:
     placed = trial.refit.placed[-1]
     c, sizes = placed.candidate, FrozenMap(trial.refit.sizes(placed))
-    return Rival(c.effect, c.at, behind, sizes, c.source, expression=placed.use.expression)
+    values, off = implied(trial.refit), off_given(trial.refit)
+    return Rival(
+        c.effect, c.at, behind, sizes, c.source, expression=placed.use.expression, values=values, off_given=off
+    )
 
 
 def _unfitted(found: Round, best: float, options: DiagnosisOptions) -> list[Rival]:
@@ -162,7 +168,8 @@ def _at_rest(found: Round, group: Sequence[Rival]) -> list[Rival]:
         entry, gain = effects()[c.effect], gains.get(c.at)
         bends = c.still and entry.equivalent_delay is None and entry.states == "none" and not entry.needs_source
         if gain is not None and bends and (entry.needs_grid or gain.parameters.get("k", 0.0) < 1.0):
-            likes.append(Rival(c.effect, c.at, gain.delta_bic, FrozenMap(), refitted=False, same_as="gain"))
+            like = Rival(c.effect, c.at, gain.delta_bic, FrozenMap(), refitted=False, same_as="gain")
+            likes.append(replace(like, values=gain.values, off_given=gain.off_given))
     return likes
 
 
@@ -177,8 +184,8 @@ def _equal(found: Round, group: Sequence[Rival], tries: Callable[[str], bool]) -
         brought = [p.signal(s) for p in paths for s in split_sources(r.source, r.at) if s in p.slots] or [np.empty(0)]
         told = [equality(r.parameters, signal) if r.parameters or not r.refitted else None for signal in brought]
         if all(t is not None for t in told):
-            values = FrozenMap(told[0] or {})
-            equal.append(Rival(other, r.at, r.delta_bic, values, r.source, refitted=False, same_as=r.effect))
+            sizes = FrozenMap(told[0] or {})
+            equal.append(replace(r, effect=other, parameters=sizes, refitted=False, same_as=r.effect, akin=""))
     return equal
 
 
@@ -207,9 +214,18 @@ class EffectClass:
 
     @property
     def best(self) -> Rival:
-        """The likeliest member of the likeliest effect."""
+        """The likeliest member of the likeliest effect; of those that are as likely the one with the values nearest to the given."""
         own = next(iter(self.equations))
-        return next(r for r, _ in self.members if (r.same_as or r.effect) == own)
+        first = next(r for r, _ in self.members if (r.same_as or r.effect) == own)
+        likely_ones = [r for r, _ in credible(self.members) if (r.same_as or r.effect) == own and r.refitted]
+        tied = [r for r in likely_ones if r.delta_bic <= first.delta_bic + TIED]
+        return nearest(first, tied, lambda r: r.values, lambda r: r.off_given)
+
+    @property
+    def differs(self) -> bool:
+        """True where likely members imply different values of the model's parameters: what these are is not known then."""
+        likely_ones = [r.values for r, _ in credible(self.members) if r.refitted]
+        return any(apart(one, other) for one, other in combinations(likely_ones, 2))
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -290,6 +306,10 @@ def compared(first: Refit, outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
     most = max(evidence.values())
     total = sum(np.exp(v - most) for v in evidence.values())
     order = sorted(evidence, key=lambda k: -evidence[k])[:TOLD]
-    return tuple(
-        Hypothesis(k, evidence[k], unseen(refits[k]), float(np.exp(evidence[k] - most) / total)) for k in order
-    )
+    return tuple(_hypothesis(k, refits[k], evidence[k], float(np.exp(evidence[k] - most) / total)) for k in order)
+
+
+def _hypothesis(names: tuple[str, ...], refit: Refit, evidence: float, probability: float) -> Hypothesis:
+    sizes = tuple(FrozenMap(refit.sizes(p)) for p in refit.placed)
+    values = FrozenMap({n: size.value for n, size in implied(refit).items()})
+    return Hypothesis(names, evidence, unseen(refit), probability, sizes, values)

@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.classes import compared
 from hvdc_ident.discrepancy.clocks import clocks, told
 from hvdc_ident.discrepancy.context import Course, SearchContext
 from hvdc_ident.discrepancy.evidence import louder_than_noise
-from hvdc_ident.discrepancy.explain import at_given, found_of, gap, off_given
+from hvdc_ident.discrepancy.explain import at_given, beside_stand_ins, found_of, gap, off_given
 from hvdc_ident.discrepancy.findings import separating
 from hvdc_ident.discrepancy.latent import Reach
 from hvdc_ident.discrepancy.localise import localise
@@ -28,9 +28,10 @@ from hvdc_ident.discrepancy.race import UNTRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.refit import Refit, judged
 from hvdc_ident.discrepancy.released import stated
 from hvdc_ident.discrepancy.residual_checks import Binned
-from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
+from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect, StandIn
 from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
 from hvdc_ident.discrepancy.signatures.candidates import entries
+from hvdc_ident.discrepancy.stand_ins import stand_ins
 from hvdc_ident.discrepancy.verdict import (
     Judgement,
     findings_of,
@@ -178,11 +179,15 @@ def _assembled(
     beyond = leaves_more_than_noise(
         judgement, last, adequate=rest["adequate"], significance=search.options.significance
     )
-    findings = findings_of(search, outcome, judgement, effects, with_intervals=not beyond)
-    text = headline(judgement, findings, tolerated=keeps_tolerance(search, last))
+    findings, depend = findings_of(search, outcome, judgement, effects, with_intervals=not beyond)
+    text = headline(judgement, findings, depend, tolerated=keeps_tolerance(search, last))
+    others: tuple[StandIn, ...] = ()
     if judgement.verdict == "no-evidence":
         moved = off_given(last, given, rest["adequate"], leaves_a_gap(search, last))
-        findings, text = ((moved,), moved.text) if moved is not None else (findings, text)
+        if moved is not None:
+            others = stand_ins(search, last, outcome.rounds[0], tuple(moved.parameters))
+            moved = beside_stand_ins(moved, others)
+            findings, text = (moved,), moved.text
     if off := clocks(search, last):
         text = f"{text} {told(off)}"
     left, bound = judgement.remainder, outcome.rounds[0].reach
@@ -213,6 +218,8 @@ def _assembled(
         remainder={} if left is None else plain(left) | {"below_tolerance": left.below_tolerance},
         hypotheses=compared(first, outcome),
         latent={} if bound is None else _latent(bound),
+        values_by_place=FrozenMap(depend),
+        stand_ins=others,
     )  # fmt: skip
 
 

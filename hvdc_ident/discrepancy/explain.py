@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.refit import Refit, held_out, unseen
-from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, Table
+from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, StandIn, Table
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
@@ -21,6 +21,8 @@ from hvdc_ident.fit.uncertainty import uncertainty
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures, listed, percentage, quantity
 
+MOST_STAND_INS = 3
+"""Effects that are told beside parameters that are off."""
 MOST_PLACES = 4
 """Signals at most that are asked for."""
 
@@ -175,6 +177,16 @@ def off_given(last: Refit, given: Refit, adequate: bool, matters: bool) -> Findi
         text = f"No effect is missing: {found.text} {explains}"
         text += f"; what remains looks like noise, {louder} as loud as supposed." if matters else "."
     return replace(found, text=text, share=share)
+
+
+def beside_stand_ins(moved: Finding, others: Sequence[StandIn]) -> Finding:
+    """The finding on parameters that are off, told beside the effects that explain the records as well with these as given."""
+    if not others:
+        return moved
+    told = "; or ".join(f"{s.text} (with {listed(s.values)} as given)" for s in others[:MOST_STAND_INS])
+    more = f"; or one of {len(others) - MOST_STAND_INS} more effects" if len(others) > MOST_STAND_INS else ""
+    text = moved.text.replace("No effect is missing:", "No effect is needed:")
+    return replace(moved, text=f"{text} The records do not tell this from: {told}{more}.")
 
 
 def moved_parameters(last: Refit, names: Collection[str]) -> Finding | None:

@@ -15,6 +15,7 @@ from hvdc_ident.discrepancy.outside.filtered import filtered, filters
 from hvdc_ident.discrepancy.outside.law import law
 from hvdc_ident.discrepancy.proposals import (
     View,
+    by_absorbed,
     by_latent,
     by_score,
     by_score_elsewhere,
@@ -50,6 +51,9 @@ def explored(
     trials = refitted(search, opened, taken, f"round {number}")
     asked: set[Hashable] = set()
     opened, trials = with_neighbours(search, opened, trials, field, number, asked)
+    if (absorbed := by_absorbed(scored)) and not search.spent:
+        text = f"round {number}: what the parameters may stand for"
+        trials = best_each([*trials, *refitted(search, opened, absorbed, text, trials)])
     if not (_noise(search, trials) or search.spent):
         given = _entrants(scored, by_score_elsewhere(search, scored, views))
         if given:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -12,23 +13,32 @@ from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, credible
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.explain import advice, sentence
 from hvdc_ident.discrepancy.formula import filled
+from hvdc_ident.discrepancy.implied import apart
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival
+from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival, ValueAt
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures_of, listed, quantity
 
 SHARED = ("s", "rad/s", "Hz", "")
 """Units of parameters that mean the same at every place."""
+TOLD = 3
+"""Places with other values of the parameters that a sentence lists."""
 
 
 def finding(
-    found: Round, one: EffectClass, put_in: FoundEffect | None = None, *, with_intervals: bool = True
+    found: Round,
+    one: EffectClass,
+    put_in: FoundEffect | None = None,
+    values: Mapping[str, EffectSize] | None = None,
+    *,
+    with_intervals: bool = True,
 ) -> Finding:
     """The class as it is told: what one of its likely members does, and where else it may be.
 
     put_in: what was put into the model: where that is a likely member, it is the one, with its sizes beside all other effects;
-    else it is the likeliest, as its own refit has it. with_intervals: whether the sentence tells the intervals of the sizes.
+    else it is the likeliest, as its own refit has it. values: of the model's own parameters beside what was put in.
+    with_intervals: whether the sentence tells the intervals of the sizes.
     """
     refits = {_key_of(t.refit): t.refit for t in found.trials}
     likely_ones = credible(one.members)
@@ -52,11 +62,53 @@ def finding(
     by_place: dict[tuple[tuple[str, ...], str], float] = {}
     for r, p in likely_ones:
         by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
-    places = tuple(Place(at, p, source) for (at, source), p in sorted(by_place.items(), key=lambda kv: -kv[1]))
+    told = _one_each(likely_ones, best)
+    shown = [
+        Place(at, p, source, r.effect, _with_spans(r, refits.get(_key(r))), r.values)
+        for (at, source), p in sorted(by_place.items(), key=lambda kv: (kv[0] != (best.at, best.source), -kv[1]))
+        for r in [told[at, source]]
+    ]
+    if own is not None and (shown[0].at, shown[0].source) == (best.at, best.source):
+        # Values that effects found later have moved are not to be compared with those of the other places.
+        latest = FrozenMap(values) if values and not apart(best.values, values) else best.values
+        shown[0] = replace(shown[0], parameters=own.parameters, values=latest)
+    places = tuple(shown)
     does = own.text if own is not None else sentence(best, best.parameters, filled(best.expression, best.parameters))
     sizes = _sizes(parameters) if with_intervals else ""
     text = f"{does}{sizes}{_others(one, best)}{_apart(best, places)}."
     return Finding(best.effect, _names(one, best.effect), one.probability, FrozenMap(parameters), places, text, delay)
+
+
+def _one_each(members: Sequence[tuple[Rival, float]], best: Rival) -> dict[tuple[tuple[str, ...], str], Rival]:
+    """Return by place and source one hypothesis: of the effect of `best` where that was refitted, else the likeliest that was."""
+    order = sorted((r for r, _ in members), key=lambda r: (r is not best, not r.refitted, r.effect != best.effect))
+    return {(r.at, r.source): r for r in reversed(order)}
+
+
+def _with_spans(rival: Rival, refit: Refit | None) -> FrozenMap[EffectSize]:
+    """The sizes of a hypothesis with their intervals; none that its effect does not have there."""
+    known = effects()[rival.effect].parameters
+    sizes = {
+        n: v for n, v in rival.parameters.items() if n in known and not (known[n].optional and v == known[n].neutral)
+    }
+    return FrozenMap({n: EffectSize(v, _span(refit, n), known[n].unit) for n, v in sizes.items()})
+
+
+def values_by_place(each: Sequence[Finding]) -> dict[str, tuple[ValueAt, ...]]:
+    """Return by parameter of the model its value at every likely place of findings that stand for one effect, where these differ.
+
+    A value that is the same at all of them, within its interval, is left out: it does not depend on what is missing where.
+    """
+    places = [p for f in each for p in f.places if p.values]
+    names = dict.fromkeys(n for one, other in combinations(places, 2) for n in apart(one.values, other.values))
+    return {
+        n: tuple(
+            ValueAt(p.values[n].value, p.values[n].ci95, p.values[n].unit, p.effect, p.at, p.source)
+            for p in places
+            if n in p.values
+        )
+        for n in names
+    }
 
 
 def _over_places(size: EffectSize, before: EffectSize, spans: Sequence[tuple[float, float]]) -> EffectSize:
@@ -151,12 +203,31 @@ def _others(one: EffectClass, best: Rival) -> str:
 
 
 def _apart(best: Rival, places: Sequence[Place]) -> str:
-    """The other places and sources, as the sentence goes on."""
-    places_too = list(dict.fromkeys(listed(p.at) for p in places if p.at != best.at))
-    sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in places if p.source and p.source != best.source))
-    apart = [f"this place from {_some(places_too)}"] if places_too else []
-    apart += [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if best.source and sources_too else []
-    return f"; the records do not tell {', nor '.join(apart)}" if apart else ""
+    """The other places and sources, as the sentence goes on; with what each implies where that is another value of a parameter."""
+    own = places[0]
+    names = list(dict.fromkeys(n for p in places[1:] for n in apart(own.values, p.values)))
+    others = [p for p in places[1:] if apart(own.values, p.values)]
+    same = [p for p in places if p not in others]
+    places_too = list(dict.fromkeys(listed(p.at) for p in same if p.at != best.at))
+    sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in same if p.source and p.source != best.source))
+    from_others = [f"this place from {_some(places_too)}"] if places_too else []
+    from_others += (
+        [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if best.source and sources_too else []
+    )
+    from_others += [f"this place from {_with_values(p, names)}" for p in others[:TOLD]]
+    from_others += [f"from {len(others) - TOLD} more with other values"] if len(others) > TOLD else []
+    then = f", where {_values(own.values, names)}" if others else ""
+    return f"{then}; the records do not tell {', nor '.join(from_others)}" if from_others else ""
+
+
+def _with_values(place: Place, names: Sequence[str]) -> str:
+    """A place with the sizes of the effect there and the values that it implies."""
+    brought = f" with {_brought(place.source, place.at)}" if place.source else ""
+    return f"{listed(place.at)}{brought}, where {_values({**place.parameters, **place.values}, [*place.parameters, *names])}"
+
+
+def _values(sizes: Mapping[str, EffectSize], names: Sequence[str]) -> str:
+    return listed(f"{n} is {quantity(sizes[n].value, sizes[n].unit)}" for n in names if n in sizes)
 
 
 def _brought(source: str, at: Sequence[str]) -> str:

@@ -20,6 +20,7 @@ from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import Pick
 from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.refit_jobs import as_given
 from hvdc_ident.discrepancy.scores import Scores, runs, scored
 from hvdc_ident.discrepancy.signatures.block import block, parameter
@@ -34,6 +35,8 @@ from hvdc_ident.model import Model
 
 SIZES = 3
 """Sizes of one effect at one place that are proposed at most: a cost over sizes may have several minima."""
+WORTHY = 0.5
+"""Share of the best score from which the trace that the parameters leave of an effect is worth a refit."""
 COARSE = 2
 """Parts of an interval that an effect with corners is stepped in: what is looked at are means over many."""
 
@@ -86,6 +89,32 @@ def by_score_elsewhere(search: SearchContext, opened: Round, views: Callable[[],
         )
         picks += _best_sizes(opened, scores, tuple(view.nominal.theta.tolist()))
     return picks
+
+
+def by_absorbed(opened: Round) -> list[Pick]:
+    """The candidates of which the parameters take up all but a trace, begun with the gains as they were given, the best first.
+
+    With gains that stand for such an effect its part of the misfit is gone already, and what is left is what the gains do
+    otherwise. Those whose trace is nothing beside the best score explain less than that does.
+    """
+    scores, before, best = opened.scores, opened.before, dict[int, int]()
+    t = scores.t_absorbed
+    least = max(scores.threshold(0.5), WORTHY * float(scores.t.max(initial=0.0)))
+    for k in map(int, np.flatnonzero(t > least)):
+        n = scores.columns[k].candidate
+        if opened.reaches(opened.candidates[n]) and (n not in best or t[k] > t[best[n]]):
+            best[n] = k
+    given = before.theta_at_given
+    for i, f in ((i, before.problem.free[i]) for i in before.gains):
+        given[i] = min(max(f.given, f.min), f.max)
+    picks = []
+    for n, k in best.items():
+        factor = 1.0 if has_to_be_met(opened.candidates[n]) else float(scores.expected[k])
+        probe = scores.columns[k].probe
+        picks.append(Pick(n, probe, factor, float(t[k]), tuple(given.tolist()), float(t[k])))
+    return sorted(picks, key=lambda p: (-round(p.fall, 6), len(opened.candidates[p.candidate].at), p.candidate))[
+        :SHORTLIST
+    ]
 
 
 def _best_sizes(opened: Round, scores: Scores, gains: tuple[float, ...]) -> list[Pick]:

@@ -57,9 +57,9 @@ class Refit:
 
     chi2: sum of squared residuals (`ResidualBlock.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
     holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press:
-    the same for parts of the fitted ones predicted from the rest. std: standard deviation of each effect parameter, by its
-    name in the model. apart: of each effect, by how many standard deviations its parameters together are off doing
-    nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
+    the same for parts of the fitted ones predicted from the rest. std: standard deviation of each free parameter, of the
+    effects and of the model, by its name in the model. apart: of each effect, by how many standard deviations its parameters
+    together are off doing nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
     """
 
     model: AnyModel
@@ -221,8 +221,7 @@ def judged(refit: Refit) -> Refit:
     chi2 = sum(b.chi2 + b.taken for b in blocks)
     rows = sum(b.residual.size for b in blocks)
     wider = float(np.sqrt(max(1.0, chi2 / max(rows - len(names), 1))))
-    own = [n for p in refit.placed for n in p.names.values() if n in names]
-    std = {n: None if (s := known.std(n)) is None else wider * s for n in own}
+    std = {f.name: None if (s := known.std(f.name)) is None else wider * s for f in refit.problem.free}
     apart = tuple(_apart_from_nothing(refit, p, known, blocks) / wider for p in refit.placed)
     return replace(
         refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=holdout(refit.problem, refit.theta),

@@ -12,7 +12,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import InputError, SteadyStateError
 from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import interval_text, interval_words, percentage
+from hvdc_ident.text import interval_text, interval_words, percentage, value_by_place
 
 if TYPE_CHECKING:
     from hvdc_ident.model import AnyModel
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable"]
 AUGMENTED = "augmented-model.toml"
+AS_LINES = ("augmented", "candidates", "effects", "ambiguity", "findings", "values_by_place", "stand_ins")
+"""Fields that JSON writes in another form."""
 SHOWN = 10
 """Candidates in the figure, the best by BIC."""
 Table = Mapping[str, Mapping[str, float | None]]
@@ -63,7 +65,8 @@ class Rival:
     refitted: whether that comes from a refit. expression: of a formula outside the catalogue, with its coefficients' names.
     same_as: the member of the set that is the same equation at the same place; empty where none is. akin: the likeliest effect
     of the set that adds the same to the same signals in these records, within the tolerance; empty where none does. prior: its
-    probability given its effect, before any data: every place and source of an effect is as likely as another.
+    probability given its effect, before any data: every place and source of an effect is as likely as another. values: of the
+    model's own free parameters with it, where it was refitted. off_given: how far these are from the given ones.
     """
 
     effect: str
@@ -76,6 +79,8 @@ class Rival:
     same_as: str = ""
     akin: str = ""
     prior: float = 1.0
+    values: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
+    off_given: float = 0.0
 
     @property
     def late(self) -> float | None:
@@ -85,10 +90,29 @@ class Rival:
 
 @dataclass(frozen=True)
 class Place:
-    """Where an effect may be: its insertion points, the probability given the effect, and the signal that it brings in."""
+    """Where an effect may be: its insertion points, the probability given the effect, and the signal that it brings in.
+
+    effect: the likeliest of the finding's effects there. parameters: its sizes if it is there; values: those of the model's own
+    free parameters then. Both are empty where it was not refitted there.
+    """
 
     at: tuple[str, ...]
     probability: float
+    source: str = ""
+    effect: str = ""
+    parameters: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
+    values: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
+
+
+@dataclass(frozen=True)
+class ValueAt:
+    """The value of a parameter of the model if an effect is at a place: of one that the records do not tell from others."""
+
+    value: float
+    ci95: tuple[float | None, float | None] | None
+    unit: str
+    effect: str
+    at: tuple[str, ...]
     source: str = ""
 
 
@@ -97,9 +121,10 @@ class Finding:
     """A missing effect, wherever it is, or the parameters whose values are off.
 
     same_as: all names of it, its own first: effects that are the same equation there, or do the same in these records.
-    probability: of the effect, summed over its places. parameters: at the likeliest place; their intervals hold over the
-    likely places. places: the likely ones, the likeliest first. equivalent_delay: by how long it delays a slow signal, s, with
-    the interval over the likely places, where one size makes it; None for what is no delay. share: of the gap that it explains
+    probability: of the effect, summed over its places. parameters: at the first place; their intervals hold over the
+    likely places. places: the likely ones: first that of `parameters`, which of places that explain the records as well is the one
+    whose `values` are nearest to the given ones, then the likeliest first. equivalent_delay: by how long it delays a slow signal,
+    s, with the interval over the likely places, where one size makes it; None for what is no delay. share: of the gap that it explains
     with the other findings.
     """
 
@@ -114,17 +139,36 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class StandIn:
+    """An effect that explains the records as well as other values of some parameters, with these as given.
+
+    delta_bic: how far it is behind those. values: the given ones that it goes with. text: one sentence on the effect.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    delta_bic: float
+    parameters: FrozenMap[float]
+    values: FrozenMap[float]
+    text: str
+    source: str = ""
+
+
+@dataclass(frozen=True)
 class Hypothesis:
     """A compared hypothesis: the effects in the model, by name and place; none for the nominal model.
 
     log_evidence: in nats over the nominal model, of fitted and held-out data. held_out: root mean square of the held-out
-    residual in noise units. probability: among the hypotheses compared.
+    residual in noise units. probability: among the hypotheses compared. parameters: by effect its sizes; values: of the model's
+    own free parameters.
     """
 
     effects: tuple[str, ...]
     log_evidence: float
     held_out: float | None
     probability: float
+    parameters: tuple[FrozenMap[float], ...] = ()
+    values: FrozenMap[float] = field(default_factory=FrozenMap)
 
 
 @dataclass(frozen=True)
@@ -188,7 +232,9 @@ class Diagnosis(Shown):
     findings: what is missing, each effect with its probability and its likely places, the likeliest first. remainder: {share of
     the gap, held_out, noise_units, p, at, below_tolerance}. hypotheses: those compared, the likeliest first. latent: by insertion
     point {bound, curve}: the share of the gap that any effect there could explain, and by experiment {time, value} of what would
-    have to be added there (at the three best points; empty at the others).
+    have to be added there (at the three best points; empty at the others). values_by_place: of each parameter whose value depends
+    on which of the likely effects or places is the true one, the value of each; `parameters_after` has the first of them.
+    stand_ins: where values that are off explain the gap, the effects that explain it as well with these values as given.
     """
 
     verdict: Verdict
@@ -215,18 +261,18 @@ class Diagnosis(Shown):
     hypotheses: tuple[Hypothesis, ...] = ()
     latent: Mapping[str, Any] = field(default_factory=dict)
     beyond_noise: bool = False
+    values_by_place: FrozenMap[tuple[ValueAt, ...]] = field(default_factory=FrozenMap)
+    stand_ins: tuple[StandIn, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The diagnosis as JSON takes it; `augmented_model` is the name of the card that `files` holds."""
-        out = {
-            name: plain(getattr(self, name))
-            for name in self.__dataclass_fields__
-            if name not in ("augmented", "candidates", "effects", "ambiguity", "findings")
-        }
+        out = {name: plain(getattr(self, name)) for name in self.__dataclass_fields__ if name not in AS_LINES}
         out["effects"] = [_member(e) for e in self.effects]
         out["ambiguity"] = [[_member(r) for r in group] for group in self.ambiguity]
-        out["findings"] = [plain(f) | {"places": [_named(p) for p in f.places]} for f in self.findings]
-        out["candidates"] = [_named(line) for line in self.candidates]
+        out["findings"] = [plain(f) | {"places": [as_line(p) for p in f.places]} for f in self.findings]
+        out["stand_ins"] = [as_line(s) for s in self.stand_ins]
+        out["values_by_place"] = {n: [as_line(v) for v in each] for n, each in self.values_by_place.items()}
+        out["candidates"] = [as_line(line) for line in self.candidates]
         out["augmented_model"] = next(iter(self.files), None)
         return out
 
@@ -248,7 +294,14 @@ class Diagnosis(Shown):
         given = ", ".join(f"{n} {v:.6g}" for n, v in self.parameters_before.items())
         about = (self.augmented.description or self.augmented.name).rstrip(". ")
         about += f"; fitted values, with what was added to the model; given were {given}"
+        for name, values in self._by_place.items():
+            about += f"; {name} depends on what is missing where: {values}"
         return {AUGMENTED: write_card(replace(card, description=about))}
+
+    @property
+    def _by_place(self) -> dict[str, str]:
+        """The values that depend on which of the likely effects and places is the true one, in words, by parameter."""
+        return {n: value_by_place([as_line(v) for v in each]) for n, each in self.values_by_place.items()}
 
     def _screen(self) -> Iterator[str | TextTable]:
         yield f"Diagnosis: {self.verdict}. {self.text}"
@@ -272,7 +325,8 @@ class Diagnosis(Shown):
         ]
         yield TextTable(("missing", "probability", "likely at", "places"), tuple(found)) if found else ""
         changed = [
-            (n, self.parameters_before[n], self.parameters_refitted[n], v) for n, v in self.parameters_after.items()
+            (n, self.parameters_before[n], self.parameters_refitted[n], self._by_place.get(n, v))
+            for n, v in self.parameters_after.items()
         ]
         yield TextTable(("parameter", "given", "refitted", "with effects"), tuple(changed)) if changed else ""
         advice = (self.separating_experiment or {}).get("text")
@@ -343,13 +397,14 @@ def _two_axes() -> Any:
     return plt.subplots(1, 2, **settings)[1]
 
 
-def _named(value: FoundEffect | Rival | Line | Place) -> dict[str, Any]:
+def as_line(value: FoundEffect | Rival | Line | Place | ValueAt | StandIn) -> dict[str, Any]:
     """A line with `from` only where a signal is brought in."""
     out = {k: plain(getattr(value, k)) for k in value.__dataclass_fields__ if k != "source"}
     return out | ({"from": value.source} if value.source else {})
 
 
 def _member(value: FoundEffect | Rival) -> dict[str, Any]:
-    """Return the line of `_named`, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
-    out = {k: v for k, v in _named(value).items() if k != "prior" and (k not in ("expression", "same_as", "akin") or v)}
+    """Return the line of `as_line`, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
+    left_out, optional = ("prior", "off_given"), ("expression", "same_as", "akin")
+    out = {k: v for k, v in as_line(value).items() if k not in left_out and (k not in optional or v)}
     return out | ({} if value.late is None else {"late": value.late})

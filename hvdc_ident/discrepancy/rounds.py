@@ -11,6 +11,7 @@ import numpy as np
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, behinds, best_of, evidence_between, objections
 from hvdc_ident.discrepancy.explore import explored
+from hvdc_ident.discrepancy.implied import TIED, implied, nearest, off_given
 from hvdc_ident.discrepancy.latent import reach
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import FIELD
@@ -83,7 +84,8 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
     """The round with its refits ranked and its winner, or what speaks against the best.
 
     Ranked by what the fitted and the held-out data say together. Of those that are as good the likeliest wins: an effect's
-    probability before any data is shared by all its places and sources, so an offset goes before one of many couplings.
+    probability before any data is shared by all its places and sources, so an offset goes before one of many couplings. Of those
+    that are as likely and imply other values of the parameters that one wins whose values are nearest to the given ones.
     """
     sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
@@ -96,8 +98,12 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
     level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
     refused = {id(t): against(search, before, t, opened, first=number == 1) for t in level}
     many = Counter(c.effect for c in found)
-    likeliest = sorted(level, key=lambda t: 2.0 * np.log(many[found[t.pick.candidate].effect]) - t.told)
-    winner = next((t for t in likeliest if not refused[id(t)]), None)
+    unlikely = {id(t): 2.0 * np.log(many[found[t.pick.candidate].effect]) - t.told for t in level}
+    likeliest = sorted((t for t in level if not refused[id(t)]), key=lambda t: unlikely[id(t)])
+    winner = next(iter(likeliest), None)
+    if winner is not None:
+        tied = [t for t in likeliest if unlikely[id(t)] <= unlikely[id(winner)] + TIED]
+        winner = nearest(winner, tied, lambda t: implied(t.refit), lambda t: off_given(t.refit))
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
 

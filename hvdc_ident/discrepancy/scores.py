@@ -33,6 +33,8 @@ SEEN = 1.0
 _BY_COLUMN = ("raw", "size", "left", "noise", "sound", "two_sided")
 LEFT = 1e-3
 """Share of a signature that has to be left beside the parameters."""
+TRACE = 1e-7
+"""Share below which what is left may be the error of signature and derivatives, which agree to 1e-4 of their size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +56,22 @@ class Scores:
     def usable(self) -> NDArray[np.bool_]:
         """(C,) whether there is something to score."""
         return np.asarray(self.sound & (self.size >= SEEN) & (self.left > LEFT * self.size) & (self.left > 1e-2 * SEEN))
+
+    @cached_property
+    def absorbed_with_trace(self) -> NDArray[np.bool_]:
+        """(C,) whether the parameters take up nearly all of a signature that the experiments excite, and not quite all.
+
+        What they leave of it may be all that the model leaves of the records: then another value of the parameters, and the
+        effect, explain these as well.
+        """
+        seen = self.sound & (self.size >= SEEN) & ~self.usable
+        return np.asarray(seen & (self.left > TRACE * self.size) & (self.left > 1e-2 * SEEN))
+
+    @cached_property
+    def t_absorbed(self) -> Array:
+        """(C,) the scores of those, 0 for all others; they are no part of what noise is judged by."""
+        allowed = self.absorbed_with_trace & (self.two_sided | (self.raw > 0))
+        return np.where(allowed, self.raw**2 / np.where(self.left > 0, self.left, 1.0), 0.0)
 
     @cached_property
     def t(self) -> Array:

@@ -15,20 +15,21 @@ from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, formul
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import louder_than_noise, material_gap, worst
 from hvdc_ident.discrepancy.explain import moved_parameters
-from hvdc_ident.discrepancy.findings import finding
+from hvdc_ident.discrepancy.findings import finding, values_by_place
 from hvdc_ident.discrepancy.formula import Law
+from hvdc_ident.discrepancy.implied import implied
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE
 from hvdc_ident.discrepancy.record_noise import FEWEST
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
-from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, Verdict
+from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict, as_line
 from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.adequacy import MATTERS
-from hvdc_ident.text import figures, listed, percentage
+from hvdc_ident.text import figures, listed, percentage, value_by_place
 
 DOMINANT = 0.5
 """Share of the gap that what is named has to explain."""
@@ -91,8 +92,8 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgem
 def _weighed(
     outcome: SearchOutcome, left: Nominal, explained: float, found: Judgement, labels: str, significance: float
 ) -> Judgement:
-    """The judgement: named, ambiguous where several classes are likely or something else may be behind one, or unnameable where
-    too much is left that a latent input would explain."""
+    """The judgement: named; ambiguous where several classes are likely, where something else may be behind one, or where the likely
+    places of one imply other values of the parameters; or unnameable where too much is left that a latent input would explain."""
     assert found.remainder is not None
     remainder, each = found.remainder, [classes(g) for g in found.sets]
     sure = all(c[0].probability >= CERTAIN for c in each)
@@ -115,6 +116,10 @@ def _weighed(
         against = remains(_names(found), rest)
     if against is not None and sure:
         return _in_doubt(found, labels, against)
+    if sure and any(c[0].differs for c in each):
+        return replace(
+            found, verdict="ambiguous", text=f"Missing: {names}; the records do not tell these places apart."
+        )
     unseen_of_it = one_way(outcome.refit) if sure else None
     if unseen_of_it is not None:
         found = replace(found, caveat=unseen_of_it.why, experiment={"text": unseen_of_it.advice})
@@ -149,28 +154,41 @@ def findings_of(
     placed: Sequence[FoundEffect],
     *,
     with_intervals: bool = True,
-) -> tuple[Finding, ...]:
+) -> tuple[tuple[Finding, ...], dict[str, tuple[ValueAt, ...]]]:
     """Return the findings: of each effect that was put in its likely classes, then the held parameters whose values are off.
 
-    placed: the effects that were put in, with their sentences. with_intervals: whether these tell the intervals of the sizes.
+    placed: the effects that were put in, with their sentences. Beside them the values of those parameters of the model that depend
+    on which of the likely effects and places is the true one, by place. with_intervals: whether sentences tell the intervals of sizes.
     """
     share = None if judgement.remainder is None else 1.0 - judgement.remainder.share
     found: list[Finding] = []
+    values, depend = implied(outcome.refit), dict[str, tuple[ValueAt, ...]]()
     for of, own, group in zip(outcome.kept, placed, judgement.sets, strict=False):
-        found += [
-            replace(finding(of, one, own, with_intervals=with_intervals), share=share) for one in likely(classes(group))
+        each = [
+            replace(finding(of, one, own, values, with_intervals=with_intervals), share=share)
+            for one in likely(classes(group))
         ]
+        depend = values_by_place(each) | depend
+        found += each
     freed = {f.name for f in (*search.held, *search.stated)} & set(outcome.refit.problem.names)
     if placed and freed and (moved := moved_parameters(outcome.refit, freed)) is not None:
         found.append(replace(moved, share=share))
-    return tuple(found)
+    return tuple(found), depend
 
 
-def headline(judgement: Judgement, findings: Sequence[Finding], *, tolerated: bool = False) -> str:
-    """The verdict in one or two sentences. tolerated: whether every signal keeps the tolerance that is stated for it."""
+def headline(
+    judgement: Judgement,
+    findings: Sequence[Finding],
+    depend: Mapping[str, Sequence[ValueAt]] | None = None,
+    *,
+    tolerated: bool = False,
+) -> str:
+    """The verdict in a few sentences. depend: values that depend on what is missing where. tolerated: whether every signal keeps the
+    tolerance that is stated for it."""
     left = judgement.remainder
     if judgement.verdict != "named" or left is None:
-        return judgement.text
+        values = [f"{n} is {value_by_place([as_line(v) for v in each])}." for n, each in (depend or {}).items()]
+        return " ".join([judgement.text, *values])
     explains = "Together they explain" if len(findings) > 1 else "It explains"
     rest = f"what remains is {figures(left.noise_units, 3)} times the noise"
     rest += ", within the stated tolerance" if tolerated else ""
@@ -203,7 +221,7 @@ def _class_text(each: Sequence[EffectClass]) -> str:
     """The classes of one effect in words, those that hold 95 % together."""
     told = []
     for c in likely(each):
-        at = list(dict.fromkeys(r.at for r, _ in c.members))
+        at = list(dict.fromkeys([c.best.at, *(r.at for r, _ in c.members)]))
         where = ", or at ".join(listed(places) for places in at[:TOLD])
         more = f", or at one of {len(at) - TOLD} more places" if len(at) > TOLD else ""
         told.append(f"{' or '.join(c.kinds)} ({percentage(c.probability)}) at {where}{more}")

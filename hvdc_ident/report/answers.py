@@ -6,8 +6,8 @@ The first screen of the report and the letter both show these answers, each in i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,7 +18,7 @@ from hvdc_ident.fit.windowed_errors import signal_within
 from hvdc_ident.report.overlay import STAGES, Overlay, overlay_of
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.values_that_count import ValuesThatCount, values_that_count
-from hvdc_ident.text import figures, interval_words, listed, one_of, percentage, quantity
+from hvdc_ident.text import figures, interval_words, listed, one_of, percentage, quantity, value_by_place
 
 Signal = tuple[str, str]
 """An output and an experiment."""
@@ -72,7 +72,8 @@ class Value:
     """A parameter: the value that counts with its interval, and the others by name; None where there is none.
 
     value: that of the model with what it lacks where that was named, else the fitted one. note: why it is held, or that it
-    stands on a bound. with_effect: whether the value with the effect counts; effect_interval: its 95 % interval.
+    stands on a bound. with_effect: whether the value with the effect counts; effect_interval: its 95 % interval. by_place: its
+    values with what is missing, in words, where they depend on what that is and where; no other value counts then.
     """
 
     name: str
@@ -84,10 +85,13 @@ class Value:
     note: str = ""
     with_effect: bool = True
     effect_interval: tuple[float | None, float | None] | None = None
+    by_place: str = ""
 
     @property
     def value(self) -> float | None:
-        """The value that counts."""
+        """The value that counts; None where it depends on what is missing."""
+        if self.by_place:
+            return None
         return self.effect if self.with_effect and self.effect is not None else self.fitted
 
     @property
@@ -311,7 +315,18 @@ class Answers:
 
     @cached_property
     def values(self) -> tuple[Value, ...]:
-        """Every candidate with the value that counts."""
+        """Every candidate with the value that counts, or with those that it has by place."""
+        depend = self.diagnosis.get("values_by_place") or {}
+        return tuple(
+            replace(v, effect=None, interval=None, effect_interval=None, by_place=value_by_place(depend[v.name]))
+            if depend.get(v.name)
+            else v
+            for v in self._values
+        )
+
+    @property
+    def _values(self) -> tuple[Value, ...]:
+        """Every candidate with the values that the fit and the diagnosis have put into their models."""
         told = self.results.get("identifiability")
         lines = (
             self.fit.get("candidates")
@@ -360,6 +375,8 @@ class Answers:
             places = f.get("places") or []
             first = places[0] if places else {"at": ()}
             said = own.get((f["effect"], tuple(first["at"]), first.get("from", "")), "")
+            if self.diagnosis.get("values_by_place"):  # the finding's own sentence tells what each place implies
+                said = ""
             late = f.get("equivalent_delay") or {}
             parameters = f["effect"] == "parameter"
             found.append(
@@ -468,9 +485,14 @@ def values_conditional(fit: Mapping[str, Any], diagnosis: Mapping[str, Any], *, 
 
 
 def places_of(
-    places: Iterable[Mapping[str, Any]], join: Callable[[Iterable[str]], str] = ", ".join
+    places: Iterable[Mapping[str, Any]],
+    join: Callable[[Iterable[str]], str] = ", ".join,
+    depend: Collection[str] = (),
 ) -> dict[str, float]:
-    """Return likely places with their probabilities, each once, with the signal that is brought in where that tells them apart."""
+    """Return likely places with their probabilities, each once, with the signal that is brought in where that tells them apart.
+
+    depend: parameters whose values depend on the place; these, and the sizes of the effect, then stand with each place.
+    """
     places = list(places)
     sources: dict[str, set[str]] = {}
     for p in places:
@@ -479,8 +501,18 @@ def places_of(
     for p in places:
         at = join(p["at"])
         at += f" from {p['from']}" if p.get("from") and len(sources[at]) > 1 else ""
+        at += _implied(p, depend)
         found[at] = found.get(at, 0.0) + float(p.get("probability", 0.0))
     return found
+
+
+def _implied(place: Mapping[str, Any], depend: Collection[str]) -> str:
+    """Return the sizes of an effect at a place and the values of the parameters that depend on it, in brackets; else nothing."""
+    if not depend or not place.get("values"):
+        return ""
+    sizes = (place.get("parameters") or {}) | {n: v for n, v in place["values"].items() if n in depend}
+    told = listed(f"{n} = {quantity(p['value'], p.get('unit') or '')}" for n, p in sizes.items())
+    return f" (then {told})"
 
 
 def joined_gap(gap: Mapping[str, Table]) -> dict[str, dict[str, float | None]]:

@@ -156,8 +156,11 @@ def _values(found: Answers) -> str:
 def _value_row(v: Value) -> list[str]:
     shown, interval = estimate(v.value, v.interval)
     note = AT_BOUND if v.note == AT_BOUND else "held" if v.note else ""
+    name = f"<strong>{text(v.name)}</strong>" + (f", {text(v.unit)}" if v.unit else "")
+    if v.by_place:
+        return [name, number(v.given), "–", "–", "", f"depends on the place: {text(v.by_place)}"]
     return [
-        f"<strong>{text(v.name)}</strong>" + (f", {text(v.unit)}" if v.unit else ""),
+        name,
         number(v.given),
         f"<strong>{shown}</strong>" if v.value is not None else "–",
         interval if v.value is not None else "–",
@@ -170,7 +173,7 @@ def _which(found: Answers) -> str:
     """Which values these are."""
     if found.counting.name == "fit" and found.counting.doubt:
         return f"Fitted without an effect: {text(found.counting.doubt)}. They may make up for what is missing."
-    if found.added and any(v.effect is not None for v in found.values):
+    if found.added and any(v.effect is not None or v.by_place for v in found.values):
         kind = "" if found.added == "effect" else f" ({found.added})"
         return f"Fitted together with what the model lacks{kind}."
     if found.fitted:

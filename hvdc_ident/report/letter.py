@@ -29,6 +29,7 @@ from hvdc_ident.text import (
     quantity,
     span,
     times_text,
+    value_by_place,
 )
 
 FILE = "letter.html"
@@ -198,8 +199,8 @@ def _values(answers: Answers) -> str:
     rows = []
     for v in answers.values:
         fitted, own = estimate(v.fitted, answers.interval(v.name, "fit")) if v.fitted is not None else ("", "")
-        effect, later = estimate(v.effect, v.effect_interval) if v.effect is not None else ("", "")
-        interval = own if v.effect is None else later
+        effect, later = estimate(v.effect, v.effect_interval) if v.effect is not None else (text(v.by_place), "")
+        interval = later if v.effect is not None else "" if v.by_place else own
         said = v.note if v.note == AT_BOUND else f"held, {v.note.split(':')[0]}" if v.note else ""
         cells = [text(v.name), number(v.given), fitted, effect, "; ".join(s for s in (interval, text(said)) if s)]
         rows.append([*cells, text(v.unit)])
@@ -240,13 +241,16 @@ def _request(answers: Answers) -> str:
     for f in found.get("findings") or []:
         if f["effect"] == "parameter":
             told |= set(f["parameters"])
+            others = [f"that {s['text']}" for s in (found.get("stand_ins") or [])[:1]]
             sizes = listed(f"{n} = {quantity(p['value'], p.get('unit') or '')}" for n, p in f["parameters"].items())
-            asked.append(f"the values that the recordings ask for: {sizes}")
+            asked.append(" or ".join([f"the values that the recordings ask for: {sizes}", *others]))
             continue
         sizes = listed(
             f"{n} = {quantity(p['value'], p.get('unit') or '')}" for n, p in (f.get("parameters") or {}).items()
         )
-        places = list(places_of(f.get("places") or [], listed))
+        depend = found.get("values_by_place") or {}
+        places = list(places_of(f.get("places") or [], listed, depend))
+        sizes = "" if depend else sizes
         where = " or ".join(places[:2]) + (f" or one of {len(places) - 2} more places" if len(places) > 2 else "")
         what = ASKED.get(f["effect"], f"the {f['effect']}")
         asked.append(f"{what} at {where}, which the model leaves out (here {sizes})" if sizes else f"{what} at {where}")
@@ -267,6 +271,8 @@ def _consistent(answers: Answers) -> str:
     """Sentences on what the difference is consistent with: the named effect, and those the data cannot tell from it."""
     found = answers.diagnosis
     verdict, effects, doubt = found["verdict"], found.get("effects") or [], _without_chance(answers.doubt)
+    if verdict == "no-evidence" and found.get("stand_ins"):
+        return _without_chance(str(found.get("text", "")))
     if verdict == "no-evidence":
         return _nothing(answers)
     if not effects:
@@ -349,13 +355,21 @@ def _values_judged(answers: Answers) -> str:
     parts = []
     if off:
         more = f" and {len(off) - MOST_OFF} more" if len(off) > MOST_OFF else ""
-        start = f"With the {what}, the" if what else "The"
+        with_it = answers.counting.name == "effect"
+        start = f"With the {what}, the" if with_it else "Without an effect, the" if answers.counting.doubt else "The"
         each = "; ".join(_in_place_of(v, interval=not answers.conditional) for v in off[:MOST_OFF])
         parts.append(f"{start} recordings ask for other values than you gave: {each}{more}.")
     if kept:
         sure = "" if answers.conditional else "95 % "
         one = f"Your value of {kept[0]} lies within its {sure}interval."
         parts.append(one if len(kept) == 1 else f"Your values of {listed(kept)} lie within their {sure}intervals.")
+    if off and found.get("stand_ins"):
+        parts.append("An effect that your model leaves out explains them as well, with the values that you gave.")
+    elif off and answers.counting.doubt:
+        parts.append("They may make up for what is missing.")
+    if depend := found.get("values_by_place") or {}:
+        each = " ".join(f"{n} is {value_by_place(at)}." for n, at in depend.items())
+        parts.append(f"What the recordings say of {listed(depend)} depends on which of these is the true one: {each}")
     if (off or kept) and answers.conditional:
         parts.append("That holds only if nothing else is missing.")
     name, alone, with_it_too = _most_moved(answers)
@@ -380,6 +394,7 @@ def _most_moved(answers: Answers) -> tuple[str, float, float]:
     moved = {
         n: (without[n] / g - 1.0, after[n] / g - 1.0) for n, g in given.items() if g and n in without and n in after
     }
+    moved = {n: shares for n, shares in moved.items() if n not in (found.get("values_by_place") or {})}
     name = max(moved, key=lambda n: abs(moved[n][0]), default="")
     return (name, *moved[name]) if name else ("", 0.0, 0.0)
 

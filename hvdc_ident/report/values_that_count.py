@@ -37,7 +37,9 @@ def values_that_count(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> V
         return ValuesThatCount("effect", added)
     doubt = ""
     if verdict == "ambiguous" and added:
-        doubt = "the diagnosis is ambiguous"
+        depend = diagnosis.get("values_by_place") or {}
+        what = f": {listed(depend)} depend{'s' if len(depend) == 1 else ''} on where the effect is" if depend else ""
+        doubt = f"the diagnosis is ambiguous{what}"
     elif verdict == "unnameable":
         doubt = "something is missing that the diagnosis cannot name"
     return ValuesThatCount("" if fit.get("status") in NO_ESTIMATES else "fit", added, doubt)

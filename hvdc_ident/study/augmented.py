@@ -107,9 +107,20 @@ def _estimates(
     known = known.widened(adequacy(problem, blocks, sources, known.effective, known.rho).widening)
     estimates = estimates_of(problem, problem.start, blocks, known, known)
     return {
-        "estimates_after": {n: plain(estimates[n]) for n in fitted if n in estimates},
+        "estimates_after": {n: _estimate(found, n, plain(estimates[n])) for n in fitted if n in estimates},
         "residual_tests_after": residual_tests(blocks, problem.fitted_experiments),
     }
+
+
+def _estimate(found: Diagnosis, name: str, estimate: dict[str, Any]) -> dict[str, Any]:
+    """Return an estimate; without a value where that depends on what is missing, with those by place instead."""
+    from hvdc_ident.discrepancy.result import as_line
+
+    depend = [as_line(v) for v in found.values_by_place.get(name, ())]
+    if not depend:
+        return estimate
+    why = "it depends on which of the likely effects and places is the true one"
+    return estimate | {"value": None, "std": None, "ci95": None, "reason": why, "by_place": depend}
 
 
 def _misfit(study: Study, curves: Mapping[str, Mapping[str, Curve]]) -> dict[str, float]:

@@ -255,7 +255,7 @@ def _values(first: Results, second: Results) -> list[dict[str, Any]]:
     fits = [first.get("fit"), second.get("fit")]
     counted = [estimates_that_count(r.get("fit"), r.get("discrepancy")) for r in (first, second)]
     candidates = [f.get("candidates") or {} for f in fits]
-    after = [(r.get("discrepancy").get("parameters_after") or {}) for r in (first, second)]
+    after = [_with_effect(r.get("discrepancy")) for r in (first, second)]
     rows = []
     for name in dict.fromkeys([*candidates[0], *candidates[1]]):
         both = [estimates.get(name) or {} for estimates in counted]
@@ -280,6 +280,12 @@ def _values(first: Results, second: Results) -> list[dict[str, Any]]:
             }
         )
     return rows
+
+
+def _with_effect(diagnosis: Mapping[str, Any]) -> dict[str, float]:
+    """The values with the effects of a diagnosis; none that depends on which of the likely effects and places is the true one."""
+    depend = diagnosis.get("values_by_place") or {}
+    return {n: v for n, v in (diagnosis.get("parameters_after") or {}).items() if n not in depend}
 
 
 def _held(fit: Mapping[str, Any], name: str) -> str:

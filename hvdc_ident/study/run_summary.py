@@ -9,7 +9,7 @@ from hvdc_ident.display import Table, rounded
 from hvdc_ident.report.answers import values_conditional
 from hvdc_ident.report.values_that_count import values_that_count
 from hvdc_ident.study.pipeline import Done
-from hvdc_ident.text import figures_of, interval_text, interval_words
+from hvdc_ident.text import figures_of, interval_text, interval_words, value_by_place
 
 
 def run_lines(done: Sequence[Done], truth: Sequence[str] = ()) -> list[str]:
@@ -36,6 +36,7 @@ def run_lines(done: Sequence[Done], truth: Sequence[str] = ()) -> list[str]:
 def values_table(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> Table:
     """Return the candidates with their given and fitted values, the interval, and the value beside the missing effect."""
     after = diagnosis.get("parameters_after", {}) if diagnosis.get("augmented_model") else {}
+    depend = diagnosis.get("values_by_place") or {}
     rows = []
     for name, c in fit.get("candidates", {}).items():
         e = fit["estimates"].get(name) or {}
@@ -43,7 +44,7 @@ def values_table(fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> Table:
         value = (
             rounded(e.get("value"), figures_of(e.get("ci95"), 5)),
             interval_text(e.get("ci95")) or held,
-            rounded(after.get(name), 5),
+            value_by_place(depend[name]) if depend.get(name) else rounded(after.get(name), 5),
         )
         rows.append((name, c["unit"], rounded(c["given"], 6), *value))
     words = interval_words(beyond_noise=values_conditional(fit, diagnosis, effect=False))

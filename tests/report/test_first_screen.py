@@ -132,6 +132,23 @@ def test_one_parameter_has_one_value_outside_the_folded_parts(like_the_demo: Pat
     assert named in whole and "846.9" in whole
 
 
+def test_a_value_that_depends_on_the_place_has_no_single_value(like_the_demo: Path, tmp_path: Path) -> None:
+    for file in like_the_demo.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    found = json.loads((tmp_path / "discrepancy.json").read_text("utf-8"))
+    values = [{"value": v, "unit": "pu/s", "effect": "lag", "at": [at]} for at, v in (("P1", 728.3), ("P1_m", 802.0))]
+    found["values_by_place"] = {"KIVDC": values}
+    found["findings"][0]["text"] = "P1 lags, where KIVDC is 728 pu/s; or P1_m, where KIVDC is 802 pu/s."
+    (tmp_path / "discrepancy.json").write_text(json.dumps(found))
+    (value,) = [v for v in Answers(Results(tmp_path)).values if v.name == "KIVDC"]
+    assert value.value is None and value.effect is None and value.interval is None
+    by_place = "728 pu/s if the lag is at P1, 802 pu/s if it is at P1_m"
+    screen = first_screen(Results(tmp_path))
+    assert f"KIVDC , pu/s 734.7 – – depends on the place: {by_place}" in tile(screen, "values")
+    assert "or P1_m, where KIVDC is 802 pu/s" in tile(screen, "missing")
+    assert "728.3" not in words(screen) and by_place in words(page(tmp_path))
+
+
 def test_a_study_that_names_a_tolerance_is_judged_by_it(like_the_demo: Path, tmp_path: Path) -> None:
     windows = json.loads((like_the_demo / "fit.json").read_text("utf-8"))["windowed_errors"]
     windows["profile"]["named"] = True

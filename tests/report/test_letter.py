@@ -216,3 +216,53 @@ def test_no_result_rests_on_the_addressee(table: str) -> None:
     kept = without_letter((study + table).encode()).decode()
     assert kept.startswith(study) and "letter" not in kept and "author" not in kept and "to =" not in kept
     assert ("[fit]" in kept) == ("[fit]" in table) and ("[[x]]" in kept) == ("[[x]]" in table)
+
+
+def tied(**changes: Any) -> dict[str, Any]:
+    """A diagnosis whose lag may be behind the output or inside the loop, with another value of a parameter in each case."""
+    places, values = [], []
+    for at, size, value in (("P2_m", 0.3, 0.1), ("a", 0.075, 0.4)):
+        own = {"Ta": {"value": value, "ci95": None, "unit": "s"}, "KIP": {"value": 30.1, "ci95": None, "unit": ""}}
+        sizes = {"T": {"value": size, "ci95": None, "unit": "s"}}
+        places.append({"at": [at], "probability": 0.5, "effect": "lag", "parameters": sizes, "values": own})
+        values.append({"value": value, "ci95": None, "unit": "s", "effect": "lag", "at": [at]})
+    finding = {"effect": "lag", "same_as": ["lag"], "probability": 1.0, "parameters": places[0]["parameters"]}
+    return diagnosis(
+        findings=[{**finding, "places": places, "text": "P2_m lags, where Ta is 0.1 s; or a."}],
+        values_by_place={"Ta": values},
+        parameters_before={"Ta": 0.1, "KIP": 30.0},
+        parameters_refitted={"Ta": 0.408, "KIP": 31.5},
+        parameters_after={"Ta": 0.1, "KIP": 30.1},
+        **changes,
+    )
+
+
+def test_a_value_that_depends_on_the_place_is_told_by_place_and_blames_nobody(tmp_path: Path) -> None:
+    folder = folder_with(tmp_path, tied())
+    letter = letter_of(Results(folder))
+    told = " ".join(letter.sentences)
+    assert "Ta is 0.1 s if the lag is at P2_m, 0.4 s if it is at a." in told and "depends on which of these" in told
+    assert "moves Ta" not in told and "without the effect moves KIP by +5.0 %" in told
+    assert "at P2_m (then T = 0.3 s and Ta = 0.1 s) or a (then T = 75 ms and Ta = 0.4 s)" in letter.request
+    table = re.sub(r"<[^>]+>", " ", write_letter(folder).read_text("utf-8"))
+    assert re.search(r"Ta\s+0\.1\s+0\.1 s if the lag is at P2_m, 0\.4 s if it is at a\s", table)
+
+
+def test_where_an_effect_does_what_a_value_does_the_value_is_not_blamed(tmp_path: Path) -> None:
+    other = {"effect": "gain", "at": ["P2"], "text": "P2 is 1.05 times what the model has", "values": {"KIP": 30.0}}
+    kip = {"value": 31.5, "ci95": None, "unit": ""}
+    finding = {"effect": "parameter", "probability": 1.0, "parameters": {"KIP": kip}, "places": []}
+    found = diagnosis(
+        verdict="no-evidence",
+        effects=[],
+        ambiguity=[],
+        text="No effect is needed: KIP is 31.5.",
+        findings=[finding],
+        stand_ins=[other],
+        sizes=None,
+    )
+    letter = letter_of(Results(folder_with(tmp_path, found)))
+    told = " ".join(letter.sentences)
+    assert "nothing is missing" not in told and "Your gains are to blame" not in told
+    assert "Whether your gains are to blame these recordings do not tell: fitted, KIP moves by +5.0 %" in told
+    assert letter.request.endswith("KIP = 31.5 or that P2 is 1.05 times what the model has.")

@@ -12,7 +12,7 @@ from hvdc_ident.report.answers import beyond_noise, places_of
 from hvdc_ident.report.drawing import AFTER, BEFORE, EFFECT, MARK, MEASURED, figure, svg, visible
 from hvdc_ident.report.html import captioned, estimate, folded, number, percent, table, text
 from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import form_of, listed, one_of, percentage, span, with_unit
+from hvdc_ident.text import form_of, listed, one_of, percentage, span, value_by_place, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -78,9 +78,18 @@ def _effects(found: dict[str, Any]) -> str:
             value, interval = estimate(p.get("value"), p.get("ci95"))
             ends = f" (95 %: {interval})" if p.get("ci95") and not beyond_noise(found) else ""
             sizes.append(f"{text(name)} = {value}{ends} {text(p.get('unit') or '')}".rstrip())
-        among = f"Chosen from {text(e.get('chosen_from'))} candidates that were refitted."
+        among = _one_of_several(found) + f"Chosen from {text(e.get('chosen_from'))} candidates that were refitted."
         lines.append(f"<li>{text(str(e.get('text', '')).rstrip('.'))}: {'; '.join(sizes)}. {among}</li>")
     return f"<ul>{''.join(lines)}</ul>" if lines else ""
+
+
+def _one_of_several(found: dict[str, Any]) -> str:
+    """Sentence beside what was put into the model, where other places explain the recordings as well with other values."""
+    depend = found.get("values_by_place") or {}
+    if not depend:
+        return ""
+    values = "; ".join(f"{text(n)} is {text(value_by_place(each))}" for n, each in depend.items())
+    return f"This is one of several that the recordings do not tell apart: {values}. "
 
 
 def _findings(found: dict[str, Any]) -> str:
@@ -88,10 +97,10 @@ def _findings(found: dict[str, Any]) -> str:
     rows = []
     for f in found.get("findings") or []:
         delay = f.get("equivalent_delay") or {}
-        places = places_of(f["places"])
+        places = places_of(f["places"], depend=found.get("values_by_place") or {})
         where = "; ".join(f"{at} ({percent(p)})" for at, p in [*places.items()][:PLACES])
         where += f"; and {len(places) - PLACES} more" if len(places) > PLACES else ""
-        value = delay.get("value")
+        value = None if found.get("values_by_place") else delay.get("value")
         late = "" if value is None else number(1e3 * value, 3)
         rows.append([text(one_of(f["same_as"])), text(f"{percent(f['probability'])}"), text(where), late])
     if not rows or (len(rows) == 1 and len(found["findings"][0]["places"]) < 2):

@@ -31,7 +31,7 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
     for v in found.values:
         line, own = fit["candidates"][v.name], (fit.get("estimates") or {}).get(v.name) or {}
         fitted, interval = estimate(v.fitted, own.get("ci95"))
-        after, later = estimate(v.effect, v.effect_interval) if v.effect is not None else ("", "")
+        after, later = estimate(v.effect, v.effect_interval) if v.effect is not None else (text(v.by_place), "")
         rows.append(
             [
                 f"<strong>{text(v.name)}</strong>",
@@ -39,7 +39,7 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
                 fitted if v.fitted is not None else "–",
                 interval if v.fitted is not None else "–",
                 share(v.fitted, line.get("given")) if v.fitted is not None else "",
-                number(refitted.get(v.name)) if v.effect is not None else "",
+                number(refitted.get(v.name)) if v.effect is not None or v.by_place else "",
                 after,
                 later,
                 share(v.effect, line.get("given")) if v.effect is not None else "",
@@ -53,7 +53,8 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
         "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
         f"effect: the same with the finding in the model; {_counting(found)}{conditions}.</p>"
     )
-    return table(header, rows, words=(0, 9)) + (told if refitted else "") + _notes(fit)
+    words = (0, 6, 9) if any(v.by_place for v in found.values) else (0, 9)
+    return table(header, rows, words=words) + (told if refitted else "") + _notes(fit)
 
 
 def _counting(found: Answers) -> str:

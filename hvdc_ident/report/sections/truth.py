@@ -15,6 +15,7 @@ def _render(results: Results) -> str:
     if not truth:
         return ""
     after = diagnosis.get("parameters_after") or {} if diagnosis.get("augmented_model") else {}
+    after = {n: v for n, v in after.items() if n not in (diagnosis.get("values_by_place") or {})}
     rows = []
     for name, true in truth["parameters"].items():
         given = (fit.get("candidates") or {}).get(name) or {}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
-from hvdc_ident.text import form_of, percentage
+from hvdc_ident.text import form_of, percentage, value_by_place
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy import Diagnosis
@@ -130,8 +130,9 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
         lines.append(f"As good (delta BIC): {members}{rest}.")
     advice = (data["separating_experiment"] or {}).get("text")
     lines += [f"Measure next: {advice}"] if advice else []
+    depend = data.get("values_by_place") or {}
     moved = [
-        f"{n} {data['parameters_refitted'][n]:.5g} -> {v:.5g}"
+        f"{n} {data['parameters_refitted'][n]:.5g} -> {value_by_place(depend[n]) if n in depend else f'{v:.5g}'}"
         for n, v in data["parameters_after"].items()
         if n in data["parameters_refitted"] and data["augmented_model"]
     ]

@@ -1,0 +1,71 @@
+"""Effects that values of the parameters stand for: with the given values they explain the records as well.
+
+A signal that is 0.8 times what the record says, and a gain of the model that is 0.8 of its given value, may be one model. The
+fitted parameters take up all of such an effect, so no score tells of it: it is refitted with the parameters as they were given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.discrepancy.context import Round, SearchContext
+from hvdc_ident.discrepancy.evidence import Pick, Ruler, at_edge, clear, evidence_between
+from hvdc_ident.discrepancy.explain import sentence
+from hvdc_ident.discrepancy.options import SHORTLIST
+from hvdc_ident.discrepancy.race import done
+from hvdc_ident.discrepancy.refit import Refit, RefitJob
+from hvdc_ident.discrepancy.refit_jobs import job
+from hvdc_ident.discrepancy.result import StandIn
+from hvdc_ident.discrepancy.scores import SEEN
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.immutable import FrozenMap
+
+
+def stand_ins(search: SearchContext, last: Refit, opened: Round, moved: Sequence[str]) -> tuple[StandIn, ...]:
+    """Return the effects that explain the records as well as other values of the parameters, with these as given, the best first.
+
+    Only one in place of all of them: beside values that are off, an effect in place of another such value explains nothing more.
+    last: the model without effects, refitted; opened: the first round of the search, whose scores tell which effects the
+    parameters take up; moved: the parameters whose values are off the given ones.
+    """
+    found = opened.candidates
+    scores = opened.scores
+    seen = scores.sound & (scores.size >= SEEN) & ~scores.usable
+    taken_up = sorted({scores.columns[k].candidate for k in np.flatnonzero(seen)})
+    if not taken_up or search.spent:
+        return ()
+    # One that brings another signal in has many likes: those that do not are asked first.
+    first = sorted(taken_up, key=lambda k: (bool(found[k].source), len(found[k].at), k))[:SHORTLIST]
+    jobs = []
+    for k in first:
+        with suppress(HvdcIdentError):  # it cannot sit there
+            jobs.append(_with_given(job(last, found, [Pick(k, 0, 1.0, 0.0)]), moved))
+    told: list[StandIn] = []
+    ruler = Ruler.of(last)
+    values = FrozenMap({f.name: f.given for f in last.problem.free if f.name in moved})
+    for refit in done(search, jobs, [f"with the given values: {j.placed[-1].candidate.label}" for j in jobs]):
+        if refit.failure or at_edge(refit, 0) or not clear(refit, 0):
+            continue
+        evidence = evidence_between(last, refit, ruler, refit.count - len(moved))
+        if evidence >= -search.options.set_bic:
+            c, sizes = refit.placed[-1].candidate, FrozenMap(refit.sizes(refit.placed[-1]))
+            told.append(StandIn(c.effect, c.at, max(-evidence, 0.0), sizes, values, sentence(c, sizes), c.source))
+    return tuple(sorted(told, key=lambda s: round(s.delta_bic, 1)))  # as good is as good: then as asked
+
+
+def _with_given(begun: RefitJob, names: Sequence[str]) -> RefitJob:
+    """Return a refit with some free parameters of the model held at their given values; it begins at every size probed."""
+    problem = begun.problem
+    own = {f.name: f.given for f in problem.free if f.name in names}
+    at = [problem.names.index(n) for n in own]
+    held = replace(
+        problem,
+        free=tuple(f for f in problem.free if f.name not in own),
+        held=FrozenMap({**problem.held, **own}),
+    )
+    begins = tuple(np.delete(b, at) for b in (*begun.begins[:1], *begun.spare))
+    return replace(begun, problem=held, begins=begins, spare=())
