@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from hvdc_ident.data.signals import MERGE_TOLERANCE, InputSignal, off_line
 from hvdc_ident.data.trajectory import Array
@@ -24,6 +25,13 @@ _ROWS_OF_SCATTER = 32  # see row_scatter
 _QUANTISED_CHANGES = 20  # changes needed before a resolution is read off them
 _DEPARTURE = 6.0  # standard deviations
 _OUTLIER = 5.0  # standard deviations
+_LONGEST = 1000  # rows, the last of a longer record: enough to see a motion, and tens of milliseconds
+_LIKELIER = 6.9  # log of 1000: the ratio of the likelihoods is 1 on average under noise, so above 1000 once in 1000 records at most
+_RHO = np.tanh(np.linspace(-0.5, 3.5, 21))  # lag-1 coefficients of noise that are compared, to 0.998
+_WHITE = np.concatenate([[0.0], np.geomspace(1e-2, 1e2, 9)])  # white noise beside that, in its variances
+_BENDS = np.concatenate(
+    [[0.0], np.geomspace(1e-8, 1e4, 25)]
+)  # variance of a motion's second differences, in those of white noise
 
 
 def event_time(inputs: Mapping[str, InputSignal]) -> float | None:
@@ -40,15 +48,16 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> f
     """Return the standard deviation of the noise in a record, in its unit; 0.0 where the record is deterministic.
 
     time: (n,) in s. values: (n,), NaN where not recorded. event: instant of the first disturbance in s; None where there
-    is none. Before the event: the scatter around a line, by the median. Where fewer than 8 rows lie before it, or none is given:
-    the scatter of the rows about the line through their neighbours, which white noise makes. A record is deterministic
+    is none. Before the event: the scatter around a line, by the median. Where fewer than 8 rows lie before it, none is given, or
+    the record moves before it (`at_rest`): the scatter of all rows about the line through their neighbours, which white noise
+    makes and a motion that the rows follow does not. A record is deterministic
     where it is smooth from row to row: its curvature is small beside its change, which no first-order noise is.
     """
     t, v = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
     single = np.append(np.diff(t) > 0, True)  # of two rows at one time the second
     there = single & ~np.isnan(v)
     before = there & (t < event) if event is not None else np.zeros(t.size, dtype=bool)
-    settled = int(before.sum()) >= FEWEST_QUIET
+    settled = int(before.sum()) >= FEWEST_QUIET and at_rest(v[before])
     rows = before if settled else there
     t, v, number = t[rows], v[rows], np.cumsum(single)[rows]
     if t.size < FEWEST_QUIET or (v == v[0]).all():
@@ -62,6 +71,73 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> f
     if not settled:
         return _scatter((bend / change)[near])
     return _scatter(_detrended(t, v))
+
+
+def at_rest(values: ArrayLike) -> bool:
+    """Return False where a record is a motion with white noise on it rather than noise about a line: its scatter is then no noise.
+
+    values: (n,) rows in their order, evenly sampled, without NaN; of more than 1000 the last count. Two explanations with as
+    many parameters are compared by their restricted likelihoods: stationary noise, white and of first order together, about a
+    line; and white noise on a smooth course, whose second differences are random (the model behind a smoothing spline). The
+    record moves where the second is a thousand times as likely. Noise of any correlation time keeps below that, for it is
+    rougher from row to row than a motion is.
+    Source: Patterson and Thompson, Biometrika 58 (1971); Wahba, J. R. Stat. Soc. B 40 (1978).
+    """
+    v = np.asarray(values, dtype=float)[-_LONGEST:]
+    if v.size < FEWEST_QUIET:
+        return True
+    line = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, v.size), 2))[0]
+    rest = v - line @ (line.T @ v)
+    power = float(rest @ rest)
+    # Of white noise the squared steps are twice its variance, within their error; then nothing but white noise is there.
+    steps = float(np.sum(np.diff(rest) ** 2)) / 2.0
+    if power <= (1e-12 * float(np.abs(v).max())) ** 2 * v.size or power < (1.0 + 2.0 / np.sqrt(v.size)) * steps:
+        return True
+    return _of_motion(rest) - _of_noise(rest, line) < _LIKELIER
+
+
+def _of_motion(v: Array) -> float:
+    """Return the largest restricted log-likelihood of white noise on a course with random second differences."""
+    z = np.diff(v, 2)
+    cover = np.ones((3, z.size))  # of the second differences of white noise: 6, -4, 1, by diagonals
+    cover[1] = -4.0
+    best, first = -np.inf, 0.0
+    for k, bends in enumerate(_BENDS):
+        cover[0] = 6.0 + bends
+        size, solved = _solved(cover, z)
+        first = first if k else size
+        best = max(best, _likelihood(float(z @ solved), z.size, size - first))
+    return best
+
+
+def _of_noise(v: Array, line: Array) -> float:
+    """Return the largest restricted log-likelihood of noise of first order and white noise about a line. line: (n, 2) orthonormal."""
+    rows, best = np.column_stack([line, v]), -np.inf
+    cover = np.empty((2, v.size))
+    for rho in _RHO:
+        steps = rows.copy()
+        steps[1:] -= rho * rows[:-1]
+        for white in _WHITE:
+            # Noise of first order leaves white steps; of white noise they are a moving average, correlated with the next ones.
+            cover[0], cover[1] = 1.0 - rho**2 + white * (1.0 + rho**2), -rho * white
+            cover[0, 0] = 1.0 + white
+            size, solved = _solved(cover, steps)
+            square = steps.T @ solved
+            slopes = np.linalg.solve(square[:2, :2], square[:2, 2])
+            size += float(np.linalg.slogdet(square[:2, :2])[1])
+            best = max(best, _likelihood(float(square[2, 2] - square[2, :2] @ slopes), v.size - 2, size))
+    return best
+
+
+def _likelihood(square: float, count: int, size: float) -> float:
+    """Return the log-likelihood at its best variance, up to a constant. square: whitened sum; size: log-determinant."""
+    return -0.5 * (count * (np.log(square / count) + 1.0) + size)
+
+
+def _solved(cover: Array, rows: Array) -> tuple[float, Array]:
+    """Return the log-determinant of a banded covariance (its lower diagonals), and its inverse times rows."""
+    factor = cholesky_banded(cover, lower=True, check_finite=False)
+    return 2.0 * float(np.sum(np.log(factor[0]))), cho_solve_banded((factor, True), rows, check_finite=False)
 
 
 def row_scatter(time: ArrayLike, values: ArrayLike) -> float | None:

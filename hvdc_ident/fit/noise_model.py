@@ -11,7 +11,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from hvdc_ident.data import FEWEST_QUIET, FLOOR_SHARE, GAP, Array, Experiment, noise_estimate, noise_floor, row_scatter
+from hvdc_ident.data import (
+    FEWEST_QUIET,
+    FLOOR_SHARE,
+    GAP,
+    Array,
+    Experiment,
+    at_rest,
+    noise_estimate,
+    noise_floor,
+    row_scatter,
+)
 from hvdc_ident.errors import StudyError
 
 AR = tuple[float, ...]
@@ -263,9 +273,9 @@ def autoregression(records: Sequence[Array], most: int = MOST) -> AR:
 
 
 def before_event(experiments: Sequence[Experiment], outputs: Sequence[str]) -> Mapping[str, AR]:
-    """Return the noise model of each output, from the rows before the event of every experiment.
+    """Return the noise model of each output, from the rows before the event of every experiment that are at rest (`at_rest`).
 
-    Raises StudyError for an output with fewer than 20 such rows, or whose record does not move there.
+    Raises StudyError for an output with fewer than 20 such rows, or whose record shows no noise there.
     """
     models = {}
     for output in outputs:
@@ -273,7 +283,7 @@ def before_event(experiments: Sequence[Experiment], outputs: Sequence[str]) -> M
         if sum(r.size for r in records) < FEWEST or not any(np.ptp(r) > 0 for r in records):
             raise StudyError(
                 f"no noise of '{output}' before the event to whiten with",
-                expected=f"at least {FEWEST} rows before the event, with noise in them",
+                expected=f"at least {FEWEST} rows before the event, at rest and with noise in them",
                 got=f"{sum(r.size for r in records)} rows",
                 hint='whiten = "residual" takes the model of the noise from the residuals',
             )
@@ -282,7 +292,7 @@ def before_event(experiments: Sequence[Experiment], outputs: Sequence[str]) -> M
 
 
 def _quiet(experiment: Experiment, output: str) -> list[Array]:
-    """Return the stretches of an output before the event, without their straight line."""
+    """Return the stretches of an output before the event that are at rest, without their straight line."""
     assert experiment.measured is not None
     if experiment.event is None:
         return []
@@ -293,7 +303,7 @@ def _quiet(experiment: Experiment, output: str) -> list[Array]:
     t, y = experiment.time[rows], y[rows]
     stretches = []
     for part in segments(t, f"experiment '{experiment.name}'"):
-        if part.stop - part.start >= 3:
+        if part.stop - part.start >= 3 and at_rest(y[part]):
             x = t[part] - t[part].mean()
             level = y[part] - y[part].mean()
             stretches.append(level - x * float(x @ level) / float(x @ x))

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 from hvdc_ident.data import (
     InputSignal,
+    at_rest,
     event_time,
     input_signal,
     noise_estimate,
@@ -184,6 +186,31 @@ def test_noise_of_white_and_coloured_records() -> None:
     assert noise_estimate(t, coloured, 4.0) == pytest.approx(2e-3 / math.sqrt(1 - 0.81), rel=0.2)
     assert pre_event_ar(coloured) == pytest.approx(0.9, abs=0.03)
     assert abs(pre_event_ar(white)) < 0.05
+
+
+def test_a_motion_before_the_event_is_no_noise() -> None:
+    """A record that is still settling, or swings, before its event has the noise that was put on it."""
+    t = np.arange(1500) * 0.01
+    noise = 2e-3 * np.random.default_rng(8).standard_normal(t.size)
+    settling = 0.1 * np.exp(-0.5 * t)
+    swinging = 0.05 * np.exp(-0.2 * t) * np.cos(3.0 * t)
+    after = np.where(t >= 4.0, 0.3 * (1.0 - np.exp(-(t - 4.0))), 0.0)
+    for motion in (settling, swinging):
+        assert noise_estimate(t, motion + after + noise, 4.0) == pytest.approx(2e-3, rel=0.1)
+        assert not at_rest((motion + noise)[:400])
+
+
+def test_noise_of_any_correlation_time_is_no_motion() -> None:
+    """Whatever the colour, alone or beside white noise, or rounded: at most one record in a thousand would be taken for one."""
+    rng = np.random.default_rng(9)
+    for n in (8, 25, 200):
+        for rho in (0.0, 0.6, 0.9, 0.98):
+            slow = lfilter([math.sqrt(1.0 - rho**2)], [1.0, -rho], rng.standard_normal((3, n + 600)))[:, 600:]
+            white = 0.3 * rng.standard_normal((3, n))
+            assert all(at_rest(r) for r in (*slow, *(slow + white), *np.round(slow + white)))
+    assert at_rest(np.full(50, 0.3))
+    assert at_rest(0.3 + 1e-3 * np.arange(50))
+    assert at_rest([1.0, 2.0])
 
 
 def test_noise_ignores_outliers() -> None:

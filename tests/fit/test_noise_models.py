@@ -287,3 +287,10 @@ def test_noise_estimated_from_few_samples_widens_the_intervals_as_students_t():
     assert (exact.dof, few.dof) == (None, 8.0)
     assert few.goodness["noise_dof"] == 8.0
     assert few.goodness["p"] > exact.goodness["p"] or few.goodness["p"] > 0.05
+
+
+def test_a_record_that_moves_before_its_event_is_no_noise_to_whiten_with():
+    t = np.arange(300) * 0.01
+    e = recorded("e", t, {"y": 0.01}, {"event": 2.0}, y=np.exp(-0.7 * t) + 0.01 * RNG(5).standard_normal(t.size))
+    with pytest.raises(StudyError, match=r"at least 20 rows before the event, at rest.*got 0 rows"):
+        before_event([e], ["y"])
