@@ -16,9 +16,8 @@ from hvdc_ident.data import Experiment, Trajectory
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler, evidence_between
 from hvdc_ident.discrepancy.nominal import of_held_out
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
+from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, run
 from hvdc_ident.discrepancy.refit_jobs import refit_again
-from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.simulator import TIME_SHIFT, unknown_of
 from hvdc_ident.text import listed, quantity
@@ -98,7 +97,7 @@ def _late(here: Refit) -> dict[str, float]:
         return found | (
             {} if others is None else _late_alone(_timed(others), end.theta[: len(others.free)], timed.outputs)
         )
-    except (SimulationError, StudyError):  # it does not run, or the record has one instant
+    except FAILURES:  # it does not run, or the record has one instant
         return {}
 
 

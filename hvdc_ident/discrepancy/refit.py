@@ -28,6 +28,9 @@ METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-
 """A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""
 GLANCE = 3
 """Evaluations of each of several starts, of which the best goes on: its start, and the first two steps."""
+FAILURES = (HvdcIdentError, ValueError, ArithmeticError)
+"""What the work on one candidate raises where it cannot be done: the candidate has failed then, with this as its reason, and the
+search goes on. numpy's LinAlgError is a ValueError."""
 SCANNED = 15
 """Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
 
@@ -139,8 +142,18 @@ class RefitResult:
 
 
 def find(job: RefitJob) -> RefitResult:
-    """Result of `run` without its job."""
-    return found_by(run(job))
+    """Result of `run` without its job; what it raises is its failure."""
+    try:
+        return found_by(run(job))
+    except FAILURES as error:
+        return found_by(failed(job, error))
+
+
+def failed(job: RefitJob, error: Exception) -> Refit:
+    """The refit of a job that could not be done, where it would have begun, with the reason."""
+    return Refit(
+        job.model, job.placed, job.problem, job.noise, job.begins[0], failure=str(error) or type(error).__name__
+    )
 
 
 def found_by(refit: Refit) -> RefitResult:
@@ -160,7 +173,7 @@ def run(job: RefitJob) -> Refit:
     best = Refit(job.model, job.placed, job.problem, job.noise, end.theta, 2.0 * end.cost, ended=ended)
     try:
         return judged(best)
-    except HvdcIdentError as error:
+    except FAILURES as error:
         return replace(best, failure=str(error))
 
 
@@ -186,7 +199,7 @@ def _swept(job: RefitJob, begin: Array) -> Array:
     unknown = job.problem.unknowns[at]
     try:
         line = SizeLine.of(job.model, job.problem, begin, at)
-    except SimulationError:
+    except FAILURES:
         return begin
     sizes = np.geomspace(max(unknown.min, SMALLEST * unknown.max), unknown.max, BENT)
     best = begin.copy()
@@ -198,7 +211,7 @@ def _walk(problem: Problem, begin: Array, evaluations: int) -> OptimiserResult:
     """The end of a walk, failed with the reason where the model raises."""
     try:
         return replace(METHOD, max_evaluations=evaluations).run(problem, begin)
-    except HvdcIdentError as error:
+    except FAILURES as error:
         return OptimiserResult(begin, None, "failed", str(error), 0)
 
 

@@ -10,11 +10,10 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import Pick
 from hvdc_ident.discrepancy.placed import PATIENCE, Placed, added, begins_anywhere, moved
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
+from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, run
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
 from hvdc_ident.effects import apply_effects
-from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -83,7 +82,7 @@ def refit_again(first: Refit, here: Refit, placed: Sequence[Placed]) -> Refit:
     """The nominal model `first` with these effects, refitted from where they stand in the hypothesis `here`; a failure is told."""
     try:
         return run(job_of(first, here, placed, {}))
-    except HvdcIdentError as error:
+    except FAILURES as error:
         return replace(here, failure=str(error))
 
 

@@ -12,12 +12,11 @@ from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, unseen_rows
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, unseen
+from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, unseen
 from hvdc_ident.discrepancy.refit_jobs import job
 from hvdc_ident.discrepancy.residual_checks import loud_after_breaks, residual_tests
 from hvdc_ident.discrepancy.size_profile import hopped
 from hvdc_ident.effects import effects
-from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.model import AnyModel
 
 PRICE = 8.0
@@ -55,7 +54,7 @@ def refitted(
         try:
             jobs.append(job(before, found, [p], made))
             of.append(p)
-        except HvdcIdentError as error:
+        except FAILURES as error:
             none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
             trials.append(CandidateFit(p, none, -np.inf))
     texts = [f"{text}: {found[p.candidate].label}" for p in of]

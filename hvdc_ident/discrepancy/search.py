@@ -14,14 +14,13 @@ from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, 
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged
+from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, judged
 from hvdc_ident.discrepancy.refit_jobs import as_given, job_of, refit_again
 from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by, once_more
 from hvdc_ident.discrepancy.released import held_again, released
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.rounds import against, closed, gained, one_round
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.errors import HvdcIdentError, SimulationError
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ def from_either_side(search: SearchContext, first: Refit) -> SearchOutcome:
     search.tell(0, 1, "once more, from the given values")
     try:
         again = forward(search, judged(replace(first, theta=theta)))
-    except SimulationError as error:
+    except FAILURES as error:
         return replace(outcome, notes=(*outcome.notes, f"from the given values nothing was looked for: {error}"))
     ruler = Ruler.of(min(last, again.refit, key=lambda r: r.chi2))
     more = len(again.refit.problem.free) - len(last.problem.free)
@@ -113,7 +112,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
         try:
             if kept or not rounds:
                 rounds.append(one_round(search, here, len(rounds) + 1))
-        except SimulationError as error:
+        except FAILURES as error:
             if not kept:
                 raise
             notes += (f"nothing was looked for beside {here.placed[-1].candidate.label}: {error}",)
@@ -177,7 +176,7 @@ def _masked(search: SearchContext, before: Refit, found: Round, number: int) -> 
     for trial in _different(found)[:BEAM]:
         try:
             further = one_round(search, trial.refit, number)
-        except SimulationError:
+        except FAILURES:
             continue
         if further.winner is None or further.ruler is None:
             continue
@@ -231,7 +230,7 @@ def settled(
                 )
                 kept[k] = again.light()
                 here = _in_place(winner.refit, k)
-            except SimulationError as error:  # refitted it runs, as far as a refit needs it to
+            except FAILURES as error:  # refitted it runs, as far as a refit needs it to
                 notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")
         k += 1
     return here, kept, tuple(notes)
@@ -259,7 +258,7 @@ def _looked_again(
     for trial in found.trials[: SHORTLIST + 1]:
         placed = trial.refit.placed[-1]
         among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
-        with suppress(HvdcIdentError):  # it cannot sit there beside the others: no rival
+        with suppress(*FAILURES):  # it cannot sit there beside the others: no rival
             job = job_of(first, here, among, {k: trial.refit.sizes(placed)})
             candidate = job.placed[k].candidate
             # Places behind an effect that is left out are one place without it.

@@ -9,7 +9,7 @@ from typing import Any
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
 from hvdc_ident.effects import EffectUse, apply_effects, effects
-from hvdc_ident.errors import ComputationError, SteadyStateError
+from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
@@ -24,7 +24,7 @@ def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosi
 
     Keys: effect, at, parameter, unit, experiment, output, time (n) in s, measured (n), sizes [value or None for
     absent], shares, labels, chosen (which of them was found), curves [(n)]. The other effects and the parameters stay
-    as found. A size at which the model cannot be run is left out.
+    as found. A size that the effect cannot have, and one at which the model cannot be run, is left out.
     """
     if not found.effects or found.augmented is None:
         return None
@@ -35,14 +35,18 @@ def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosi
     first = found.effects[0]
     name = next(iter(first.parameters))
     size = first.parameters[name]
-    neutral = _neutral(first, effects()[first.effect].parameters[name].neutral)
+    bounds = effects()[first.effect].parameters[name]
+    neutral = _neutral(first, bounds.neutral)
     rows = chosen.compared
     shown: dict[str, list[Any]] = {"sizes": [], "shares": [], "labels": [], "curves": []}
     for share in SHARES:
         value = _size(size.value, neutral, share)
+        # On the other side of neutral, or far from it, an effect has no such size: a lead of less than 0 s.
+        if value is not None and not bounds.min <= value <= bounds.max:
+            continue
         try:
             run = simulate(_with(model, found, value), chosen, found.parameters_after, outputs=[place[0]])
-        except (ComputationError, SteadyStateError):  # as where a smaller limit leaves no rest to begin at
+        except HvdcIdentError:  # as where a smaller limit leaves no rest to begin at
             continue
         shown["sizes"].append(value)
         shown["shares"].append(share)

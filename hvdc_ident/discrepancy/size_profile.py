@@ -19,12 +19,11 @@ from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import unseen_rows
 from hvdc_ident.discrepancy.options import BEAM, SURE
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, RefitResult, found_by, judged, run, signal
+from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, RefitResult, found_by, judged, run, signal
 from hvdc_ident.discrepancy.refit_jobs import as_given
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.discrepancy.size_line import BENT, PATIENT, SizeLine
 from hvdc_ident.effects import Probe, SignalScales, effects, size_grid
-from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.immutable import FrozenMap
@@ -87,9 +86,11 @@ def sized(candidate: CandidateEffect) -> str:
 
 
 def resized(probe: Probe, name: str, size: float) -> Probe:
-    low, high = probe.free[name]
-    free = FrozenMap({**probe.free, name: (min(low, 0.9 * size), max(high, 1.1 * size))})
-    return replace(probe, values=FrozenMap({**probe.values, name: size}), free=free)
+    """The probe with another size of a parameter, and room about it, within what the effect may have."""
+    q, (low, high) = effects()[probe.effect].parameters[name], probe.free[name]
+    size, room = min(max(size, q.min), q.max), 0.1 * abs(size)
+    wide = max(min(low, size - room), q.min), min(max(high, size + room), q.max)
+    return replace(probe, values=FrozenMap({**probe.values, name: size}), free=FrozenMap({**probe.free, name: wide}))
 
 
 K = TypeVar("K", bound=Hashable)
@@ -139,7 +140,7 @@ class _Sweep:
         """Sizes to look at; none where the slot's signal cannot be simulated by itself: what is counted is not known then."""
         try:
             return self.sizes(refit)
-        except SimulationError:
+        except FAILURES:
             return np.empty(0)
 
 
@@ -174,8 +175,11 @@ def hopped(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]
 def _polished(here: Refit) -> RefitResult:
     """Refit from the end of a simplex search, where that is better: rows that cross an edge turn the cost into stairs."""
     simplex = NelderMead(max_evaluations=RUNS, size=SIMPLEX, cost=0.05, step=1e-8, restarts=2)
-    end = simplex.run(replace(here.problem, simulator=ModelSimulator(here.model, PATIENT)), here.theta)
-    there = run(RefitJob(here.model, here.placed, here.problem, (end.theta,), here.noise))
+    try:
+        end = simplex.run(replace(here.problem, simulator=ModelSimulator(here.model, PATIENT)), here.theta)
+        there = run(RefitJob(here.model, here.placed, here.problem, (end.theta,), here.noise))
+    except FAILURES:  # it stays where it is
+        return found_by(here)
     return found_by(min(here, here if there.failure else there, key=_left))
 
 
@@ -248,7 +252,7 @@ def _agreed(search: SearchContext, refits: Mapping[int, Refit]) -> dict[int, Ref
         if grids[k].size:
             theta = r.theta.copy()
             theta[_size(r)[0]] = grids[k][np.argmin(left[k])]
-            with suppress(HvdcIdentError):  # it stays where it runs
+            with suppress(*FAILURES):  # it stays where it runs
                 there = judged(replace(r, theta=theta))
                 found[k] = min(r, there, key=_left)
     return found
@@ -339,7 +343,10 @@ class _Piece:
 
 def _left_at(piece: _Piece) -> Array:
     """Chi2 at each size; infinite for one that could not be run."""
-    line = SizeLine.of(piece.refit.model, piece.refit.problem, piece.refit.theta, _size(piece.refit)[0])
+    try:
+        line = SizeLine.of(piece.refit.model, piece.refit.problem, piece.refit.theta, _size(piece.refit)[0])
+    except FAILURES:
+        return np.full(piece.sizes.size, np.inf)
     asked: dict[Data, Callable[[float], float]] = {"fitted": line.fitted, "held out": line.unseen, "all": line.left}
     of = asked[piece.what]
     return np.array([of(float(s)) for s in piece.sizes])

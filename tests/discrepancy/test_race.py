@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import experiments
+from cases import FREE, experiments, model
 from refits import beside, plain
 
+from hvdc_ident import Model
+from hvdc_ident.discrepancy import diagnose, refit, refit_jobs
 from hvdc_ident.discrepancy.context import Course, SearchContext
 from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
+from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.size_profile import resized
+from hvdc_ident.effects import Probe, effects
+from hvdc_ident.errors import ComputationError, InputError
+from hvdc_ident.fit import Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
@@ -73,3 +81,60 @@ def test_the_bar_never_goes_back_and_tells_the_best_so_far() -> None:
     assert [d for d, _, _ in seen] == sorted(d for d, _, _ in seen)
     assert all(0 <= d < t == 100 for d, t, _ in seen)
     assert seen[0][2] == "refits" and seen[-1][2] == "refits; best so far: after 40, 0.025 times the noise is left"
+
+
+FAILS = (
+    InputError("a value lies outside its bounds"),
+    ComputationError("it does not converge"),
+    np.linalg.LinAlgError("SVD did not converge"),
+    ValueError("operands could not be broadcast"),
+    ZeroDivisionError("division by zero"),
+)
+
+
+@pytest.mark.parametrize("error", FAILS, ids=lambda e: type(e).__name__)
+def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on(
+    before: Refit, error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever it raises: where its refit is made, at its first run, or where its result is judged."""
+    sound, broken = job(before, "lag", "wm", 0.05), job(before, "lag", "drag", 0.05)
+    alone = run(sound)
+    for place in ("_best_walk", "judged", "_walk"):
+        plain = getattr(refit, place)
+
+        def fails(of: object, *given: object, plain: Callable[..., object] = plain) -> object:
+            placed = getattr(of, "placed", None)
+            if (placed or (None,))[0] is broken.placed[0] or of is broken.problem:
+                raise error
+            return plain(of, *given)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(refit, place, fails)
+            told, lost = Race().run(SEARCH, before.chi2, [sound, broken], ["a", "b"])
+        assert str(error) in lost.failure
+        assert not told.failure and told.chi2 == pytest.approx(alone.chi2, rel=1e-5)
+
+
+def test_a_diagnosis_outlives_a_candidate_that_raises(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gain raises where its refit is made; the lag that is missing is named all the same."""
+    plain = refit_jobs.added
+
+    def fails(model: Model, problem: Problem, candidate: CandidateEffect, *given: object) -> object:
+        if candidate.effect == "gain":
+            raise ValueError("no such gain")
+        return plain(model, problem, candidate, *given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(refit_jobs, "added", fails)
+    found = diagnose(model(), experiments(lag=0.03), FREE, effects=["lag", "gain"], places=["wm"])
+    assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text
+    statuses = {c.effect: c.status for c in found.candidates if c.round == 1}
+    assert statuses == {"lag": "refitted", "gain": "failed: no such gain"}
+
+
+def test_sizes_are_within_what_an_effect_may_have() -> None:
+    """A neighbour's size is taken over, of an effect with other bounds or another sign."""
+    lead = Probe("lead-lag", FrozenMap({"T1": 0.1, "T2": 0.2}), FrozenMap({"T1": (0.01, 1.0), "T2": (0.01, 1.0)}))
+    low = resized(lead, "T2", 0.0)
+    assert low.values["T2"] == effects()["lead-lag"].parameters["T2"].min == low.free["T2"][0]
+    below = resized(Probe("offset", FrozenMap({"c": 0.1}), FrozenMap({"c": (0.0, 0.5)})), "c", -2.0)
+    assert below.free["c"][0] < below.values["c"] == -2.0 < below.free["c"][1]
