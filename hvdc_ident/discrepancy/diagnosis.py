@@ -25,6 +25,7 @@ from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_found
 from hvdc_ident.discrepancy.race import UNTRIED as NOT_BEGUN
+from hvdc_ident.discrepancy.record_noise import LOUDER, QUIETER, OutputNoise
 from hvdc_ident.discrepancy.refit import Refit, judged
 from hvdc_ident.discrepancy.released import stated
 from hvdc_ident.discrepancy.residual_checks import Binned
@@ -49,6 +50,7 @@ from hvdc_ident.fit import FitParameter, Simulator
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.simulate import ModelSimulator
+from hvdc_ident.text import quantity
 
 CLOSED = (
     "The model is closed inside: effects were tried at its inputs and outputs only; its signals, states and loops were "
@@ -190,6 +192,9 @@ def _assembled(
             findings, text = (moved,), moved.text
     if off := clocks(search, last):
         text = f"{text} {told(off)}"
+    if louder := contradiction(model, first.noise, LOUDER):
+        text = f"{text} {louder}"
+    notes = (*notes, *filter(None, [contradiction(model, first.noise, QUIETER)]))
     left, bound = judgement.remainder, outcome.rounds[0].reach
     return Diagnosis(
         verdict=judgement.verdict,
@@ -209,9 +214,7 @@ def _assembled(
         augmented=augmented,
         fallback=None if other is None else other.to_dict(),
         bode=responses_found,
-        noise={
-            o: {"std": n.std, "ar": list(n.model), "resolution": n.step, "source": n.source} for o, n in first.noise.items()
-        },
+        noise={o: noise_told(n) for o, n in first.noise.items()},
         notes=notes,
         doubt=judgement.doubt,
         findings=findings,
@@ -221,6 +224,29 @@ def _assembled(
         values_by_place=FrozenMap(depend),
         stand_ins=others,
     )  # fmt: skip
+
+
+def noise_told(noise: OutputNoise) -> dict[str, Any]:
+    """Return the noise of an output for the results: what was taken, how well it is known, and what was stated."""
+    return {
+        "std": noise.std, "ar": list(noise.model), "resolution": noise.step, "source": noise.source, "error": noise.std_error,
+        "stated": noise.stated, "contradicted": noise.contradicted,
+    }  # fmt: skip
+
+
+def contradiction(model: AnyModel, noise: Mapping[str, OutputNoise], how: str) -> str:
+    """Return in a sentence what the records say against the stated noise of some outputs, "louder" or "quieter"; else nothing."""
+    each = []
+    for o, n in noise.items():
+        if n.contradicted == how and n.stated is not None and n.std is not None:
+            unit = model.outputs[o].unit if o in model.outputs else ""
+            stated, shown = quantity(n.stated, unit, 3), quantity(n.shown, unit, 3)
+            each.append(f"{o} (stated {stated}, shown {shown})")
+    if not each:
+        return ""
+    if how == LOUDER:
+        return f"The records are noisier than was stated, and the noise they show was used: {', '.join(each)}."
+    return f"The records before the event are less noisy than was stated; the stated noise was used: {', '.join(each)}."
 
 
 def _latent(bound: Reach) -> dict[str, Any]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.options import SURE, DiagnosisOptions
+from hvdc_ident.discrepancy.record_noise import freedom_of
 from hvdc_ident.discrepancy.refit import Refit, held_out, held_out_by_record, unseen
 from hvdc_ident.discrepancy.scores import Scores
 from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
@@ -154,8 +155,14 @@ def material_gap(
 
 
 def louder_than_noise(refit: Refit, share: float) -> bool:
-    """Return True where the fitted residual is larger than the noise by more than a share of it, in amplitude."""
-    return refit.chi2 > (1.0 + share) ** 2 * refit.rows
+    """Return True where the fitted residual is larger than the noise by more than a share of it, in amplitude, and by more than
+    an estimated noise may be off."""
+    return refit.chi2 > ((1.0 + share) ** 2 + SURE * level_error(refit)) * refit.rows
+
+
+def level_error(refit: Refit) -> float:
+    """Relative standard error of the noise's power, where its level is estimated; 0 where it is stated."""
+    return float(np.sqrt(2.0 / freedom_of(refit.noise, refit.problem.outputs)))
 
 
 STEP = 0.05

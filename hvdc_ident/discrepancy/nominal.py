@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -11,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
-from hvdc_ident.discrepancy.record_noise import OutputNoise, draws, noise_of
-from hvdc_ident.errors import StudyError
+from hvdc_ident.discrepancy.record_noise import GIVEN, OutputNoise, draws, noise_of, stated_by
+from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit import FitParameter, Problem, Simulator
 from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.fit.simulator import approximate, observe
 from hvdc_ident.identifiability.gate import gate, gated
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
 from hvdc_ident.immutable import FrozenMap
@@ -130,8 +132,8 @@ def nominal(
     fitted = [e for e in experiments if e.role == "fit" and e.outputs]
     if not fitted:
         raise StudyError("nothing to diagnose", expected='an experiment of role "fit" with measured outputs')
-    noise = noise_of([e for e in experiments if e.outputs])
     problem = Problem(simulator, tuple(experiments), tuple(parameters), held=FrozenMap(held))
+    noise = noise_of([e for e in experiments if e.outputs], _runs(problem))
     if report is not None:
         problem = gated(problem, gate(report, diagnosis=True))
     # What is known of the noise goes into the records: a fit keeps weights of its own for deterministic outputs only.
@@ -182,8 +184,23 @@ def off_jumps(experiment: Experiment) -> Experiment:
 
 
 def _stated(experiment: Experiment, output: str, noise: OutputNoise) -> float | None:
-    """The standard deviation of a record: its own where that was given and holds, else what was found of its noise."""
-    return experiment.noise.get(output) if noise.source == "given" else noise.std
+    """The standard deviation of a record: its own where that was stated and holds, else what was found of its noise."""
+    own = stated_by(experiment, output)
+    if own is not None and (noise.source == GIVEN or noise.stated is None):
+        return own
+    return noise.by_record[experiment.name][0] if experiment.name in noise.by_record else noise.std
+
+
+def _runs(problem: Problem) -> dict[str, Mapping[str, Array]]:
+    """By experiment the outputs of the model at the start of the fit, (n,) at its rows; without those that cannot be run."""
+    # With the derivatives of the fit the machine code is that of the fit: compiling another takes longer than running it.
+    free = () if approximate(problem.simulator) else tuple(f.name for f in problem.free)
+    found: dict[str, Mapping[str, Array]] = {}
+    for e in problem.experiments:
+        if e.outputs and e.domain == "time":
+            with suppress(SimulationError):  # nothing is known of its motion then: the record has to be at rest
+                found[e.name] = observe(problem.simulator, e, problem.values(problem.start), free).values
+    return found
 
 
 def _told_apart(optimum: LocalAnalysis) -> tuple[LocalAnalysis, dict[str, float]]:

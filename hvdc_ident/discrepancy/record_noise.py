@@ -1,17 +1,18 @@
 """The noise of the records: how large, how correlated from row to row, how coarse, told by what lies before the event.
 
 A fit's own residuals would tell it wrong where an effect is missing: they hold the effect. So the records before the
-event decide; given standard deviations stand unless those records are plainly noisier.
+event decide, less the run of the model, and only where both are at rest: what moves there holds the effect too. Stated
+standard deviations stand unless those rows are plainly noisier, and what the records say against them is told.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from hvdc_ident.data import Array, Experiment, event_time, noise_floor
+from hvdc_ident.data import Array, Experiment, Trajectory, at_rest, event_time, noise_floor
 from hvdc_ident.discrepancy.noise_colour import TANH, Colour, Likelihood, likelihood, together, without_common
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.errors import StudyError
@@ -25,6 +26,12 @@ FEWEST = 8
 """Rows before an event from which anything is told of the noise."""
 GIVEN = "given"
 """The source of a standard deviation that stands as it was given."""
+LOUDER, QUIETER = "louder", "quieter"
+"""What records before the event are, where they are not as loud as was stated."""
+SCATTER_ERROR = 0.9
+"""Standard error of the logarithm of the scatter from row to row, times the root of the number of rows (`row_scatter`)."""
+ROWS_OF_MOTION = 32
+"""Rows in which a motion of 30 times the noise is seen (`at_rest`, by simulation); in 20 it is not."""
 SOFT = 1e-6
 LONG = 120
 """Rows of a record from which more than one AR coefficient is told."""
@@ -48,7 +55,11 @@ class OutputNoise:
 
     model: its AR coefficients from row to row, () where it is white; error: the standard error of artanh of a single
     one. step: what values are rounded to, 0 for nothing. source: where it comes from, in words. rows: how many before an
-    event. freedom: degrees of freedom of a standard deviation that is told by those; 0 for one that is not.
+    event that are at rest. freedom: degrees of freedom of a standard deviation that is estimated; 0 for one that is stated.
+    stated: what was stated, None where nothing was; shown: what the records show of it; contradicted: "louder" or "quieter"
+    where they are so beyond chance.
+    by_record: by experiment the standard deviation and its degrees of freedom, where the records' own differ beyond chance.
+    moving: rows before an event of which nothing is told, for the model or the record is not at rest there.
     """
 
     std: float | None
@@ -58,6 +69,16 @@ class OutputNoise:
     source: str
     rows: int
     freedom: int = 0
+    stated: float | None = None
+    shown: float = 0.0
+    contradicted: str = ""
+    by_record: FrozenMap[tuple[float, int]] = field(default_factory=FrozenMap)
+    moving: int = 0
+
+    @property
+    def std_error(self) -> float:
+        """The relative standard error of the standard deviation; 0 of a stated one."""
+        return float(1.0 / np.sqrt(2.0 * self.freedom)) if self.freedom else 0.0
 
     @property
     def below(self) -> float:
@@ -71,10 +92,15 @@ class OutputNoise:
         return QuantisedNoise(self.step, max(self.below, FINEST * self.step)) if coarse else None
 
 
-def noise_of(experiments: Sequence[Experiment]) -> FrozenMap[OutputNoise]:
-    """The noise of every measured output, from all its records together; AR coefficients from all outputs together."""
+def noise_of(
+    experiments: Sequence[Experiment], runs: Mapping[str, Mapping[str, Array]] | None = None
+) -> FrozenMap[OutputNoise]:
+    """The noise of every measured output, from all its records together; AR coefficients from all outputs together.
+
+    runs: by experiment and output the run of the model, (n,) at the experiment's rows; without one a level is taken for it.
+    """
     outputs = dict.fromkeys(o for e in experiments for o in e.outputs)
-    quiet = {o: _quiet(o, [e for e in experiments if o in e.outputs]) for o in outputs}
+    quiet = {o: _quiet(o, [e for e in experiments if o in e.outputs], runs or {}) for o in outputs}
     short = {o: likelihood(q.records) for o, q in quiet.items() if q.moves and q.even and not q.longer and not q.coarse}
     colours = _colours(quiet, short)
     return FrozenMap({o: _noise(q, colours.get(o, Colour()), short.get(o)) for o, q in quiet.items()})
@@ -86,8 +112,9 @@ class Quiet:
 
     std: their standard deviation if they were white; moves: whether there is noise in them at all. given: the standard
     deviation told; step: what the whole records are rounded to; rounded: their noise when below that. floor: the least a
-    record can hold. scatter: the white noise that all rows show from one to the next. longer: an AR model of several
-    coefficients, where there are rows enough. even: evenly spaced rows.
+    record can hold. scatter: the white noise that all rows show from one to the next, and their number. longer: an AR model
+    of several coefficients, where there are rows enough. even: evenly spaced rows. own: by experiment the variance and the number
+    of its rows at rest. moving: rows before the events that are not at rest.
     """
 
     records: tuple[Array, ...]
@@ -97,9 +124,11 @@ class Quiet:
     step: float
     rounded: float
     floor: float
-    scatter: float | None
+    scatter: tuple[float, int] | None
     longer: AR
     even: bool
+    own: Mapping[str, tuple[float, int]]
+    moving: int
 
     @property
     def rows(self) -> int:
@@ -114,9 +143,10 @@ class Quiet:
         return self.step > 0.0 and self.std < COARSE * self.step and not (self.moves and slow)
 
 
-def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
-    before = [(t, r) for e in experiments for t, r in [_before(e, output)] if r.size >= FEWEST]
-    quiet = without_tone([t for t, _ in before], [r for _, r in before])
+def _quiet(output: str, experiments: Sequence[Experiment], runs: Mapping[str, Mapping[str, Array]]) -> Quiet:
+    resting = {e.name: _before(e, output, runs.get(e.name, {}).get(output)) for e in experiments}
+    before = {name: (t, r) for name, (t, r, _) in resting.items() if r.size}
+    quiet = without_tone([t for t, _ in before.values()], [r for _, r in before.values()])
     whole = [e.measured[output][np.isfinite(e.measured[output])] for e in experiments if e.measured is not None]
     step, given, even = _step(whole), _given(output, experiments), _even(experiments)
     rounded = step * float(np.sqrt(1.0 / 12.0 + _dither(whole, step) ** 2)) if step > 0.0 else 0.0
@@ -126,7 +156,6 @@ def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
     scale = max((float(np.abs(r).max()) for r in whole if r.size), default=1.0)
     std = float(np.sqrt(power / max(rows - 2 * len(records), 1))) if rows else 0.0
     moves = std > 1e-12 * scale and (given is None or std >= 1e-3 * given) and (given is not None or std > floor)
-    scatter = scatter_of(experiments, output)
     longer = autoregression(records) if moves and even and rows >= LONG * len(records) else ()
     return Quiet(
         records,
@@ -136,10 +165,20 @@ def _quiet(output: str, experiments: Sequence[Experiment]) -> Quiet:
         step,
         rounded,
         floor,
-        scatter[0] if scatter else None,
+        scatter_of([_less(e, output, runs.get(e.name, {}).get(output)) for e in experiments], output),
         longer if len(longer) > 1 else (),
         even,
+        {n: (float(r @ r) / (r.size - 2), r.size) for n, r in zip(before, quiet, strict=True)},
+        sum(moving for _, _, moving in resting.values()),
     )
+
+
+def _less(experiment: Experiment, output: str, run: Array | None) -> Experiment:
+    """The experiment with what the model leaves of one output, in which only what it lacks is left of the motion."""
+    if run is None or experiment.measured is None:
+        return experiment
+    left = (experiment.measured[output] - run)[:, None]
+    return experiment.with_(measured=Trajectory(experiment.time, left, (output,), (experiment.measured.unit(output),)))
 
 
 def _colours(quiet: Mapping[str, Quiet], short: Mapping[str, Likelihood]) -> dict[str, Colour]:
@@ -165,6 +204,10 @@ def _lack(found: Likelihood, given: float) -> tuple[float, bool]:
 
 
 def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNoise:
+    return replace(_told(quiet, colour, found), stated=quiet.given, moving=quiet.moving)
+
+
+def _told(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNoise:
     given, rows, step = quiet.given, quiet.rows, quiet.step
     freedom = max(rows - 2 * len(quiet.records), 1)
     std = quiet.std if quiet.moves else 0.0
@@ -173,31 +216,70 @@ def _noise(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNois
         return OutputNoise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
     if quiet.coarse:
         return OutputNoise(given, (), 0.0, step, GIVEN, rows)
+    if rows == 0 and quiet.scatter is not None:
+        return _from_scatter(quiet, *quiet.scatter)
     if given is None and std <= quiet.floor:
         if step > 0.0:
             return OutputNoise(quiet.rounded, (), 0.0, step, "the resolution of the record and its flicker", rows)
-        if rows == 0 and quiet.scatter is not None:
-            return OutputNoise(
-                quiet.scatter, (), 0.0, step, "the scatter from row to row, for no rows lie before an event", 0
-            )
         return OutputNoise(None, (), 0.0, step, "none: the misfit stands in for it", rows)
     model = (colour.rho,) if colour.tanh else quiet.longer
     if colour.tanh and found is not None:
         std = found.best_std(colour.tanh)
+    rho = sum(model)
+    fresh = max((1.0 - min(rho, 0.99) ** 2) / (1.0 + rho**2), 1.0 / max(rows, 1))
     if given is None:
-        return OutputNoise(std, model, colour.error, step, "the records before the event", rows, freedom)
+        own = _by_record(quiet, std, fresh)
+        return OutputNoise(
+            std, model, colour.error, step, "the records before the event", rows, freedom, by_record=FrozenMap(own)
+        )
+    margin = 1.0 + SURE / np.sqrt(2.0 * max(rows, 1) * fresh)
     if colour.tanh and found is not None:
         lack, above = _lack(found, given)
-        noisier = above and lack > SURE**2
+        louder, quieter = above and lack > SURE**2, not above and lack > SURE**2
     else:
-        rho = sum(model)
-        independent = max(rows * (1.0 - min(rho, 0.99) ** 2) / (1.0 + rho**2), 1.0)
-        noisier = std > given * (1.0 + SURE / np.sqrt(2.0 * independent))
-    if noisier:
-        return OutputNoise(
-            std, model, colour.error, step, "the records before the event, noisier than what was given", rows, freedom
-        )
-    return OutputNoise(given, model, colour.error, step, GIVEN, rows)
+        louder, quieter = std > given * margin, bool(rows) and given > std * margin
+    if louder:
+        source = "the records before the event, noisier than what was given"
+        return OutputNoise(std, model, colour.error, step, source, rows, freedom, shown=std, contradicted=LOUDER)
+    against = QUIETER if quieter else ""
+    return OutputNoise(given, model, colour.error, step, GIVEN, rows, shown=std, contradicted=against)
+
+
+def _from_scatter(quiet: Quiet, scatter: float, count: int) -> OutputNoise:
+    """The noise where no rows before an event tell it: as stated, unless that is plainly less than what all rows show."""
+    why = "before an event are at rest" if quiet.moving else "lie before an event"
+    freedom = max(int(count / (2.0 * SCATTER_ERROR**2)), 1)
+    if quiet.given is None:
+        return OutputNoise(scatter, (), 0.0, quiet.step, f"the scatter from row to row, for no rows {why}", 0, freedom)
+    # What is not followed from row to row is in the scatter too, as far as its orders agree all the same: three standard errors.
+    if scatter > quiet.given * np.exp((SURE + 3.0) * SCATTER_ERROR / np.sqrt(count)):
+        source = "the scatter from row to row, more than what was given"
+        return OutputNoise(scatter, (), 0.0, quiet.step, source, 0, freedom, shown=scatter, contradicted=LOUDER)
+    return OutputNoise(quiet.given, (), 0.0, quiet.step, GIVEN, 0)
+
+
+def _by_record(quiet: Quiet, std: float, fresh: float) -> dict[str, tuple[float, int]]:
+    """By experiment its standard deviation and degrees of freedom, where one of them is not that of all; else nothing.
+
+    std: of all together; fresh: the share of the rows that are independent.
+    """
+    if quiet.step > 0.0 or len(quiet.own) < 2:
+        return {}
+    scale = std / quiet.std
+    own = {n: (scale * float(np.sqrt(variance)), rows - 2) for n, (variance, rows) in quiet.own.items()}
+    differ = any(
+        s <= 0.0 or abs(np.log(s / std)) > SURE / np.sqrt(2.0 * max(rows * fresh, 1.0)) for s, rows in own.values()
+    )
+    return own if differ and all(s > quiet.floor for s, _ in own.values()) else {}
+
+
+def freedom_of(noise: Mapping[str, OutputNoise], outputs: Iterable[str]) -> float:
+    """Degrees of freedom of the noise level of some outputs together; infinite where all of it is stated.
+
+    Source: Satterthwaite, Biometrics Bulletin 2 (1946), for outputs with as many rows each.
+    """
+    shares = [1.0 / n.freedom if (n := noise[o]).freedom else 0.0 for o in outputs]
+    return len(shares) ** 2 / sum(shares) if any(shares) else float("inf")
 
 
 def _even(experiments: Sequence[Experiment]) -> bool:
@@ -210,9 +292,19 @@ def _even(experiments: Sequence[Experiment]) -> bool:
     return True
 
 
+def stated_by(experiment: Experiment, output: str) -> float | None:
+    """The standard deviation that a record states for an output; None where it was estimated from its rows, or is next to nothing."""
+    value = experiment.noise.get(output)
+    if value is None or experiment.measured is None or (output in experiment.noise_dof and experiment.domain == "time"):
+        return None
+    v = experiment.measured[output]
+    extent = float(np.nanmax(v) - np.nanmin(v)) if np.isfinite(v).any() else 0.0
+    return value if value > 1.001 * SOFT * extent else None
+
+
 def _given(output: str, experiments: Sequence[Experiment]) -> float | None:
-    """The root mean square of the standard deviations given; None where one is missing or all are next to nothing."""
-    found = [e.noise.get(output) for e in experiments]
+    """The root mean square of the standard deviations stated; None where one is missing or all are next to nothing."""
+    found = [stated_by(e, output) for e in experiments]
     if any(n is None or n <= 0 for n in found):
         return None
     whole = [e.measured[output] for e in experiments if e.measured is not None]
@@ -248,20 +340,48 @@ def without_tone(times: Sequence[Array], records: Sequence[Array]) -> list[Array
     return best[1]
 
 
-def _before(experiment: Experiment, output: str) -> tuple[Array, Array]:
-    """The times and rows before the event, less their straight line."""
+def _before(experiment: Experiment, output: str, run: Array | None) -> tuple[Array, Array, int]:
+    """The times and rows before the event that are at rest, less the model's run and a line, and how many rows are not.
+
+    run: (n,) of the model at the experiment's rows; None where there is none.
+    """
     assert experiment.measured is not None
     event = experiment.event if experiment.event is not None else event_time(experiment.inputs)
+    none = np.empty(0)
     if event is None:
-        return np.empty(0), np.empty(0)
+        return none, none, 0
     keep = (experiment.time < event - 1e-12) & np.isfinite(experiment.measured[output])
-    t, v = experiment.time[keep], experiment.measured[output][keep]
-    if v.size < FEWEST:
-        return np.empty(0), np.empty(0)
+    t, y = experiment.time[keep], experiment.measured[output][keep]
+    run = np.zeros(t.size) if run is None else run[keep]
+    first = first_at_rest(t, y - run, run)
+    if first is None:
+        return none, none, t.size if t.size >= FEWEST else 0
+    return t[first:], without_line(t[first:], (y - run)[first:]), first
+
+
+def first_at_rest(time: Array, misfit: Array, run: Array) -> int | None:
+    """The row from which a record is at rest, and the model too; None where there is none.
+
+    time: (n,) s; misfit: record less run. Where the model moves, what it lacks moves too. All of its motion could be missing:
+    it is at rest where even that would change the variance of the misfit by less than the standard error of this variance,
+    sqrt(2/n) of it. Of a model that comes to rest the last half, quarter and so on are asked, for the plant may come to rest later
+    as far as there are rows enough to see that.
+    """
+    first, least = 0, FEWEST
+    while time.size - first >= least:
+        rest, motion = without_line(time[first:], misfit[first:]), run[first:] - run[first:].mean()
+        if motion @ motion <= np.sqrt(2.0 / rest.size) * (rest @ rest):
+            return first if at_rest(rest) else None
+        first, least = first + (time.size - first + 1) // 2, ROWS_OF_MOTION
+    return None
+
+
+def without_line(t: Array, v: Array) -> Array:
+    """The values less the straight line that fits them best."""
     x = t - t.mean()
     power = float(x @ x)
     rest = v - v.mean()
-    return t, np.asarray(rest - x * (float(x @ rest) / power if power else 0.0))
+    return np.asarray(rest - x * (float(x @ rest) / power if power else 0.0))
 
 
 def _step(records: Sequence[Array]) -> float:
@@ -298,9 +418,9 @@ def draws(
     """For each block (m, count) records of nothing but noise, weighted and whitened as the residuals are.
 
     fitted: the model's output at each block's rows, in its unit: rounding depends on it. A single AR coefficient is
-    drawn too, within its error, and so is a standard deviation that rows before the event tell, and the size of the noise
-    below a quantiser: what is not known of the noise widens what noise can do. Where the standard deviation is not given it
-    goes with the coefficient, for the steps from row to row are what is sure.
+    drawn too, within its error, and so is a standard deviation that is estimated, of a record by itself where the records
+    differ, and the size of the noise below a quantiser: what is not known of the noise widens what noise can do. Where the
+    standard deviation is not given it goes with the coefficient, for the steps from row to row are what is sure.
     """
     times = {e.name: e.time for e in problem.fitted_experiments}
     outputs = list(dict.fromkeys(b.output for b in blocks))
@@ -316,8 +436,10 @@ def draws(
         if len(n.model) == 1 and n.source != GIVEN:
             e *= np.sqrt((1.0 - n.model[0] ** 2) / (1.0 - model[0] ** 2))
         if n.freedom:
-            spread = np.random.default_rng([seed, 4, outputs.index(b.output)]).chisquare(n.freedom, count)
-            e *= np.sqrt(n.freedom / spread)
+            own = n.by_record.get(b.experiment)
+            freedom, which = (n.freedom, ()) if own is None else (own[1], (k,))
+            spread = np.random.default_rng([seed, 4, outputs.index(b.output), *which]).chisquare(freedom, count)
+            e *= np.sqrt(freedom / spread)
         if n.step:
             size = n.below * np.ones(count)
             if n.quantised is not None:

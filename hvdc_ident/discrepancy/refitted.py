@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.discrepancy.context import Round, SearchContext
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, unseen_rows
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, level_error, unseen_rows
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.race import Race
@@ -130,13 +130,18 @@ def cost_of(trial: CandidateFit) -> float:
 
 def excess(refit: Refit) -> bool:
     """Return True where a model leaves more than noise, by size."""
-    return refit.chi2 / refit.rows > 1.0 + SURE * float(np.sqrt(2.0 / refit.effective))
+    return refit.chi2 / refit.rows > 1.0 + SURE * _power_error(refit)
 
 
 def misses(refit: Refit) -> bool:
     """Return True where a model leaves more of unseen data than of those it was fitted to, by more than chance."""
     seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
-    return now is not None and now**2 > seen * (1.0 + SURE * float(np.sqrt(2.0 / refit.effective)))
+    return now is not None and now**2 > seen * (1.0 + SURE * _power_error(refit))
+
+
+def _power_error(refit: Refit) -> float:
+    """Standard error of the mean square of noise over its level: of the rows, and of a level that is estimated (F distribution)."""
+    return float(np.hypot(np.sqrt(2.0 / refit.effective), level_error(refit)))
 
 
 def left_by(refit: Refit) -> float:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtrc
 from scipy.stats import chi2
 
 from hvdc_ident.data import Array
@@ -24,7 +25,7 @@ from hvdc_ident.discrepancy.evidence import unseen_rows
 from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE
-from hvdc_ident.discrepancy.record_noise import draws
+from hvdc_ident.discrepancy.record_noise import draws, freedom_of
 from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
 from hvdc_ident.discrepancy.refitted import left_by
 from hvdc_ident.discrepancy.scores import runs
@@ -119,7 +120,8 @@ def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
         return 0.0
     if others is None:  # parts of the fitted records, which noise before the event has told of
         rows = unseen_rows(last) * last.effective / last.rows
-        return float(chi2.sf(square * rows, rows))
+        freedom = freedom_of(last.noise, last.problem.outputs)
+        return float(chi2.sf(square * rows, rows) if np.isinf(freedom) else fdtrc(rows, freedom, square))
     held = Nominal(others, last.theta[: len(last.problem.free)], last.noise)
     drawn = draws(others, held.blocks, held.noise, held.fitted(), _least_draws(search), search.seed + 6)
     rows = sum(b.residual.size for b in held.blocks)

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.implied import implied
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE
-from hvdc_ident.discrepancy.record_noise import FEWEST
+from hvdc_ident.discrepancy.record_noise import FEWEST, first_at_rest
 from hvdc_ident.discrepancy.refit import Refit, signal, unseen
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
@@ -276,7 +276,7 @@ def _one_kind(group: Sequence[Rival]) -> bool:
 
 
 def noise_left(left: Nominal) -> float:
-    """The mean square that noise alone leaves in whitened residuals, from the rows before the events; at least 1.
+    """The mean square that noise alone leaves in whitened residuals, from the rows before the events that are at rest; at least 1.
 
     It is 1 where the noise is as supposed. AR coefficients from few rows are not: with a standard deviation that is
     given, a coefficient that is wrong by a tenth makes of whitened noise half or three times its size.
@@ -284,12 +284,15 @@ def noise_left(left: Nominal) -> float:
     experiments = {e.name: e for e in left.problem.fitted_experiments}
     rows: dict[str, int] = {}
     quiet: dict[str, list[Array]] = {}
-    for b in left.blocks:
+    for b, run in zip(left.blocks, left.fitted(), strict=True):
         e = experiments[b.experiment]
         event = e.event if e.event is not None else event_time(e.inputs)
         rows[b.output] = rows.get(b.output, 0) + b.residual.size
         if event is not None and b.slope is None:  # one level between two steps is no measure of the others
-            quiet.setdefault(b.output, []).append(b.residual[e.time[b.rows] < event - 1e-12])
+            before = e.time[b.rows] < event - 1e-12
+            first = first_at_rest(e.time[b.rows][before], b.misfit[before], run[before])
+            if first is not None:
+                quiet.setdefault(b.output, []).append(b.residual[before][first:])
     total = 0.0
     for output, count in rows.items():
         own = np.concatenate(quiet.get(output) or [np.zeros(0)])

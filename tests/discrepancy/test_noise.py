@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from cases import SIGMA, TIME, experiments
+from scipy.integrate import solve_ivp
 
-from hvdc_ident.discrepancy.record_noise import noise_of, without_tone
+from hvdc_ident import Experiment, InputSignal, Trajectory
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.discrepancy.record_noise import OutputNoise, freedom_of, noise_of, without_tone
+from hvdc_ident.fit import FitParameter
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import parse_card
+from hvdc_ident.study.recordings import with_noise
 
 
 def test_white_noise_stands_as_given() -> None:
@@ -47,3 +55,155 @@ def test_a_sine_of_common_phase_is_no_noise_and_noise_is_no_sine() -> None:
     left = without_tone(times, [n + tone for n in noise])
     assert np.std(np.concatenate(left)) == pytest.approx(1.0, abs=0.15)
     assert all(np.array_equal(a, b) for a, b in zip(without_tone(times, noise), noise, strict=True))
+
+
+SWING = np.arange(800) * 0.01
+"""Instants of a record that swings from its beginning, s; its input jumps at 4 s."""
+
+
+def swung(seed: int, *, sigma: float, stated: float | None, damping: float = 0.3, late: float = 0.1) -> Experiment:
+    """The swing of `motion`, read late, with white noise: an input moves half way."""
+    y = motion(SWING - late, damping) + sigma * np.random.default_rng(seed).standard_normal(SWING.size)
+    return Experiment(
+        SWING, f"swing-{seed}", inputs=FrozenMap({"u": InputSignal.step(4.0, 0.0, 1.0)}), event=4.0,
+        measured=Trajectory(SWING, y[:, None], ("y",), ("",)),
+        noise=FrozenMap({} if stated is None else {"y": stated}),
+    )  # fmt: skip
+
+
+def motion(t: Array, damping: float) -> Array:
+    """An oscillation that dies away, and a step answer from 4 s on."""
+    return np.asarray(np.exp(-damping * t) * np.cos(2.0 * t) + 0.2 * np.where(t > 4.0, 1.0 - np.exp(4.0 - t), 0.0))
+
+
+def run_of(record: Experiment, damping: float = 0.3) -> dict[str, dict[str, Array]]:
+    """What the model without the lag makes of it."""
+    return {record.name: {"y": motion(SWING, damping)}}
+
+
+def test_what_moves_before_the_event_is_no_noise_whether_noise_is_stated_or_not() -> None:
+    """The lag that the model lacks is in those rows: a misfit a hundred times the noise of 1e-3."""
+    for seed in range(3):
+        told = swung(seed, sigma=1e-3, stated=1e-3)
+        found = noise_of([told], run_of(told))["y"]
+        assert (found.std, found.source, found.contradicted, found.model) == (1e-3, "given", "", ())
+        assert (found.rows, found.moving, found.std_error) == (0, 400, 0.0)
+        untold = swung(seed, sigma=1e-3, stated=None)
+        for runs in (run_of(untold), {}):
+            found = noise_of([untold], runs)["y"]
+            assert found.std == pytest.approx(1e-3, rel=0.15)
+            assert found.std == pytest.approx(1e-3, rel=5.0 * found.std_error)
+            assert "at rest" in found.source
+
+
+def test_a_stated_noise_that_is_too_small_is_told_where_rows_before_the_event_move() -> None:
+    record = swung(4, sigma=1e-3, stated=3e-4)
+    found = noise_of([record], run_of(record))["y"]
+    assert found.std == pytest.approx(1e-3, rel=0.15)
+    assert (found.stated, found.contradicted) == (3e-4, "louder")
+
+
+def test_rows_before_the_event_count_from_where_the_motion_has_died_away() -> None:
+    record = swung(5, sigma=1e-3, stated=None, damping=6.0)
+    found = noise_of([record], run_of(record, damping=6.0))["y"]
+    assert found.std == pytest.approx(1e-3, rel=0.15)
+    assert 50 <= found.rows < 400
+    assert found.source == "the records before the event"
+
+
+def test_a_noise_that_the_data_room_estimated_is_an_estimate_with_its_uncertainty() -> None:
+    told = experiments(seed=1)
+    estimated = [with_noise(e, {})[0] for e in told]
+    assert all(set(e.noise) == set(SIGMA) for e in estimated)
+    found = noise_of(estimated)["w"]
+    assert found.stated is None and found.source == "the records before the event"
+    assert found.std == pytest.approx(SIGMA["w"], rel=4.0 * found.std_error)
+    assert found.std_error == pytest.approx(1.0 / np.sqrt(2.0 * found.rows), rel=0.05)
+    assert noise_of(told)["w"].std_error == 0.0
+
+
+def test_records_of_different_noise_keep_their_own() -> None:
+    loud = [swung(k, sigma=s, stated=None, damping=60.0, late=0.0) for k, s in enumerate((1e-3, 1e-3, 5e-3))]
+    runs = {name: run for e in loud for name, run in run_of(e, damping=60.0).items()}
+    found = noise_of(loud, runs)["y"]
+    assert {n: s for n, (s, _) in found.by_record.items()} == pytest.approx(
+        {"swing-0": 1e-3, "swing-1": 1e-3, "swing-2": 5e-3}, rel=0.25
+    )
+    assert not noise_of(loud[:2], runs)["y"].by_record
+
+
+def test_a_stated_noise_larger_than_the_records_stands_and_is_told() -> None:
+    found = noise_of([e.with_(noise={n: 3.0 * s for n, s in SIGMA.items()}) for e in experiments()])["torque"]
+    assert (found.std, found.source, found.contradicted) == (3.0 * SIGMA["torque"], "given", "quieter")
+    assert found.shown == pytest.approx(SIGMA["torque"], rel=0.2)
+
+
+def test_the_level_of_several_outputs_is_as_uncertain_as_estimates_of_it_scatter() -> None:
+    freedoms = {"a": 40, "b": 300, "c": 0}
+    noise = {o: OutputNoise(1.0, (), 0.0, 0.0, "", 0, f) for o, f in freedoms.items()}
+    random = np.random.default_rng(1)
+    levels = [random.chisquare(f, 40_000) / f if f else np.ones(40_000) for f in freedoms.values()]
+    assert np.sqrt(2.0 / freedom_of(noise, freedoms)) == pytest.approx(float(np.std(np.mean(levels, axis=0))), rel=0.03)
+    assert freedom_of(noise, ["c"]) == np.inf
+
+
+CIRCUIT = parse_card("""
+schema = 1
+name = "circuit"
+[parameters]
+R = {value = 0.8, min = 0.1}
+[inputs]
+u = {value = 0.0}
+[states]
+i = {derivative = "u - R*i - v", start = 0.0}
+v = {derivative = "i", start = 2.0}
+[outputs]
+i = "i"
+v = "v"
+""")
+
+
+def discharged(stated: float) -> list[Experiment]:
+    """The circuit from a charged capacitor, by scipy, with the current read through a filter of 80 ms; a step at 2 s."""
+    found, random = [], np.random.default_rng(2)
+    t = np.arange(160) * 0.05
+    for name, level in (("one", 0.5), ("two", -0.7)):
+
+        def rates(time: float, s: Array, level: float = level) -> list[float]:
+            return [(level if time >= 2.0 else 0.0) - 0.8 * s[0] - s[1], s[0], (s[0] - s[2]) / 0.08]
+
+        run = solve_ivp(rates, (0.0, t[-1]), [0.0, 2.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.01)
+        y = run.y[[2, 1]].T + 1e-3 * random.standard_normal((t.size, 2))
+        found.append(
+            Experiment(
+                t,
+                name,
+                inputs=FrozenMap({"u": InputSignal.step(2.0, 0.0, level)}),
+                event=2.0,
+                measured=Trajectory(t, y, ("i", "v"), ("A", "V")),
+                noise=FrozenMap({"i": stated, "v": stated}),
+            )
+        )
+    return found
+
+
+def test_a_lag_is_found_in_a_plant_that_does_not_start_at_rest() -> None:
+    free = (FitParameter("R", 0.8, 0.2, 3.0),)
+    found = diagnose(CIRCUIT, discharged(1e-3), free, effects=["lag", "gain", "offset"])
+    assert [(e.effect, e.at) for e in found.effects] == [("lag", ("outputs.i",))], found.text
+    size = found.effects[0].parameters["T"]
+    assert size.ci95 is not None and size.ci95[0] is not None and size.ci95[1] is not None
+    assert size.ci95[0] <= 0.08 <= size.ci95[1]
+    assert found.noise["i"] == {
+        "std": 1e-3, "ar": [], "resolution": 0.0, "source": "given", "error": 0.0, "stated": 1e-3, "contradicted": "",
+    }  # fmt: skip
+    assert "noisier" not in found.text
+
+
+def test_a_stated_noise_that_the_records_refute_is_said_beside_the_verdict() -> None:
+    free = (FitParameter("R", 0.8, 0.2, 3.0),)
+    found = diagnose(CIRCUIT, discharged(2e-4), free, effects=["lag"])
+    assert "The records are noisier than was stated" in found.text
+    assert "i (stated 0.0002, shown 0.00" in found.text
+    assert found.noise["v"]["contradicted"] == "louder"
+    assert found.noise["v"]["std"] == pytest.approx(1e-3, rel=0.15)
