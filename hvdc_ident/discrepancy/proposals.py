@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
-from hvdc_ident.discrepancy.evidence import Pick
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick
 from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import SHORTLIST
+from hvdc_ident.discrepancy.refit import FAILURES, failed_at
 from hvdc_ident.discrepancy.refit_jobs import as_given
 from hvdc_ident.discrepancy.scores import Scores, runs, scored
 from hvdc_ident.discrepancy.signatures.block import block, parameter
@@ -189,7 +190,10 @@ def by_latent(
     spots: list[_Spot] = []
     largest = np.zeros(noise.shape[1])
     done = zip(mapped(search.executor, _at_place, jobs), dearer, strict=True)
-    for k, ((more, under), extra) in enumerate(done, start=1):
+    failures: dict[str, str] = {}
+    for k, ((more, under, failure), extra) in enumerate(done, start=1):
+        if failure:
+            failures[jobs.of[k - 1][1]] = failure
         spots += [replace(s, fall=s.fall - extra) for s in more]
         largest = np.maximum(largest, under)
         search.tell(k, len(jobs), f"round {number}: many sizes of {len(dense)} candidates")
@@ -203,7 +207,13 @@ def by_latent(
         key = _key(s.candidate)
         picks.append(Pick(at[key], count[key], 1.0, s.score, tuple(s.theta.tolist()), s.fall))
         count[key] += 1
-    return replace(opened, candidates=found, scores=scores), sorted(picks, key=lambda p: -p.fall)
+    failed = tuple(
+        CandidateFit(Pick(at[_key(d.candidate)], 0, 1.0, 0.0), failed_at(opened.before, why), -np.inf)
+        for place, why in failures.items()
+        for d in places[place]
+    )
+    opened = replace(opened, candidates=found, scores=scores, failed=(*opened.failed, *failed))
+    return opened, sorted(picks, key=lambda p: -p.fall)
 
 
 def has_one_size(candidate: CandidateEffect) -> bool:
@@ -226,7 +236,15 @@ def _key(candidate: CandidateEffect) -> Hashable:
     return candidate.effect, candidate.at, candidate.source, candidate.named
 
 
-def _at_place(job: _PlaceJob) -> tuple[list[_Spot], Array]:
+def _at_place(job: _PlaceJob) -> tuple[list[_Spot], Array, str]:
+    """What `_sizes_at_place` returns, and why it has no sizes, empty where it has: the other places are looked at all the same."""
+    try:
+        return *_sizes_at_place(job), ""
+    except FAILURES as error:
+        return [], np.zeros(job.noise.shape[1]), str(error) or type(error).__name__
+
+
+def _sizes_at_place(job: _PlaceJob) -> tuple[list[_Spot], Array]:
     """The best sizes of the candidates at one insertion point, and (B,) the largest score of any in each record of noise."""
     nominal = job.view.nominal
     latent = Inversion.of(nominal, job.view.paths, job.found[0].candidate.at[0])

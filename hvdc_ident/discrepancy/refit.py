@@ -149,6 +149,11 @@ def find(job: RefitJob) -> RefitResult:
         return found_by(failed(job, error))
 
 
+def failed_at(before: Refit, why: str) -> Refit:
+    """The refit of a model with one more effect that could not be made, told by the model before it."""
+    return Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=why)
+
+
 def failed(job: RefitJob, error: Exception) -> Refit:
     """The refit of a job that could not be done, where it would have begun, with the reason."""
     return Refit(

@@ -12,7 +12,7 @@ from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, level_error, uns
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, unseen
+from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, failed_at, unseen
 from hvdc_ident.discrepancy.refit_jobs import job
 from hvdc_ident.discrepancy.residual_checks import loud_after_breaks, residual_tests
 from hvdc_ident.discrepancy.size_profile import hopped
@@ -55,8 +55,7 @@ def refitted(
             jobs.append(job(before, found, [p], made))
             of.append(p)
         except FAILURES as error:
-            none = Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=str(error))
-            trials.append(CandidateFit(p, none, -np.inf))
+            trials.append(CandidateFit(p, failed_at(before, str(error) or type(error).__name__), -np.inf))
     texts = [f"{text}: {found[p.candidate].label}" for p in of]
     best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
     refits = Race().run(search, before.chi2, jobs, texts, best)

@@ -87,6 +87,8 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
     probability before any data is shared by all its places and sources, so an offset goes before one of many couplings. Of those
     that are as likely and imply other values of the parameters that one wins whose values are nearest to the given ones.
     """
+    tried = {t.pick.candidate for t in trials}
+    trials = [*trials, *(t for t in opened.failed if t.pick.candidate not in tried)]
     sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
         return replace(opened, failed=failed, why="no candidate could be refitted")

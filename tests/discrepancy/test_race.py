@@ -11,7 +11,7 @@ from cases import FREE, experiments, model
 from refits import beside, plain
 
 from hvdc_ident import Model
-from hvdc_ident.discrepancy import diagnose, refit, refit_jobs
+from hvdc_ident.discrepancy import diagnose, placed, proposals, refit
 from hvdc_ident.discrepancy.context import Course, SearchContext
 from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.race import Race
@@ -117,18 +117,37 @@ def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on
 
 def test_a_diagnosis_outlives_a_candidate_that_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gain raises where its refit is made; the lag that is missing is named all the same."""
-    plain = refit_jobs.added
+    plain = placed.added
 
     def fails(model: Model, problem: Problem, candidate: CandidateEffect, *given: object) -> object:
         if candidate.effect == "gain":
             raise ValueError("no such gain")
         return plain(model, problem, candidate, *given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(refit_jobs, "added", fails)
+    monkeypatch.setattr("hvdc_ident.discrepancy.refit_jobs.added", fails)
     found = diagnose(model(), experiments(lag=0.03), FREE, effects=["lag", "gain"], places=["wm"])
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text
     statuses = {c.effect: c.status for c in found.candidates if c.round == 1}
     assert statuses == {"lag": "refitted", "gain": "failed: no such gain"}
+
+
+def test_a_place_whose_sizes_cannot_be_worked_out_is_told_and_the_others_are_looked_at(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plain = proposals._sizes_at_place
+
+    def fails(of: proposals._PlaceJob) -> object:
+        if of.found[0].candidate.at == ("err",):
+            raise np.linalg.LinAlgError("SVD did not converge")
+        return plain(of)
+
+    monkeypatch.setattr(proposals, "_sizes_at_place", fails)
+    quick, looked_for = DiagnosisOptions(fallback=False), ["lag", "quantisation"]
+    found = diagnose(model(), experiments(lag=0.03), FREE, effects=looked_for, places=["wm", "err"], options=quick)
+    assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text
+    lines = {(c.effect, c.at): c.status for c in found.candidates if c.round == 1}
+    assert lines["quantisation", ("err",)] == "failed: SVD did not converge", lines
+    assert "failed" not in lines["lag", ("wm",)]
 
 
 def test_sizes_are_within_what_an_effect_may_have() -> None:
