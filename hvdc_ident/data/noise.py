@@ -6,7 +6,6 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.linalg import cho_solve_banded, cholesky_banded
 
 from hvdc_ident.data.signals import MERGE_TOLERANCE, InputSignal, off_line
 from hvdc_ident.data.trajectory import Array
@@ -136,6 +135,8 @@ def _likelihood(square: float, count: int, size: float) -> float:
 
 def _solved(cover: Array, rows: Array) -> tuple[float, Array]:
     """Return the log-determinant of a banded covariance (its lower diagonals), and its inverse times rows."""
+    from scipy.linalg import cho_solve_banded, cholesky_banded  # a simulation does without it
+
     factor = cholesky_banded(cover, lower=True, check_finite=False)
     return 2.0 * float(np.sum(np.log(factor[0]))), cho_solve_banded((factor, True), rows, check_finite=False)
 

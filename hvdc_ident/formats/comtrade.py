@@ -84,8 +84,8 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     """The channels, all or those named in that order: a x + b in the header's unit, digital ones 0 or 1.
 
     Primary or secondary values as recorded. A channel's skew moves it by interpolation. Time starts at 0; a pause that the
-    time stamps tell of between samples at the sampling rates is kept. One number outside the range that the header gives a
-    channel is a mark for what was not recorded: NaN. `origin.notes` tells of both, and of what is kept outside the range.
+    time stamps tell of between samples at the sampling rates is kept. A mark outside the range that the header gives a
+    channel, 99999 say, is what was not recorded: NaN. `origin.notes` tells of both, and of what is kept outside the range.
     Raises WaveformError for a header or data part that does not hold together.
     """
     record = _open(path)
@@ -284,8 +284,8 @@ def _stamps(record: _Record, rows: int) -> Array:
 def _within_range(record: _Record, channel: int, values: Array) -> tuple[Array, str]:
     """The values of an analog channel, NaN where a mark stands in for one, and a remark on what lies outside its range.
 
-    A mark is one and the same number above the range, or below. Different numbers there are a signal that the header
-    gives too narrow a range: they stay.
+    A mark is one and the same number above the range, or below, whose digits are all nines or which is the lowest of its binary kind
+    (IEC 60255-24). Other numbers there are a signal that the header gives too narrow a range: they stay.
     """
     limits, about = record.ranges[channel], record.header.analog_channels[channel]
     if (
@@ -300,12 +300,18 @@ def _within_range(record: _Record, channel: int, values: Array) -> tuple[Array, 
         low, high = float(raw[outside].min()), float(raw[outside].max())
         n = int(np.count_nonzero(outside))
         samples = f"{n} sample{'s' if n > 1 else ''} outside the range of the header, {limits}"
-        if high - low <= 1e-9 * abs(high):
+        if high - low <= 1e-9 * abs(high) and _is_mark(high):
             values = np.where(outside, math.nan, values)
             notes.append(f"{samples}: {high:.10g} is taken as the mark of what was not recorded")
         else:
-            notes.append(f"{samples}: kept, for they are different numbers, {low:.10g} to {high:.10g}")
+            notes.append(f"{samples}: kept, for none is a mark of what was not recorded, {low:.10g} to {high:.10g}")
     return values, f"{record.names[channel]}: {'; '.join(notes)}" if notes else ""
+
+
+def _is_mark(number: float) -> bool:
+    """True for 99999, 999999, ... of either sign, and for the lowest number of 16 or 32 bits."""
+    digits = f"{abs(number):.0f}"
+    return (set(digits) == {"9"} and len(digits) > 4) or number in (-(2.0**15), -(2.0**31))
 
 
 def _skewed(time: Array, values: Any, skew: float) -> Array:

@@ -20,7 +20,7 @@ CONTOUR = 32
 
 
 def modes(model: LinearModel) -> tuple[Mode, ...]:
-    """Return the rightmost modes, at least as many as the model has states; conjugates follow each other, the upper one first.
+    """Return the rightmost modes, at least one for each state and five for each delay; conjugates follow each other, the upper one first.
 
     With u P(s) = 0 and P(s) v = 0 at a root, the share of a state is u v and that of a delay u v times its time (the content
     of the delay); they sum to 1 over both before their moduli are taken. The derivative by a parameter is

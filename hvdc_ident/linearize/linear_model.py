@@ -246,7 +246,7 @@ class LinearModel(Shown):
     def poles(self) -> Array:
         """Return (states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor.
 
-        With delays: the rightmost roots of the exact characteristic equation, at least as many as there are states.
+        With delays: the rightmost roots of the exact characteristic equation, at least one for each state and five for each delay.
         """
         from hvdc_ident.linearize.modal import poles
 

@@ -25,6 +25,8 @@ COUNTED = "roots of the exact characteristic equation, counted by the argument p
 MULTIPLIERS = "multipliers over the period of the sampled blocks (modes: without aliases)"
 TOLERANCES = (1e-12, 1e-10, 1e-8)
 """Distances from the imaginary axis, relative to the radius that bounds the roots, within which one counts as on it."""
+PER_DELAY = 5
+"""Roots of each delay among the modes, as its usual approximant has states: roots of a delay may stand right of those of states."""
 ON_CIRCLE = 1e-9
 """Distance from the unit circle within which rounding hides on which side a multiplier lies."""
 CERTAIN = 1e-4
@@ -150,7 +152,7 @@ class Characteristic:
 
     @cached_property
     def roots(self) -> Roots:
-        """The rightmost roots, at least as many as there are states, and the number that is unstable."""
+        """The rightmost roots, at least one for each state and `PER_DELAY` for each delay, and the number that is unstable."""
         found = [_roots_of(part) for part, _ in self.parts()]
         unstable: float | None = 0.0
         for r in found:
@@ -158,7 +160,7 @@ class Characteristic:
         axis = sum(r.axis for r in found)
         reasons = dict.fromkeys(r.reason for r in found if r.reason)
         grows = 0.0 if unstable is None else unstable
-        least = max(self.nx, axis + int(grows)) if np.isfinite(grows) else None
+        least = max(self.nx + PER_DELAY * len(self.whole.channels), axis + int(grows)) if np.isfinite(grows) else None
         averaged = _first([r.values if r.averaged is None else r.averaged for r in found], least)
         values = _first([r.values for r in found], least)
         return Roots(values, unstable, axis, "; ".join(reasons), all(r.certain for r in found), averaged)

@@ -363,9 +363,7 @@ def _values_judged(answers: Answers) -> str:
         sure = "" if answers.conditional else "95 % "
         one = f"Your value of {kept[0]} lies within its {sure}interval."
         parts.append(one if len(kept) == 1 else f"Your values of {listed(kept)} lie within their {sure}intervals.")
-    if off and found.get("stand_ins"):
-        parts.append("An effect that your model leaves out explains them as well, with the values that you gave.")
-    elif off and answers.counting.doubt:
+    if off and answers.counting.doubt:
         parts.append("They may make up for what is missing.")
     if depend := found.get("values_by_place") or {}:
         each = " ".join(f"{n} is {value_by_place(at)}." for n, at in depend.items())
@@ -380,6 +378,8 @@ def _values_judged(answers: Answers) -> str:
         )
     elif name and not off and not kept and abs(alone) >= MOVED:
         parts.append(f"A fit moves {name} by {_percent(alone)}.")
+    if parts and found.get("stand_ins"):
+        parts.append("An effect that your model leaves out explains them as well, with the values that you gave.")
     return " ".join(parts)
 
 

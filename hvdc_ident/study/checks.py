@@ -250,7 +250,9 @@ def at_given(study: Study) -> Iterator[None]:
     try:
         yield
     except SteadyStateError as e:
-        if study.start == study.given and not all(_starts_elsewhere(study, x) for x in study.experiments):
+        stuck = [x for x in study.experiments if _no_start(study, x, study.given) is not None]
+        elsewhere = bool(stuck) and all(_starts_elsewhere(study, x) for x in stuck)
+        if study.start == study.given and not elsewhere:
             raise
         raise ComputationError(
             f"at the given values {e.what}",

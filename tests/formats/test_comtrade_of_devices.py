@@ -202,7 +202,15 @@ def test_different_numbers_outside_the_range_are_a_signal_and_told(tmp_path: Pat
     samples = [8000, 8190, 8300, 8400, 8350, 8190, 8000, 9.5]
     found = read_waveforms(put(tmp_path, header("1\n500,8"), rows([2000 * k for k in range(8)], samples)))
     np.testing.assert_array_equal(found["Idc"], [0.25 * v - 3 for v in samples])
-    assert "kept, for they are different numbers, 8300 to 8400" in found.origin.notes[0]
+    assert "kept, for none is a mark of what was not recorded, 8300 to 8400" in found.origin.notes[0]
+
+
+def test_a_level_outside_the_range_is_a_signal_and_told(tmp_path: Path) -> None:
+    """A signal of two levels, the upper one beyond a range that the header gives too narrow."""
+    samples = [8000, 8000, 8000, 40000, 40000, 40000, 8000, 8000]
+    found = read_waveforms(put(tmp_path, header("1\n500,8"), rows([2000 * k for k in range(8)], samples)))
+    np.testing.assert_array_equal(found["Idc"], [0.25 * v - 3 for v in samples])
+    assert "3 samples outside the range of the header, -8192 to 8191: kept" in found.origin.notes[0]
 
 
 @pytest.mark.parametrize("scale", ["0,-3", "1e-18,-3", "1e-310,-3"])
@@ -233,7 +241,8 @@ def test_a_limit_that_is_the_rounded_extreme_makes_no_marks(tmp_path: Path) -> N
     values = np.array([-1.2349, 4.5749, 4.59], dtype=np.float32)
     data = b"".join(struct.pack("<IIfH", k + 1, 2000 * k, v, 0) for k, v in enumerate(values))
     found = read_waveforms(put(tmp_path, head, data))
-    np.testing.assert_array_equal(np.isnan(found["Idc"]), [False, False, True])
+    np.testing.assert_allclose(found["Idc"], 0.25 * values.astype(float) - 3.0, rtol=1e-6)
+    assert "1 sample outside the range of the header, -1.23 to 4.57: kept" in found.origin.notes[0]
 
 
 # Where a user reads it

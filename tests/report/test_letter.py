@@ -93,8 +93,8 @@ def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
     )
     assert "lag of 1.6 ms" in consistent and "1.4 and 1.8 ms" in consistent and "delay at P2_m" in consistent
     assert gains == (
-        "Your value of KIP lies within its 95 % interval. A fit without the effect moves KIP by +5.0 % to make up for it; with the "
-        "effect the same fit moves it by +0.3 %."
+        "Your value of KIP lies within its interval. That holds only if nothing else is missing. A fit without the effect moves KIP "
+        "by +5.0 % to make up for it; with the effect the same fit moves it by +0.3 %."
     )
     assert "75 %" in gained and "1.05 times the noise" in gained
     assert letter.following == "To tell them apart: record P2 at 1 kHz."
@@ -264,5 +264,8 @@ def test_where_an_effect_does_what_a_value_does_the_value_is_not_blamed(tmp_path
     letter = letter_of(Results(folder_with(tmp_path, found)))
     told = " ".join(letter.sentences)
     assert "nothing is missing" not in told and "Your gains are to blame" not in told
-    assert "Whether your gains are to blame these recordings do not tell: fitted, KIP moves by +5.0 %" in told
+    assert (
+        "A fit moves KIP by +5.0 %. An effect that your model leaves out explains them as well, with the values that you gave."
+        in told
+    )
     assert letter.request.endswith("KIP = 31.5 or that P2 is 1.05 times what the model has.")

@@ -293,7 +293,7 @@ def test_the_diagnosis_compares_with_the_given_values(results: dict[str, Any]) -
 def test_letter_and_report_speak_of_the_given_values(study: Path, fitted: dict[str, float]) -> None:
     told = " ".join(letter_of(Results(study.parent / "s-results")).sentences)
     change = 100 * (fitted["K"] / 11.0 - 1.0)
-    assert f"K moves by {change:+.1f} %" in told
+    assert f"in place of 11 ({change:+.1f} %)" in told
     page = (study.parent / "s-results/report.html").read_text()
     assert "start values" not in page and "given values" in page
     for heading in ("<h2>The values</h2>", "<h2>Parameters</h2>"):
