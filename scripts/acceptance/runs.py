@@ -74,4 +74,5 @@ def settled(text: str, folders: Sequence[Path]) -> str:
                   "DATE", text)  # fmt: skip
     text = re.sub(r"hvdc_ident \d+\.\d+\.\d+\S*", "hvdc_ident VERSION", text)
     text = re.sub(r"\b(in|after|took) \d+(\.\d+)? (s|min)\b", r"\1 TIME", text)
+    text = re.sub(r", \d+(\.\d+)? s from ", ", TIME from ", text)
     return re.sub(r"\b[0-9a-f]{40,64}\b", "HASH", text)
