@@ -150,7 +150,10 @@ def _values(found: Answers) -> str:
     effect = found.counting.name == "effect"
     header = ["parameter, unit", "given", "value", found.interval_words(effect=effect), "change", ""]
     which = " ".join(s for s in (_which(found), found.condition if found.fitted or effect else "") if s)
-    return f"<p class='answer'>{which}</p>{table(header, rows, words=(0, 5))}{more}{_moved(found)}"
+    depend = "".join(
+        f"<p>{text(v.name)} depends on the place: it is {text(v.by_place)}.</p>" for v in found.values if v.by_place
+    )
+    return f"<p class='answer'>{which}</p>{table(header, rows, words=(0, 5))}{depend}{more}{_moved(found)}"
 
 
 def _value_row(v: Value) -> list[str]:
@@ -158,7 +161,7 @@ def _value_row(v: Value) -> list[str]:
     note = AT_BOUND if v.note == AT_BOUND else "held" if v.note else ""
     name = f"<strong>{text(v.name)}</strong>" + (f", {text(v.unit)}" if v.unit else "")
     if v.by_place:
-        return [name, number(v.given), "–", "–", "", f"depends on the place: {text(v.by_place)}"]
+        return [name, number(v.given), "by place", "–", "", ""]
     return [
         name,
         number(v.given),

@@ -144,7 +144,8 @@ def test_a_value_that_depends_on_the_place_has_no_single_value(like_the_demo: Pa
     assert value.value is None and value.effect is None and value.interval is None
     by_place = "728 pu/s if the lag is at P1, 802 pu/s if it is at P1_m"
     screen = first_screen(Results(tmp_path))
-    assert f"KIVDC , pu/s 734.7 – – depends on the place: {by_place}" in tile(screen, "values")
+    assert "KIVDC , pu/s 734.7 by place –" in tile(screen, "values")
+    assert f"KIVDC depends on the place: it is {by_place}." in tile(screen, "values")
     assert "or P1_m, where KIVDC is 802 pu/s" in tile(screen, "missing")
     assert "728.3" not in words(screen) and by_place in words(page(tmp_path))
 
