@@ -145,6 +145,15 @@ def value_by_place(values: Sequence[Mapping[str, Any]]) -> str:
     return ", ".join(told)
 
 
+def unstable_roots(stability: Mapping[str, Any]) -> str:
+    """Return how many roots lie right of the imaginary axis, in words. stability: as the results of a linear model have it."""
+    count = stability["unstable_roots"]
+    if count is None or math.isinf(count):
+        return "infinitely many unstable roots"
+    number = f"{count:.0f} unstable root{'' if count == 1 else 's'}"
+    return f"at least {number}" if stability["reason"] else number
+
+
 def form_of(effect: Mapping[str, Any]) -> str:
     """Return the name of an effect in the results, with its formula where it is outside the catalogue."""
     return f"{effect['effect']} {effect.get('expression', '')}".rstrip()

@@ -29,7 +29,7 @@ METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-
 GLANCE = 3
 """Evaluations of each of several starts, of which the best goes on: its start, and the first two steps."""
 FAILURES = (HvdcIdentError, ValueError, ArithmeticError)
-"""What the work on one candidate raises where it cannot be done: the candidate has failed then, with this as its reason, and the
+"""Errors of the work on one candidate that cannot be done: the candidate has failed then, with this as its reason, and the
 search goes on. numpy's LinAlgError is a ValueError."""
 SCANNED = 15
 """Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""

@@ -28,7 +28,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     """
     core = model.delay_free
     assert core is not None
-    equation = Characteristic.of(core)
+    equation = model.characteristic
     found_roots = equation.roots
     roots = found_roots.values if found_roots.averaged is None else found_roots.averaged
     whole, means = equation.whole, sliding_means(equation)

@@ -321,7 +321,7 @@ def _closed_with_delays(plant: LinearModel, controller: LinearModel) -> Stabilit
 
 def _equation(model: LinearModel) -> Characteristic:
     if model.delay_free is not None:
-        return Characteristic.of(model.delay_free).visible()
+        return model.characteristic.visible()
     a, b, c, d = visible(model)
     return Characteristic(a, a.shape[0], (), b, c, d)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize.loops import LoopMargins, Margins
     from hvdc_ident.linearize.modal import Mode
     from hvdc_ident.linearize.reduction import Reduction
-    from hvdc_ident.linearize.stability import Stability
+    from hvdc_ident.linearize.stability import Characteristic, Stability
     from hvdc_ident.linearize.transfer_function import TransferFunction
 
 
@@ -243,6 +244,14 @@ class LinearModel(Shown):
 
     # --- analysis ---
 
+    @cached_property
+    def characteristic(self) -> Characteristic:
+        """The exact characteristic equation of a model with delays; poles, modes and stability rest on one search for its roots."""
+        from hvdc_ident.linearize.stability import Characteristic as Equation
+
+        assert self.delay_free is not None
+        return Equation.of(self.delay_free)
+
     def poles(self) -> Array:
         """Return (states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor.
 
@@ -253,7 +262,7 @@ class LinearModel(Shown):
         return poles(self)
 
     def stability(self) -> Stability:
-        """Whether the model is stable, delays exact, with the number of roots right of the imaginary axis."""
+        """Return the verdict on stability, delays exact, with the number of roots right of the imaginary axis."""
         from hvdc_ident.linearize.modal import stability_of
 
         return stability_of(self)

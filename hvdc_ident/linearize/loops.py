@@ -228,7 +228,7 @@ class Margins:
 
     @property
     def stable(self) -> bool | None:
-        """Whether the closed loop is stable, delays exact; None where it cannot be told."""
+        """True where the closed loop is stable, delays exact; None where it cannot be told."""
         return _stable(self.stability)
 
     @property
@@ -312,7 +312,7 @@ class LoopMargins:
 
     @property
     def stable(self) -> bool | None:
-        """Whether the closed loops are stable, delays exact; None where it cannot be told."""
+        """True where the closed loops are stable, delays exact; None where it cannot be told."""
         return _stable(self.stability)
 
     @property
@@ -396,7 +396,7 @@ def open_equation(model: LinearModel) -> Characteristic:
     Raises LinearizationError where the direct part is -1.
     """
     if model.delay_free is not None:
-        found = Characteristic.of(model.delay_free)
+        found = model.characteristic
     else:
         a, b, c, d = without_sliding_means(model)
         found = Characteristic(a, a.shape[0], (), b, c, d)

@@ -80,7 +80,7 @@ def poles(model: LinearModel) -> Array:
     Of a model with delays the rightmost roots of its exact characteristic equation, by falling real part.
     """
     if model.delay_free is not None:
-        return Characteristic.of(model.delay_free).roots.values
+        return model.characteristic.roots.values
     return approximate_poles(model)
 
 
@@ -97,7 +97,7 @@ def approximate_poles(model: LinearModel) -> Array:
 def stability_of(model: LinearModel) -> Stability:
     """Return whether a model is stable: with delays by its characteristic equation, else by its eigenvalues."""
     if model.delay_free is not None:
-        return stability(Characteristic.of(model.delay_free))
+        return stability(model.characteristic)
     values = approximate_poles(model)
     if not values.size:
         return Stability("stable", 0, None)

@@ -17,7 +17,7 @@ from scipy.optimize import minimize_scalar
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.stability import Characteristic, sliding_means, stability
+from hvdc_ident.linearize.stability import sliding_means, stability
 from hvdc_ident.linearize.system import Array
 
 TOLERANCE = 1e-10
@@ -366,7 +366,7 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
 def _refuse_unstable(model: LinearModel, what: str) -> None:
     """Raise LinearizationError where a model with delays is not stable, or cannot be told to be, between inputs and outputs."""
     assert model.delay_free is not None
-    found = stability(Characteristic.of(model.delay_free).visible())
+    found = stability(model.characteristic.visible())
     if found.verdict != "stable":
         raise LinearizationError(
             what, where=f"linear model '{model.name}'", got=f"{found.verdict}: {found.reason or found.count_text}"
@@ -376,7 +376,7 @@ def _refuse_unstable(model: LinearModel, what: str) -> None:
 def _linf_of_delays(model: LinearModel) -> Peak:
     """Return the L-infinity norm of a model with delays, on a grid of its exact response and beside the largest value."""
     assert model.delay_free is not None
-    equation = Characteristic.of(model.delay_free).visible()
+    equation = model.characteristic.visible()
     if equation.roots.axis > sliding_means(equation):
         raise LinearizationError(
             "the L-infinity norm is infinite: a pole lies on the imaginary axis", where=f"linear model '{model.name}'"

@@ -319,7 +319,7 @@ def _neutral(part: Part, direct: float) -> Roots:
 
 @dataclass(frozen=True, eq=False)
 class Stability:
-    """Whether a model is stable: without delays by its eigenvalues, with delays by its characteristic equation.
+    """The verdict on a model's stability: without delays by its eigenvalues, with delays by its characteristic equation.
 
     verdict: "stable", "on the limit of stability", "unstable" or "not decided". unstable: roots right of the axis, None
     where not decided, infinite where there are infinitely many; from below where there is a reason. rightmost: the first

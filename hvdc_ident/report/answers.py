@@ -63,7 +63,7 @@ class Errors:
 
 
 def _passed(failed: int, judged: int, not_judged: int) -> bool | None:
-    """What is not judged is not passed."""
+    """Return False where one failed, True where all were judged and none did, else None."""
     return False if failed else None if not_judged or not judged else True
 
 
@@ -170,7 +170,7 @@ class Answers:
         return " ".join(found)
 
     def interval_words(self, *, effect: bool) -> str:
-        """What the intervals of the values with the effect, or else of the fitted ones, are called."""
+        """Return the name of the intervals of the values with the effect, or else of the fitted ones."""
         return interval_words(beyond_noise=values_conditional(self.fit, self.diagnosis, effect=effect))
 
     @cached_property
@@ -421,7 +421,7 @@ class Answers:
 
     @property
     def doubt(self) -> str:
-        """What tells that something else stands behind the additions, as a sentence goes on; empty where nothing does."""
+        """Return what tells that something else stands behind the additions, as a sentence goes on; empty where nothing does."""
         return str(self.diagnosis.get("doubt") or "") if self.added else ""
 
     @property

@@ -1,4 +1,4 @@
-"""What keeps a study from being run, or its results from being right, found before a stage runs: `check` ends with it."""
+"""Hindrances of a run: what keeps it from ending, or its results from being right, found before a stage runs: `check` ends with it."""
 
 from __future__ import annotations
 

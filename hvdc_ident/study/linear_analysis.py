@@ -12,7 +12,7 @@ from hvdc_ident.errors import LinearizationError, SteadyStateError
 from hvdc_ident.model import Model
 from hvdc_ident.study import schema
 from hvdc_ident.study.measured_responses import port_of
-from hvdc_ident.text import quantity
+from hvdc_ident.text import quantity, unstable_roots
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel, OperatingPoint
@@ -262,15 +262,6 @@ def stability(data: Mapping[str, Any]) -> str:
         return f"stability not decided: {found['reason']}"
     why = f": {found['reason']}" if found["reason"] else ""
     return f"{found['verdict']}{right} ({unstable_roots(found)}, delays exact){why}"
-
-
-def unstable_roots(found: Mapping[str, Any]) -> str:
-    """Return how many roots lie right of the imaginary axis, in words."""
-    count = found["unstable_roots"]
-    if count is None or math.isinf(count):
-        return "infinitely many unstable roots"
-    number = f"{count:.0f} unstable root{'' if count == 1 else 's'}"
-    return f"at least {number}" if found["reason"] else number
 
 
 def _point_lines(data: Mapping[str, Any]) -> list[str]:

@@ -98,7 +98,7 @@ class QuiescentLevel:
 
     @property
     def is_mistake(self) -> bool:
-        """Whether the recording seems wrong, not the model: a positive factor may as well be a gain of the model."""
+        """True where the recording seems wrong, not the model: a positive factor may as well be a gain of the model."""
         if self.suggestion is None or self.suggestion in PLAIN:
             return False
         return self.suggestion != "factor" or (self.factor or 0.0) < 0.0

@@ -9,6 +9,7 @@ import numpy as np
 from hvdc_ident.report.drawing import figure, svg
 from hvdc_ident.report.html import captioned, number, table, text
 from hvdc_ident.report.results import Results, Section
+from hvdc_ident.text import unstable_roots
 
 NEAREST = 5
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -81,13 +82,9 @@ def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
 
 
 def _count(found: dict[str, Any]) -> str:
-    """How many roots are unstable, and why that cannot be told where it cannot."""
-    count, why = found["unstable_roots"], f" ({text(found['reason'])})" if found["reason"] else ""
-    if found["verdict"] == "not decided":
-        return f": not decided{why}"
-    if count is None:
-        return f": infinitely many unstable roots{why}"
-    return f": {'at least ' if why else ''}{count:.0f} unstable root{'' if count == 1 else 's'}{why}"
+    """Return the number of unstable roots after a colon, and why that cannot be told where it cannot."""
+    why = f" ({text(found['reason'])})" if found["reason"] else ""
+    return f": {'not decided' if found['verdict'] == 'not decided' else unstable_roots(found)}{why}"
 
 
 def _modes(given: list[dict[str, Any]], fitted: dict[str, Any] | None) -> str:
