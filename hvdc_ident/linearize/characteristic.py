@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.delays import Channel, response, response_by_s
+from hvdc_ident.linearize.delays import Channel, response, response_by_s, response_slopes
 from hvdc_ident.linearize.system import Array
 
 STEP = 0.9
@@ -26,6 +26,10 @@ MOST_WORK = 100_000_000
 """Points of the contour, and points times entries of the pencil, after which counting is given up: some seconds."""
 NEUTRAL = 1e-9
 """Distance from 1 within which rounding hides on which side a gain around a delay without states lies."""
+
+
+FARTHEST = 200.0
+"""Largest -Re(s) T of a delay's root that is looked for: its factor there, e^200, is far beyond what rounding leaves of the others."""
 
 
 class Undecided(LinearizationError):
@@ -61,8 +65,8 @@ class Part:
         return np.asarray(np.abs(self.matrix[n:, n:]) * kept[:, None])
 
     def factors(self, s: Array) -> Array:
-        """E(s), (frequencies, delays)."""
-        found = [response(c.kind, c.time, c.compute, s) for c in self.channels]
+        """E(s), (frequencies, delays); as large as at `FARTHEST` left of it, where only states before a delay have roots."""
+        found = [response(c.kind, c.time, c.compute, x) for c, x in zip(self.channels, self._held(s), strict=True)]
         return np.array(found, dtype=complex).reshape(len(self.channels), s.size).T
 
     def pencil(self, s: Array) -> Array:
@@ -77,11 +81,22 @@ class Part:
     def pencil_by_s(self, s: Array) -> Array:
         """The derivative of the pencil by s."""
         n = self.nx
-        slopes = [response_by_s(c.kind, c.time, c.compute, s) for c in self.channels]
+        slopes = [
+            response_by_s(c.kind, c.time, c.compute, x) for c, x in zip(self.channels, self._held(s), strict=True)
+        ]
         rows = np.concatenate([np.zeros((s.size, n)), np.array(slopes).reshape(len(self.channels), s.size).T], axis=1)
         found = -rows[:, :, None] * self.matrix
         found[:, range(n), range(n)] += 1.0
         return np.asarray(found)
+
+    def factor_slopes(self, s: Array) -> list[tuple[Array, Array]]:
+        """Return for each delay the derivatives of its factor by its time and by its compute time."""
+        places = zip(self.channels, self._held(s), strict=True)
+        return [response_slopes(c.kind, c.time, c.compute, x) for c, x in places]
+
+    def _held(self, s: Array) -> list[Array]:
+        """Return for each delay the frequencies, their real parts not below where the search for its roots ends."""
+        return [np.maximum(s.real, -FARTHEST / length) + 1j * s.imag for length in self.lengths]
 
     # --- counting ---
 
@@ -210,10 +225,10 @@ class Part:
         s = s.astype(complex)
         with np.errstate(all="ignore"):
             for _ in range(40):
-                s = s[np.isfinite(s) & (-s.real * self.lengths.max() < 200.0)]
+                s = s[np.isfinite(s) & (-s.real * self.lengths.max() < FARTHEST)]
                 slope = self._logarithmic(s)
                 s = np.where(np.abs(slope) > 0, s - 1.0 / np.where(slope == 0, 1.0, slope), s)
-            s = s[np.isfinite(s) & (-s.real * self.lengths.max() < 200.0)]
+            s = s[np.isfinite(s) & (-s.real * self.lengths.max() < FARTHEST)]
             s = s[np.abs(1.0 / self._logarithmic(s)) <= 1e-9 * (np.abs(s) + 1e-3 * self.unit)] if s.size else s
         return self._distinct(s)
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.characteristic import Part
-from hvdc_ident.linearize.delays import DelayFree, response, response_slopes
+from hvdc_ident.linearize.delays import DelayFree
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.modal import Mode
 from hvdc_ident.linearize.operating_point import ZERO
@@ -24,7 +26,8 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
 
     With u P(s) = 0 and P(s) v = 0 at a root, the share of a state is u v and that of a delay u v times its time (the content
     of the delay); they sum to 1 over both before their moduli are taken. The derivative by a parameter is
-    -u dP v / (u P' v).
+    -u dP v / (u P' v). Both depend on the part of the equation alone that the root belongs to, and are taken from it: what a
+    fast root leaves in a delay behind it is exp(-s T) times as large as its states, and would hide them.
     """
     core = model.delay_free
     assert core is not None
@@ -40,10 +43,15 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
         apart = np.abs(roots - root) > ALIKE * max(abs(root), 1e-3 * whole.unit)
         place = int((~apart[:k]).sum())  # among the roots that are alike
         right, left = _vectors(whole, complex(root), int((~apart).sum()))
-        share, shape = _participation(whole, complex(root), right, left, place)
+        shape = _shape(right, place)
+        own = _unknowns(equation, complex(root), whole.unit)
+        part = equation.part(own)
+        right_of_own, left_of_own = _vectors(part, complex(root), int((~apart).sum()))
+        share = np.zeros(len(names))
+        share[own] = _participation(part, complex(root), right_of_own, left_of_own)
         radius = 0.3 * float(np.abs(roots - root)[apart].min(initial=whole.unit))
         slopes = {
-            name: _slope(whole, core, complex(root), right, left, place, g, radius)
+            name: _slope(part, _Direction.of(core, g, own), complex(root), right_of_own, left_of_own, place, radius)
             for name, g in model.gradients.items()
         }
         mean = k in slowest and abs(root) <= zero
@@ -61,6 +69,16 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     return tuple(found)
 
 
+def _unknowns(equation: Characteristic, root: complex, unit: float) -> Array:
+    """Return the unknowns of the part that a root belongs to; all of them where several parts have it."""
+    owners = []
+    for places, found in equation.roots_by_part:
+        values = found.values if found.averaged is None else found.averaged
+        if (np.abs(values - root) <= ALIKE * max(abs(root), 1e-3 * unit)).any():
+            owners.append(places)
+    return owners[0] if len(owners) == 1 else np.arange(equation.matrix.shape[0])
+
+
 def _vectors(whole: Part, root: complex, count: int) -> tuple[Array, Array]:
     """Return the null vectors of the pencil at a root: the right ones in columns, the left ones in rows."""
     pencil = whole.pencil(np.array([root]))[0]
@@ -75,54 +93,63 @@ def _vectors(whole: Part, root: complex, count: int) -> tuple[Array, Array]:
     return right / np.linalg.norm(right, axis=0), left / np.linalg.norm(left, axis=1)[:, None]
 
 
-def _participation(whole: Part, root: complex, right: Array, left: Array, place: int) -> tuple[Array, Array]:
-    """Return the shares of states and delays, and the shape, its largest entry 1."""
-    slope = whole.pencil_by_s(np.array([root]))[0]
+def _participation(part: Part, root: complex, right: Array, left: Array) -> Array:
+    """Return the shares of the part's states and delays."""
+    slope = part.pencil_by_s(np.array([root]))[0]
     with np.errstate(all="ignore"):
         share = np.abs(np.diag(slope @ right @ np.linalg.pinv(left @ slope @ right) @ left))
     if not share.sum() > 0:
         share = np.abs(right[:, 0] * left[0])
+    return np.asarray(share / max(float(share.sum()), 1e-300))
+
+
+def _shape(right: Array, place: int) -> Array:
+    """Return the unknowns of one of the roots that are alike, the largest 1."""
     v = right[:, min(place, right.shape[1] - 1)]
-    return share / max(float(share.sum()), 1e-300), v / v[np.argmax(np.abs(v))]
+    return np.asarray(v / v[np.argmax(np.abs(v))])
+
+
+@dataclass(frozen=True, eq=False)
+class _Direction:
+    """What a parameter changes of a part: its matrix, and each delay's times, s."""
+
+    matrix: Array
+    times: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, core: DelayFree, gradient: Gradient, places: Array) -> _Direction:
+        assert gradient.delay_free is not None
+        n = core.nx
+        rows, columns = (np.where(places < n, places, places + k) for k in (core.no, core.nu))
+        times = tuple(gradient.times[i - n] for i in places if i >= n)
+        return cls(gradient.delay_free[np.ix_(rows, columns)], times)
 
 
 def _slope(
-    whole: Part,
-    core: DelayFree,
-    root: complex,
-    right: Array,
-    left: Array,
-    place: int,
-    gradient: Gradient,
-    radius: float,
+    part: Part, direction: _Direction, root: complex, right: Array, left: Array, place: int, radius: float
 ) -> complex:
     """Return the derivative of a root by a parameter; of roots that are one and not apart, the mean."""
     s = np.array([root])
-    inner = left @ whole.pencil_by_s(s)[0] @ right
+    inner = left @ part.pencil_by_s(s)[0] @ right
     if np.linalg.cond(inner) < 1e6:
-        values = np.linalg.eigvals(-np.linalg.solve(inner, left @ _along(whole, core, s, gradient)[0] @ right))
+        values = np.linalg.eigvals(-np.linalg.solve(inner, left @ _along(part, direction, s)[0] @ right))
         return complex(np.sort_complex(values)[min(place, values.size - 1)])
     around = root + radius * np.exp(2j * np.pi * np.arange(CONTOUR) / CONTOUR)
-    pencil, slope, along = whole.pencil(around), whole.pencil_by_s(around), _along(whole, core, around, gradient)
+    pencil, slope, along = part.pencil(around), part.pencil_by_s(around), _along(part, direction, around)
     count = np.trace(np.linalg.solve(pencil, slope), axis1=1, axis2=2) @ (around - root)
     moved = np.trace(np.linalg.solve(pencil, along), axis1=1, axis2=2) @ (around - root)
     return complex(-moved / count)
 
 
-def _along(whole: Part, core: DelayFree, s: Array, gradient: Gradient) -> Array:
+def _along(part: Part, direction: _Direction, s: Array) -> Array:
     """Return the derivative of the pencil by a parameter."""
-    n, e = whole.nx, len(whole.channels)
-    assert gradient.delay_free is not None
-    rows = [*range(n), *range(n + core.no, n + core.no + e)]
-    columns = [*range(n), *range(n + core.nu, n + core.nu + e)]
-    change = gradient.delay_free[np.ix_(rows, columns)]
+    n, e = part.nx, len(part.channels)
     factors = np.ones((s.size, n + e), dtype=complex)
     slopes = np.zeros((s.size, n + e), dtype=complex)
-    for i, (c, times) in enumerate(zip(whole.channels, gradient.times, strict=True)):
-        factors[:, n + i] = response(c.kind, c.time, c.compute, s)
-        by_time, by_compute = response_slopes(c.kind, c.time, c.compute, s)
+    factors[:, n:] = part.factors(s)
+    for i, ((by_time, by_compute), times) in enumerate(zip(part.factor_slopes(s), direction.times, strict=True)):
         slopes[:, n + i] = by_time * times[0] + (by_compute * times[1] if len(times) > 1 else 0.0)
-    return np.asarray(-(factors[:, :, None] * change + slopes[:, :, None] * whole.matrix))
+    return np.asarray(-(factors[:, :, None] * direction.matrix + slopes[:, :, None] * part.matrix))
 
 
 def _kind(equation: Characteristic, root: complex, right: Array, left: Array, zero: float) -> str:

@@ -136,6 +136,11 @@ class Characteristic:
         """All of it as one part, for the pencil."""
         return Part(self.matrix, self.nx, self.channels)
 
+    def part(self, places: Array) -> Part:
+        """Return some of the unknowns as a part, not balanced."""
+        found = tuple(self.channels[i - self.nx] for i in places if i >= self.nx)
+        return Part(self.matrix[np.ix_(places, places)], len(places) - len(found), found)
+
     def parts(self) -> Iterator[tuple[Part, Array]]:
         """Return the parts that determine one another's unknowns only one way, balanced, with the places of their unknowns."""
         m = self.matrix
@@ -143,17 +148,21 @@ class Characteristic:
         _, label = connected_components(links, directed=True, connection="strong")
         for k in range(label.max(initial=-1) + 1):
             places = np.flatnonzero(label == k)
-            own = m[np.ix_(places, places)]
-            if own.shape[0] > 1:
-                _, (scale, _) = scipy.linalg.matrix_balance(own, permute=False, separate=True)
-                own = own * scale[None, :] / scale[:, None]
-            found = tuple(self.channels[i - self.nx] for i in places if i >= self.nx)
-            yield Part(own, len(places) - len(found), found), places
+            own = self.part(places)
+            if own.matrix.shape[0] > 1:
+                _, (scale, _) = scipy.linalg.matrix_balance(own.matrix, permute=False, separate=True)
+                own = replace(own, matrix=own.matrix * scale[None, :] / scale[:, None])
+            yield own, places
+
+    @cached_property
+    def roots_by_part(self) -> tuple[tuple[Array, Roots], ...]:
+        """The places of the unknowns of each part, and its roots."""
+        return tuple((places, _roots_of(part)) for part, places in self.parts())
 
     @cached_property
     def roots(self) -> Roots:
         """The rightmost roots, at least one for each state and `PER_DELAY` for each delay, and the number that is unstable."""
-        found = [_roots_of(part) for part, _ in self.parts()]
+        found = [r for _, r in self.roots_by_part]
         unstable: float | None = 0.0
         for r in found:
             unstable = _sum(unstable, r.unstable)

@@ -146,6 +146,27 @@ def test_the_simulation_grows_where_a_root_does_and_a_pade_approximant_errs(gain
     assert modes[0].eigenvalue == found.rightmost and (modes[0].kind == "growing oscillation") == (rate > 0)
 
 
+def test_a_fast_mode_before_a_long_delay_is_its_own_state_s():
+    chain = hi.Model(
+        name="fast-before-late",
+        parameters={
+            "T1": {"value": 2e-5, "unit": "s"},
+            "T2": {"value": 0.5, "unit": "s"},
+            "Td": {"value": 0.05, "unit": "s"},
+        },
+        inputs={"u": 0.0},
+        states={"x": "(u - x)/T1", "y": "(late - y)/T2"},
+        delays={"late": {"of": "x", "time": "Td"}},
+        outputs={"y": "y"},
+    )
+    modes = {round(m.eigenvalue.real, 6): m for m in hi.linearize(chain, sensitivities=["T1", "T2", "Td"]).modes()}
+    for name, time, own in (("T1", 2e-5, "x"), ("T2", 0.5, "y")):
+        mode = modes[round(-1 / time, 6)]
+        assert mode.participation[own] == pytest.approx(1.0)
+        assert mode.sensitivity[name] == pytest.approx(1 / time**2)
+        assert sum(map(abs, mode.sensitivity.values())) == pytest.approx(1 / time**2)
+
+
 def test_modes_of_a_delay_against_differences():
     names = ["gain", "T", "zeta"]
     model = resonance(0.02, 1.3)
