@@ -77,6 +77,7 @@ class Mapper:
         self._source = desk.source
         self._seen = Seen(desk.file, None)
         self._stamp = desk.read_at
+        self._turn = asyncio.Lock()  # reading and writing the study file follow one another, as they were asked for
         self._record: Trajectory | None = None
         self._columns: tuple[Column, ...] = ()
         self._matching: Matching | None = None
@@ -252,6 +253,14 @@ class Mapper:
     # --- the file ---
 
     async def _save(self) -> None:
+        async with self._turn:
+            await self._write_mapping()
+
+    async def _renew_in_turn(self, *, keep: bool) -> None:
+        async with self._turn:
+            await self._renew(keep=keep)
+
+    async def _write_mapping(self) -> None:
         if self._map is None:
             return
         was = self._was or self._map.name
@@ -289,6 +298,10 @@ class Mapper:
 
     async def _look(self) -> None:
         """See whether the study file is another one than the page knows; take it over where nothing was changed here."""
+        async with self._turn:
+            await self._look_at_file()
+
+    async def _look_at_file(self) -> None:
         now = stamp(self._desk.file)
         if now == self._stamp or self._banner.visible:
             return
@@ -310,7 +323,10 @@ class Mapper:
             self._banner.visible = False
             self._in_background(way)
 
-        file = {"Keep mine": lambda: self._renew(keep=True), "Show the file's": lambda: self._renew(keep=False)}
+        file = {
+            "Keep mine": lambda: self._renew_in_turn(keep=True),
+            "Show the file's": lambda: self._renew_in_turn(keep=False),
+        }
         self._banner.clear()
         with self._banner:
             ui.label(text)
