@@ -43,6 +43,7 @@ MOST_OFF = 4
 ASKED = {
     "backlash": "the play of the mechanism",
     "deadband": "the width of the dead band",
+    "deadband-step": "the width of the dead band, and whether its output jumps at the edge",
     "delay": "the dead time of sampling, computation and communication",
     "gain": "the scaling",
     "inner-loop": "the bandwidth and damping of the inner control loop",

@@ -15,6 +15,7 @@ LARGE: dict[str, dict[str, float]] = {
     "backlash": {"width": 0.2},
     "conductance": {"g": 0.2},
     "deadband": {"width": 0.15},
+    "deadband-step": {"width": 0.15},
     "droop": {"k": 0.3, "deadband": 0.1},
     "gain": {"k": 0.8},
     "limit": {"level": 0.35},

@@ -179,6 +179,31 @@ def test_quantisation_rounds():
     assert np.unique(np.round(y / step)).size > 40
 
 
+def test_a_deadband_with_a_step_lets_all_through_beyond_its_edge():
+    width = 0.1503
+    away = np.abs(np.abs(u) / width - 1) > 3e-4
+    assert away.mean() > 0.999
+    expected = np.where(np.abs(u) > width, u, 0.0)
+    np.testing.assert_allclose(passed("deadband-step", {"width": width})[away], expected[away], atol=1e-12)
+    recorded = apply_effects(
+        Model("r", inputs={"u": 0.0}, outputs={"y": "u"}),
+        [{"effect": "deadband-step", "at": "outputs.y", "parameters": {"width": width}}],
+    )
+    y = simulate(recorded, experiment("bench", T, {"u": U}))["y"]
+    np.testing.assert_allclose(y, expected, atol=1e-12)
+
+
+def test_a_loop_slides_along_the_edge_of_a_deadband_with_a_step():
+    """w' = d - K w beyond the band and d inside: for 0 < d < K width the loop can neither leave nor stay (Filippov)."""
+    loop = Model("m", {"K": 50.0}, inputs={"d": 0.0}, states={"w": "d - K*e"}, signals={"e": "w"}, outputs={"w": "w"})
+    loop = apply_effects(loop, [{"effect": "deadband-step", "at": "e", "parameters": {"width": 0.1}}])
+    record = experiment("e", np.linspace(0.0, 1.0, 101), {"d": InputSignal.step(0.105, 0.0, 1.0)})
+    run = simulate(loop, record, sensitivities=["deadband_step_e_width"])
+    np.testing.assert_allclose(run["w"], np.clip(record.time - 0.105, 0.0, 0.1), atol=0.1 * 2e-4)
+    np.testing.assert_allclose(run.gradient("w")[record.time > 0.22, 0], 1.0, atol=1e-3)
+    assert find_operating_point(loop, {"d": 1.0}).states["w"] == pytest.approx(0.1, rel=2e-4)
+
+
 def test_sample_hold_holds_what_it_took():
     period, compute = 0.01371, 0.004
     y = passed("sample-hold", {"Ts": period, "compute": compute})
@@ -234,6 +259,8 @@ def test_a_delay_in_a_loop_is_the_method_of_steps():
         ("limit", {"level": 0.4}, lambda s: 0 * s),
         ("deadband", {"width": 0.1}, lambda s: 1 + 0 * s),
         ("deadband", {"width": 0.6}, lambda s: 0 * s),
+        ("deadband-step", {"width": 0.1}, lambda s: 1 + 0 * s),
+        ("deadband-step", {"width": 0.6}, lambda s: 0 * s),
         ("backlash", {"width": 0.1}, lambda s: 0 * s),
         ("quantisation", {"step": 0.1}, lambda s: 0 * s),
         ("saturation", {"level": 0.5}, lambda s: 1 / np.cosh(1.0) ** 2 + 0 * s),

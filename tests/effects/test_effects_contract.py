@@ -29,6 +29,7 @@ NEUTRAL = {
     "conductance": ({"g": 0.0},),
     "coupling": ({"k": 0.0},),
     "deadband": ({"width": 0.0},),
+    "deadband-step": ({"width": 0.0},),
     "delay": ({"T": 0.0},),
     "disturbance": ({"amplitude": 0.0},),
     "droop": ({"k": 0.0},),
@@ -72,6 +73,7 @@ SMALL = {
     "rate-limit": 2e-3,  # it follows within 0.2 ms, however close to neutral
     "sample-hold": 1e-3,
     "quantisation": 3e-4,
+    "deadband-step": 3e-4,  # so does what lies on an algebraic loop
     "window-mean": 1e-4,
     "delay": 1e-4,
 }

@@ -1,0 +1,60 @@
+"""A deadband with a step: 0 inside +-width, u itself outside."""
+
+from collections.abc import Mapping
+
+import sympy as sp
+
+from hvdc_ident.effects.base import TRACKING_TIME, Additions, Effect, EffectParameter
+from hvdc_ident.expression import clip, where
+from hvdc_ident.immutable import FrozenMap
+
+EDGE = 2e-4
+"""Width of the edge inside the model, of the deadband's own width (a recorded output jumps)."""
+
+
+def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
+    """Return u outside the band and 0 inside, over an edge from width to (1 + EDGE) width.
+
+    A loop that is driven back into the band by its own reaction never rests at an ideal step: it slides along the edge. An
+    edge of finite width has that sliding rest as its steady state (Filippov's solution, up to the width). Within an
+    algebraic loop a jump may leave no solution at all: there the value is reached within 0.2 ms.
+    """
+    width = p["width"]
+    if add.kind == "output":
+        return where(sp.Abs(u) > width, u, 0)
+    outside = u * clip((sp.Abs(u) / width - 1) / EDGE, 0, 1)
+    if not add.circular:
+        return outside
+    outside = add.signal("outside", outside)
+    return add.state("y", lambda y: (outside - y) / TRACKING_TIME, rest=outside)
+
+
+EFFECT = Effect(
+    name="deadband-step",
+    summary="0 inside +-width, else u (deadband with a step, type 1 of governors)",
+    parameters=FrozenMap(
+        {
+            "width": EffectParameter(
+                0.01,
+                neutral=0.0,
+                description="half of the band, from 0 to its edge",
+                measure="peak",
+                probes=(0.03, 0.1, 0.3),
+                search=(1e-4, 1.0),
+            )
+        }
+    ),
+    rewrite=rewrite,
+    holds=True,
+    sentence="{at} is 0 within +-{width} and acts in full beyond",
+    excited_by="slow ramps both ways through 0 and well beyond the band",
+    example=FrozenMap({"width": 0.45}),
+    tried_by_default=False,
+    confusable=FrozenMap(
+        {
+            "deadband": "a ramp well beyond the band: with the step the signal comes back in full, without it smaller by the width",
+            "quantisation": "slow ramps both ways: one jump at either edge against many",
+            "backlash": "slow ramps both ways: the play is flat at each turn, wherever it is",
+        }
+    ),
+)

@@ -1,0 +1,108 @@
+"""What standard controllers hide: a deadband with a step, in a loop, against scipy with events."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy import integrate
+
+from hvdc_ident.data import InputSignal, experiment
+from hvdc_ident.effects import apply_effects
+from hvdc_ident.model import Model
+from hvdc_ident.simulate import simulate
+
+TIME = np.linspace(0.0, 4.0, 1237)
+STEPS = ((0.0, 0.0), (0.301, 0.3), (1.503, -0.2), (2.907, 0.05))
+"""(s, value): a load or set-point; no step at a row."""
+
+
+def hybrid(modes, mode, y0):
+    """States (K, n) of a system that is in one mode at a time: its equations, and where it leaves for which other mode.
+
+    modes: {name: (rhs(y, u), [(g(y, u), next)])}; a mode is left where a g rises above 0.
+    """
+    found, y = [np.array([y0])], np.array(y0, dtype=float)
+    for (begin, level), end in pairwise([*STEPS, (TIME[-1], None)]):
+        t = begin
+        while t < end[0]:
+            mode = next((after for g, after in modes[mode][1] if g(y, level) > 1e-13), mode)
+            run = _in_one_mode(*modes[mode], y, level, t, end[0])
+            rows = TIME[(t < TIME) & (run.t[-1] >= TIME)]
+            found.append(run.sol(rows).T if rows.size else np.zeros((0, y.size)))
+            t, y = run.t[-1], run.y[:, -1]
+            if run.status == 1:
+                ways = zip(modes[mode][1], run.t_events, strict=True)
+                mode = next(after for (_, after), met in ways if met.size)
+    return np.vstack(found)
+
+
+def _in_one_mode(rhs, ways, y, level, begin, end):
+    def leaving(g):
+        def event(t, y):
+            return g(y, level)
+
+        event.terminal, event.direction = True, 1.0
+        return event
+
+    return integrate.solve_ivp(
+        lambda t, y: rhs(y, level), (begin, end), y, "DOP853", dense_output=True, rtol=1e-12, atol=1e-13,
+        events=[leaving(g) for g, _ in ways], max_step=0.02,
+    )  # fmt: skip
+
+
+GOVERNOR = Model(
+    "governor",
+    {"K": 5.0, "D": 0.5, "Tg": 0.3},
+    inputs={"load": 0.0},
+    states={"w": "g - load - D*w", "g": "(-K*e - g)/Tg"},
+    signals={"e": "w"},
+    outputs={"w": "w", "g": "g"},
+)
+
+
+def with_step(p):
+    """The governor behind a deadband with a step."""
+    width = p["width"]
+
+    def in_mode(acts):
+        return lambda y, u: [y[1] - u - p["D"] * y[0], (-p["K"] * acts * y[0] - y[1]) / p["Tg"]]
+
+    return hybrid(
+        {
+            "inside": (in_mode(0.0), [(lambda y, u: y[0] - width, "above"), (lambda y, u: -y[0] - width, "below")]),
+            "above": (in_mode(1.0), [(lambda y, u: width - y[0], "inside")]),
+            "below": (in_mode(1.0), [(lambda y, u: width + y[0], "inside")]),
+        },
+        "inside",
+        [0.0, 0.0],
+    )
+
+
+CASES = {
+    "deadband with a step": (GOVERNOR, "deadband-step", "e", {"width": 0.03}, with_step, 1e-4),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_loop_runs_as_scipy_finds_it_with_events(case):
+    model, effect, place, sizes, reference, accuracy = CASES[case]
+    changed = apply_effects(model, [{"effect": effect, "at": place, "parameters": sizes}])
+    names = [n for n in changed.parameters if n not in model.parameters]
+    wanted = (*model.parameters, *names)
+    moved = next(iter(model.inputs))
+    corners = [c for (_, a), (t, b) in pairwise(STEPS) for c in ((t, a), (t, b))]
+    record = experiment("steps", TIME, {moved: InputSignal.corners(corners)})
+    run = simulate(changed, record, sensitivities=wanted, rtol=1e-9)
+    values = dict(model.values) | sizes
+    expected = reference(values)
+    np.testing.assert_allclose(run.trajectory.values, expected, atol=accuracy)
+    plain = simulate(model, record).trajectory.values
+    assert np.abs(expected - plain).max() > 0.03
+    for k, name in enumerate((*model.parameters, *sizes)):
+        h = 1e-5 * values[name]
+        slope = (reference(values | {name: values[name] + h}) - reference(values | {name: values[name] - h})) / (2 * h)
+        assert np.abs(run.gradients[:, :, k] - slope).max() < max(1e-4, 100 * accuracy) * (1 + np.abs(slope).max()), (
+            name
+        )
