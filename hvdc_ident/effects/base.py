@@ -36,6 +36,7 @@ Measure = Literal[
     "range/source",
     "range/source2",
     "of T2",
+    "of up",
 ]
 
 
@@ -82,11 +83,13 @@ class EffectParameter:
 class Additions:
     """Builder of the states, delays, sampled values and signals that an effect adds to the model, under unused names.
 
-    kind: of the insertion point, one of INSERTION_POINT_KINDS. circular: True where it lies on an algebraic loop.
+    kind: of the insertion point, one of INSERTION_POINT_KINDS. circular: True where it lies on an algebraic loop. neutral: by
+    signal that the effect adds, what it is without the effect, for the way from the model's own steady state.
     """
 
     def __init__(self, model: Model, prefix: str, kind: str, circular: bool) -> None:
         self.model, self._prefix, self.kind, self.circular = model, prefix, kind, circular
+        self.neutral: dict[str, sp.Expr] = {}
 
     def state(
         self, label: str, derivative: Callable[[sp.Symbol], sp.Expr], rest: sp.Expr | None = None, unit: str = ""
@@ -109,6 +112,20 @@ class Additions:
         added = {n: State(d, rest=r) for n, d, r in zip(names, derivatives(symbols), rests, strict=True)}
         self.model = replace(self.model, states=self.model.states | added)
         return symbols
+
+    def rest(self, x: sp.Expr, derivative: sp.Expr, held: Callable[[sp.Expr], sp.Expr] | None = None) -> None:
+        """Let the model's state x rest where it would with this derivative, which the effect's own hides.
+
+        held: from the way that x has to go to that rest to the way it goes, for an effect that moves the rest.
+        """
+        state = self.model.states[str(x)]
+        way = derivative if state.rest is None else state.rest - x
+        if held is not None:
+            before, way = way, self.signal("to_rest", held(way))
+            self.neutral[str(way)] = before
+        elif state.rest is not None:
+            return
+        self.model = replace(self.model, states=self.model.states | {str(x): replace(state, rest=x + way)})
 
     def start(self, of: sp.Expr) -> sp.Symbol:
         """Return the symbol of an expression's value at the start: a state that never moves."""
@@ -144,8 +161,8 @@ class Additions:
 class Rewrite(Protocol):
     """Map u, the signal of the insertion point, to y, which its readers see instead.
 
-    p: the parameters' symbols by name, without the optional ones that are left out; "from": the other signal, and
-    "expression": the term, where the effect has one. add: makes the states and signals that y needs.
+    p: the parameters' symbols by name, without the optional ones that are left out; "from": the other signal, "expression":
+    the term, and "state": the state whose derivative u is, where the effect has one. add: makes the states and signals that y needs.
     """
 
     def __call__(self, u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr: ...
@@ -166,8 +183,10 @@ class Effect:
     a per-unit signal of some tenths, as the list of effects and the tests use them.
     confusable: other effects that may explain the same data, each with what separates them.
     needs_source: True where it brings in another signal (`from`). needs_expression: True where its form is given with it,
-    with coefficients of the user's own names. tried_by_default: False for a general form that stands for many others and is
-    tried where none of them is enough. resistance: the parameter that a resistance of the model replaces.
+    with coefficients of the user's own names. of_derivative: True where it changes the equation of the state at its place: u
+    is the derivative that the state had, y the one that it has. A diagnosis does not try such an effect.
+    tried_by_default: False for a form that is tried only where it is named, such as a general one that stands for many others.
+    resistance: the parameter that a resistance of the model replaces.
     self_exciting: True where it moves the model by itself, so that a record of it does not begin in steady state.
     holds: True where it passes no small change on, so that what integrates its signal may rest at any level.
     equivalent_delay: delay of a slow signal, s, from its parameters' values, which effects that are hard to tell apart
@@ -189,6 +208,7 @@ class Effect:
     confusable: FrozenMap[str] = field(default_factory=FrozenMap)
     needs_source: bool = False
     needs_expression: bool = False
+    of_derivative: bool = False
     tried_by_default: bool = True
     resistance: str = ""
     self_exciting: bool = False

@@ -20,7 +20,15 @@ from hvdc_ident.effects.base import Additions, Effect, EffectParameter
 from hvdc_ident.errors import InputError, ModelError, require_known
 from hvdc_ident.expression import parse, symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model, fresh, insertion_point, insertion_point_of, rewritten
+from hvdc_ident.model import (
+    AnyModel,
+    Model,
+    fresh,
+    insertion_point,
+    insertion_point_of,
+    rewritten,
+    with_derivative_signal,
+)
 from hvdc_ident.parameters import Parameter
 
 COEFFICIENT = EffectParameter(0.0, neutral=0.0, min=-math.inf, optional=True, description="coefficient of the term")
@@ -214,6 +222,7 @@ def _at_one(
 ) -> Model:
     """Return the model with the effect at one of its places. source: the signal brought in there."""
     kind, name = insertion_point(model, place)
+    added: dict[str, sp.Expr] = {}
     circular = kind in ("signal", "algebraic") and _leads_back(model, name)
 
     def rewrite(m: Model, u: sp.Expr) -> tuple[Model, sp.Expr]:
@@ -224,14 +233,21 @@ def _at_one(
             p["from"] = _source(m, source, where).xreplace(before)
         if effect.needs_expression:
             p["expression"] = _term(use, symbols, where).xreplace(before)
+        if effect.of_derivative:
+            p["state"] = symbol(name)
         add = Additions(m, use.prefix_at(place), kind, circular)
         y = effect.rewrite(u, p, add)
+        added.update(add.neutral)
         return add.model, y
 
     try:
-        return rewritten(model, place, use.label, rewrite)
+        model, changed = with_derivative_signal(model, name) if effect.of_derivative else (model, place)
+        made = rewritten(model, changed, use.label, rewrite)
     except InputError as e:
         raise e.at(where) from None
+    if not added or made.origin is None:
+        return made
+    return replace(made, origin=replace(made.origin, neutral=made.origin.neutral | added))
 
 
 def _leads_back(model: Model, name: str) -> bool:

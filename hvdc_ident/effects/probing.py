@@ -108,6 +108,7 @@ _SIZES: dict[Measure, Size] = {
     "range/source": lambda x, u, source, p: x * u.range / source.range,
     "range/source2": lambda x, u, source, p: x * u.range / source.peak**2,
     "of T2": lambda x, u, source, p: x * p["T2"],
+    "of up": lambda x, u, source, p: x * p["up"],
 }
 _SEARCH: dict[Measure, tuple[float, float]] = {
     "one": (-10.0, 10.0),
@@ -123,6 +124,7 @@ _SEARCH: dict[Measure, tuple[float, float]] = {
     "range/source": (-2.0, 2.0),
     "range/source2": (-2.0, 2.0),
     "of T2": (0.02, 50.0),
+    "of up": (0.02, 50.0),
 }
 SMALLEST = 1e-3
 """Share of the largest size at which a search over a parameter that cannot be negative begins."""
@@ -163,7 +165,7 @@ def probes(
     known = {n: replace(effect.parameters[n], value=v, probes=()) for n, v in (given or {}).items()}
     effect = replace(effect, parameters=effect.parameters | known)
     switched = {n: q for n, q in effect.parameters.items() if not q.optional}
-    absent = {n: 0.0 for n, q in effect.parameters.items() if q.optional}
+    absent = {n: float(q.neutral or 0.0) for n, q in effect.parameters.items() if q.optional}
     groups: list[list[str]] = [[]]
     if not switched:
         parts = [n for n in absent if effect.parameters[n].probes]
@@ -171,7 +173,9 @@ def probes(
     combinations = []
     for group in groups:
         tried = switched | {n: effect.parameters[n] for n in group}
-        combinations += [{n: v.get(n, 0.0) for n in effect.parameters} for v in _combinations(tried, signal, other)]
+        combinations += [
+            {n: v[n] if n in v else absent[n] for n in effect.parameters} for v in _combinations(tried, signal, other)
+        ]
     return tuple(_probe(effect, values, signal, other) for values in combinations)
 
 
@@ -189,7 +193,7 @@ def _combinations(
     parameters: Mapping[str, EffectParameter], signal: SignalScales, source: SignalScales
 ) -> list[dict[str, float]]:
     """Return every combination of the parameters' sizes; those measured by another one come after it."""
-    order = sorted(parameters, key=lambda n: parameters[n].measure in ("of T2", "time*R"))
+    order = sorted(parameters, key=lambda n: parameters[n].measure in ("of T2", "of up", "time*R"))
     combinations: list[dict[str, float]] = []
     for sizes in itertools.product(*(_tried(parameters[n], signal) for n in order)):
         values: dict[str, float] = {}
@@ -237,7 +241,10 @@ def distance_from_neutral(effect: Effect, values: Mapping[str, float]) -> dict[s
         if q.neutral is None or name not in values or (q.optional and values[name] == q.neutral):
             continue
         neutral = values[q.neutral] if isinstance(q.neutral, str) else q.neutral
-        distances[name] = 1.0 / values[name] if math.isinf(neutral) else values[name] - neutral
+        if math.isinf(neutral):
+            distances[name] = 1.0 / values[name] if values[name] else math.inf
+        else:
+            distances[name] = values[name] - neutral
     return distances
 
 

@@ -16,7 +16,15 @@ from hvdc_ident.model.definition import (
     State,
     recording,
 )
-from hvdc_ident.model.transform import blended, driven, fresh, insertion_point, insertion_point_of, rewritten
+from hvdc_ident.model.transform import (
+    blended,
+    driven,
+    fresh,
+    insertion_point,
+    insertion_point_of,
+    rewritten,
+    with_derivative_signal,
+)
 
 __all__ = [
     "Algebraic",
@@ -43,5 +51,6 @@ __all__ = [
     "recording",
     "rewritten",
     "save_card",
+    "with_derivative_signal",
     "write_card",
 ]

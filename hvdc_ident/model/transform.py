@@ -107,6 +107,17 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
     return replace(model, algebraic=model.algebraic | {name: replace(unknown, equation=y)}, origin=origin)
 
 
+def with_derivative_signal(model: Model, state: str) -> tuple[Model, str]:
+    """Return the model in which a state's derivative is a named signal, `der_STATE`, and that name: a place of its own."""
+    name, derivative = f"der_{state}", model.states[state].derivative
+    if name in model.signals and derivative == symbol(name):
+        return model, name
+    name = fresh(model, name)
+    states = model.states | {state: replace(model.states[state], derivative=symbol(name))}
+    origin = model.origin or ModelOrigin(model)
+    return replace(model, states=states, signals=model.signals | {name: Signal(derivative)}, origin=origin), name
+
+
 def blended(model: Model) -> tuple[Model, str]:
     """Return the model with a parameter that scales its effects from 0 to 1, and its name ("" without effects).
 

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SteadyStateError
+from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model, blended
+from hvdc_ident.model import Model, State, blended
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.equations import ACCURACY, SHORTEST, TINY, ModelEquations, by_structure
 from hvdc_ident.simulate.object_code import Code, entry, evaluate
@@ -369,7 +370,7 @@ class Equilibria:
     def _guesses(self) -> list[Array]:
         """The model's own guesses, then the unknown ones at 0, at 1 and at seeded random places; nan where `rest` tells."""
         m = self.structure.model
-        given = [np.nan if s.guess is None and s.rest is not None else s.guess for s in m.states.values()]
+        given = [np.nan if s.guess is None and _tells_place(n, s) else s.guess for n, s in m.states.items()]
         tail = [m.algebraic[n].start for n in self.structure.unknowns]
         if all(g is not None for g in given):
             return [np.array([*given, *tail], dtype=float)]
@@ -393,7 +394,8 @@ class Equilibria:
         v = np.zeros(self.n + self.extra)
         v[: guess.size] = guess
         model = s.model
-        open_states = [k for k in np.flatnonzero(np.isnan(v[:nx])) if model.states[s.states[k]].rest is not None]
+        nowhere = np.flatnonzero(np.isnan(v[:nx]))
+        open_states = [k for k in nowhere if _tells_place(s.states[k], model.states[s.states[k]])]
         held = [self.n + k for k in range(self.extra) if guess.size == self.n or np.isnan(v[self.n + k])]
         given = [x.guess for x in model.states.values()]
         fill = (
@@ -549,6 +551,11 @@ class Equilibria:
         names = [f"d({n})/dt" for n in self.structure.states] + [f"unknown '{n}'" for n in self.structure.unknowns]
         names += [f"delay '{n}'" for n in m.delays] + [f"sampled value '{n}'" for n in m.sampled]
         return names[index]
+
+
+def _tells_place(name: str, state: State) -> bool:
+    """Return whether the rest of a state says where that is; one that reads the state itself is an equation for it."""
+    return state.rest is not None and symbol(name) not in state.rest.free_symbols
 
 
 _Values = tuple[Array, Array, float]

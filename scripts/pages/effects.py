@@ -26,6 +26,8 @@ LARGE: dict[str, dict[str, float]] = {
 }
 """Sizes of the pictures where those of the effect's example are too small to be seen in a drawing."""
 LEVEL, OTHER = 0.5, 0.3
+LAG = 0.04
+"""Time constant of the lag whose state an effect on a state's equation is shown at, of the picture's duration."""
 
 
 def page() -> str:
@@ -35,9 +37,10 @@ def page() -> str:
         "",
         "An effect replaces the signal u of an insertion point by y, which all readers of the signal then see. Insertion points are",
         "inputs, named signals, algebraic unknowns, states and outputs; at an output only the recording changes. At its neutral value",
-        "an effect is left out of the model. The pictures are simulated by this package with the values of the caption.",
+        "an effect is left out of the model. Effects on a derivative x' sit at a state and change its equation, whoever reads it;",
+        "their pictures show the state of a lag. The pictures are simulated by this package with the values of the caption.",
         "",
-        "| effect | y |",
+        "| effect | y, or x' |",
         "|---|---|",
         *(f"| [`{name}`](#{name}) | {_cell(e.summary)} |" for name, e in effects().items()),
         "",
@@ -48,7 +51,7 @@ def page() -> str:
 
 
 def _entry(e: Effect) -> list[str]:
-    lines = [f"## `{e.name}` {{: #{e.name} }}", "", f"**y**: {e.summary}", "", picture(e), ""]
+    lines = [f"## `{e.name}` {{: #{e.name} }}", "", f"**{_changed(e)}**: {e.summary}", "", picture(e), ""]
     lines += [f"*How to excite it*: {e.excited_by}.", ""]
     if e.parameters:
         lines += ["| parameter | default | neutral | bounds | unit | meaning |", "|---|---|---|---|---|---|"]
@@ -75,7 +78,7 @@ def _entry(e: Effect) -> list[str]:
             *(f"- `{other}`; what tells them apart: {how}" for other, how in e.confusable.items()),
             "",
         ]
-    use = [f'effect = "{e.name}"', 'at = "SIGNAL"']
+    use = [f'effect = "{e.name}"', 'at = "STATE"' if e.of_derivative else 'at = "SIGNAL"']
     use += ['from = "OTHER"'] if e.needs_source else []
     use += ['expression = "k*OTHER**2"'] if e.needs_expression else []
     values = ", ".join(f"{n} = {v:g}" for n, v in e.example.items())
@@ -94,17 +97,20 @@ def picture(e: Effect) -> str:
     values = ", ".join(
         f"{n} = {v:g} {e.parameters[n].unit if n in e.parameters else ''}".rstrip() for n, v in _shown(e).items()
     )
+    if e.of_derivative:
+        values += f", at the state of a lag of {LAG * end:.3g} s"
     made = drawing(curves, f"time, {unit}", "signal", f"u and y over time for the effect {e.name} with {values}")
     return f"<figure>{made}<figcaption>{e.name} with {values}</figcaption></figure>"
 
 
 def simulated(e: Effect, end: float) -> tuple[Any, Any, Any, Any]:
     """Return time, u, y and the other signal (None where there is none) of a step and a ramp back through the effect."""
+    state = {"x": f"(u - x)/{LAG * end}"} if e.of_derivative else {"clock": {"derivative": "-clock", "start": 0.0}}
     plain = hi.Model(
         name="wire",
         inputs={"u": 0.0, "other": 0.0},
-        states={"clock": {"derivative": "-clock", "start": 0.0}},
-        signals={"x": "u", "z": "other"},
+        states=state,
+        signals={"z": "other"} if e.of_derivative else {"x": "u", "z": "other"},
         outputs={"y": "x"},
     )
     use: dict[str, Any] = {"effect": e.name, "at": "x", "parameters": _shown(e)}
@@ -136,10 +142,15 @@ def _duration(e: Effect) -> float:
         return 60 / v["wn"]
     if "frequency" in v:
         return 4 / v["frequency"]
-    if "rate" in v:
-        return 6 * LEVEL / v["rate"]
+    for rate in ("rate", "up"):
+        if rate in v:
+            return 6 * LEVEL / v[rate]
     times = [v[n] for n in ("T", "T1", "Ts") if n in v]
     return 25 * max(times) if times else 1.0
+
+
+def _changed(e: Effect) -> str:
+    return "x'" if e.of_derivative else "y"
 
 
 def _cell(text: str) -> str:

@@ -34,7 +34,7 @@ from hvdc_ident.study.study import load_study
 
 HERE = Path(__file__).resolve().parent
 KINDS = {"ME": "model-exchange", "CS": "co-simulation"}
-SLOT, SOURCE = "P2_m", "Vdc2"
+SLOT, STATE, SOURCE = "P2_m", "xp", "Vdc2"
 QUICK = ("vsc-hvdc-link", "lag", "limit", "delay")
 RTOL = 1e-9
 PARTS = ("agreement", "studies")
@@ -52,7 +52,7 @@ def models(quick: bool) -> Iterator[tuple[str, Model]]:
             continue
         use = EffectUse(
             name,
-            (SLOT,),
+            (STATE if effect.of_derivative else SLOT,),
             effect.example,
             source=SOURCE if effect.needs_source else "",
             expression=f"k*{SOURCE}**2" if effect.needs_expression else "",

@@ -9,6 +9,13 @@ SIZES = {name: dict(effect.example) for name, effect in effects().items()}
 SOURCE = "Vdc2"
 TERM = "k*Vdc2**2"
 NAMES = tuple(effects())
+STATES = {"Q2_m": "xq2"}
+"""State in whose loop a place lies; the others are in that of xp."""
+
+
+def place(name: str, at: str) -> str:
+    """The place, or a state in its loop for an effect that sits at states alone."""
+    return at if effects()[name].insertion_kinds != ("state",) else STATES.get(at, "xp")
 
 
 def use(name: str, at: str | tuple[str, ...], values: dict[str, float] | None = None) -> EffectUse:
@@ -16,7 +23,7 @@ def use(name: str, at: str | tuple[str, ...], values: dict[str, float] | None = 
     effect = effects()[name]
     return EffectUse(
         name,
-        (at,) if isinstance(at, str) else at,
+        tuple(place(name, p) for p in ((at,) if isinstance(at, str) else at)),
         FrozenMap(SIZES[name] | (values or {})),
         source=SOURCE if effect.needs_source else "",
         expression=TERM if effect.needs_expression else "",

@@ -47,6 +47,7 @@ NEUTRAL = {
     "sample-hold": ({"Ts": 0.0},),
     "saturation": ({"level": math.inf},),
     "second-order": ({"wn": math.inf},),
+    "state-rate-limit": ({"up": math.inf, "down": math.inf},),
     "term": ({"k": 0.0},),
     "window-mean": ({"T": 0.0},),
 }
@@ -60,6 +61,7 @@ NEARLY = {
     "second-order": {"wn": 1e6},
     "inner-loop": {"wn": 1e6},
     "rate-limit": {"rate": 1e7},
+    "state-rate-limit": {"up": 1e7, "down": 1e7},
     "gain": {"k": 1.0 + 1e-9},
     "lead-lag": {"T1": 0.003, "T2": 0.003 * (1 + 1e-9)},
     "lag": {"T": 1e-8},

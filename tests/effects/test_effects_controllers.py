@@ -1,4 +1,4 @@
-"""What standard controllers hide: a deadband with a step, in a loop, against scipy with events."""
+"""What standard controllers hide (deadbands with a step, limited rates), in loops, against scipy with events."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ import pytest
 from scipy import integrate
 
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.effects import apply_effects
+from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.effects import apply_effects, effects
+from hvdc_ident.errors import InputError, ModelError
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
 
@@ -80,8 +82,32 @@ def with_step(p):
     )
 
 
+def with_rates(p):
+    """The governor whose gate has limited rates."""
+
+    def speed(y):
+        return (-p["K"] * y[0] - y[1]) / p["Tg"]
+
+    def in_mode(limit):
+        return lambda y, u: [y[1] - u - p["D"] * y[0], speed(y) if limit is None else limit]
+
+    return hybrid(
+        {
+            "free": (
+                in_mode(None),
+                [(lambda y, u: speed(y) - p["up"], "up"), (lambda y, u: -p["down"] - speed(y), "down")],
+            ),
+            "up": (in_mode(p["up"]), [(lambda y, u: p["up"] - speed(y), "free")]),
+            "down": (in_mode(-p["down"]), [(lambda y, u: speed(y) + p["down"], "free")]),
+        },
+        "free",
+        [0.0, 0.0],
+    )
+
+
 CASES = {
     "deadband with a step": (GOVERNOR, "deadband-step", "e", {"width": 0.03}, with_step, 1e-4),
+    "gate with limited rates": (GOVERNOR, "state-rate-limit", "g", {"up": 0.5, "down": 0.8}, with_rates, 2e-8),
 }
 
 
@@ -106,3 +132,17 @@ def test_a_loop_runs_as_scipy_finds_it_with_events(case):
         assert np.abs(run.gradients[:, :, k] - slope).max() < max(1e-4, 100 * accuracy) * (1 + np.abs(slope).max()), (
             name
         )
+
+
+def at(model, *uses):
+    """The model with effects, each (name, place, values)."""
+    return apply_effects(model, [{"effect": e, "at": place, "parameters": values} for e, place, values in uses])
+
+
+@pytest.mark.parametrize("effect", ["state-rate-limit"])
+def test_what_changes_a_state_s_equation_sits_at_states_and_is_not_tried(effect):
+    with pytest.raises(ModelError, match=r"cannot sit at the input 'load'; expected state"):
+        at(GOVERNOR, (effect, "load", dict(effects()[effect].example)))
+    record = experiment("e", TIME, {"load": 0.0})
+    with pytest.raises(InputError, match=rf"does not try the effect '{effect}'.*\[\[model.effect\]\]"):
+        diagnose(GOVERNOR, [record], [], effects=[effect])

@@ -23,7 +23,7 @@ from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
-from tests.effects.sizes import NAMES, SIZES
+from tests.effects.sizes import NAMES, SIZES, place
 
 LINK = load_model("vsc-hvdc-link")
 TIME = np.linspace(0.0, 0.4, 201)
@@ -76,7 +76,7 @@ def test_probes_make_models_that_run(name):
     run = simulate(LINK, case, outputs=("P2_m", "Vdc2"))
     own, source = (SignalScales.of([TIME], [run[n]]) for n in ("P2_m", "Vdc2"))
     for p in probes(effect, own, source)[-1:]:
-        use = p.use(("P2_m",), "Vdc2" if effect.needs_source else "")
+        use = p.use((place(name, "P2_m"),), "Vdc2" if effect.needs_source else "")
         model = apply_effects(LINK, [use])
         assert set(p.model_names(use)) <= set(model.parameters) - set(LINK.parameters)
         assert {model.parameters[n].value for n in p.model_names(use)} == {p.values[n] for n in p.free}

@@ -99,6 +99,18 @@ def test_an_effect_that_keeps_the_rest_keeps_the_branch(effect):
             assert found["m"] == pytest.approx(e / math.hypot(1, found["g"] * x), rel=1e-8)
 
 
+@pytest.mark.parametrize("effect", [n for n, e in effects().items() if e.of_derivative])
+@pytest.mark.parametrize("state", ["g", "m"])
+def test_a_limit_on_a_state_s_equation_that_its_rest_does_not_reach_keeps_the_branch(effect, state):
+    values = {"state-rate-limit": {"up": 0.4, "down": 0.2}}[effect]
+    model, random = apply_effects(LOAD, [EffectUse(effect, (state,), values)]), np.random.default_rng(1)
+    for _ in range(5):
+        e, x = random.uniform(0.7, 1.3), random.uniform(0.2, 0.9)
+        power = random.uniform(0.1, 0.98) * e**2 / (2 * x)
+        found, branch = start(model, E=e, X=x, P0=power)
+        assert found["g"] == pytest.approx(conductance(power, e, x), rel=1e-8) and branch == "own"
+
+
 SHIFTING = {
     "gain": lambda u, p: p["k"] * u,
     "offset": lambda u, p: u + p["c"],
