@@ -37,6 +37,8 @@ Measure = Literal[
     "range/source2",
     "of T2",
     "of up",
+    "above low",
+    "below high",
 ]
 
 

@@ -109,6 +109,8 @@ _SIZES: dict[Measure, Size] = {
     "range/source2": lambda x, u, source, p: x * u.range / source.peak**2,
     "of T2": lambda x, u, source, p: x * p["T2"],
     "of up": lambda x, u, source, p: x * p["up"],
+    "above low": lambda x, u, source, p: u.low + x * u.range,
+    "below high": lambda x, u, source, p: u.high - x * u.range,
 }
 _SEARCH: dict[Measure, tuple[float, float]] = {
     "one": (-10.0, 10.0),
@@ -125,6 +127,8 @@ _SEARCH: dict[Measure, tuple[float, float]] = {
     "range/source2": (-2.0, 2.0),
     "of T2": (0.02, 50.0),
     "of up": (0.02, 50.0),
+    "above low": (1e-3, 0.98),
+    "below high": (0.98, 1e-3),
 }
 SMALLEST = 1e-3
 """Share of the largest size at which a search over a parameter that cannot be negative begins."""

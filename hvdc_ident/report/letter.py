@@ -50,6 +50,7 @@ ASKED = {
     "lag": "the time constant of the filter or transducer",
     "lead-lag": "the two time constants of the lead-lag",
     "limit": "the limit",
+    "non-windup-limit": "the levels of the limit, and that it acts without windup",
     "offset": "the offset",
     "quantisation": "the resolution of the measurement",
     "rate-limit": "the limit of the rate of change",

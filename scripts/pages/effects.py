@@ -20,6 +20,7 @@ LARGE: dict[str, dict[str, float]] = {
     "gain": {"k": 0.8},
     "limit": {"level": 0.35},
     "loss": {"a": 0.05, "b": 0.2, "c": 0.2},
+    "non-windup-limit": {"low": -0.35, "high": 0.35},
     "offset": {"c": 0.1},
     "quantisation": {"step": 0.15},
     "term": {"k": 0.6},

@@ -102,13 +102,21 @@ def test_an_effect_that_keeps_the_rest_keeps_the_branch(effect):
 @pytest.mark.parametrize("effect", [n for n, e in effects().items() if e.of_derivative])
 @pytest.mark.parametrize("state", ["g", "m"])
 def test_a_limit_on_a_state_s_equation_that_its_rest_does_not_reach_keeps_the_branch(effect, state):
-    values = {"state-rate-limit": {"up": 0.4, "down": 0.2}}[effect]
+    values = {"state-rate-limit": {"up": 0.4, "down": 0.2}, "non-windup-limit": {"low": 0.01, "high": 20.0}}[effect]
     model, random = apply_effects(LOAD, [EffectUse(effect, (state,), values)]), np.random.default_rng(1)
     for _ in range(5):
         e, x = random.uniform(0.7, 1.3), random.uniform(0.2, 0.9)
         power = random.uniform(0.1, 0.98) * e**2 / (2 * x)
         found, branch = start(model, E=e, X=x, P0=power)
         assert found["g"] == pytest.approx(conductance(power, e, x), rel=1e-8) and branch == "own"
+
+
+def test_a_limited_state_rests_at_its_limit_even_where_it_has_no_rest_without():
+    """The load that may not raise its conductance beyond 0.5 draws less than it is ordered to, and cannot collapse."""
+    model = apply_effects(LOAD, [EffectUse("non-windup-limit", ("g",), {"high": 0.5})])
+    for order, expected in ((0.3, conductance(0.3)), (0.6, 0.5), (1.5, 0.5)):
+        found, branch = start(model, P0=order)
+        assert found["g"] == pytest.approx(expected, rel=1e-9) and branch == "own"
 
 
 SHIFTING = {
