@@ -56,6 +56,7 @@ ASKED = {
     "rate-limit": "the limit of the rate of change",
     "sample-hold": "the sampling time",
     "saturation": "the level of saturation",
+    "servo": "the time constant and the rate limits of the servo",
     "state-rate-limit": "the limits of the rate of change, upwards and downwards",
     "second-order": "the natural frequency and damping of the filter or transducer",
     "window-mean": "the length of the averaging window",

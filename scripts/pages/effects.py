@@ -23,6 +23,7 @@ LARGE: dict[str, dict[str, float]] = {
     "non-windup-limit": {"low": -0.35, "high": 0.35},
     "offset": {"c": 0.1},
     "quantisation": {"step": 0.15},
+    "servo": {"T": 0.3, "up": 0.6, "down": 0.4},
     "term": {"k": 0.6},
 }
 """Sizes of the pictures where those of the effect's example are too small to be seen in a drawing."""

@@ -204,6 +204,26 @@ def test_a_loop_slides_along_the_edge_of_a_deadband_with_a_step():
     assert find_operating_point(loop, {"d": 1.0}).states["w"] == pytest.approx(0.1, rel=2e-4)
 
 
+def test_a_servo_runs_at_its_rates_and_then_as_a_lag():
+    """Behind a step from 0 to 1 it moves at its rate until 1 - y is the rate times T, then exponentially: in closed form."""
+    step = InputSignal.corners([(0.1003, 0.0), (0.1003, 1.0), (0.6003, 1.0), (0.6003, 0.0)])
+    use = EffectUse("servo", ("u",), FrozenMap({"T": 0.05, "up": 4.0, "down": 5.0}))
+    y = simulate(effect_model(use), experiment("bench", T, {"u": step}), rtol=1e-10)["y"]
+
+    def answer(t, rate):
+        gone = np.maximum(t, 0.0)
+        end = (1.0 - 0.05 * rate) / rate
+        return np.where(gone < end, rate * gone, 1.0 - 0.05 * rate * np.exp(-(gone - end) / 0.05))
+
+    top = answer(0.5, 4.0)
+    np.testing.assert_allclose(y[T < 0.6], answer(T[T < 0.6] - 0.1003, 4.0), atol=1e-8)
+    end = (top - 0.25) / 5.0
+    late = T[T > 0.6003] - 0.6003
+    np.testing.assert_allclose(
+        y[T > 0.6003], np.where(late < end, top - 5.0 * late, 0.25 * np.exp(-(late - end) / 0.05)), atol=1e-8
+    )
+
+
 def test_sample_hold_holds_what_it_took():
     period, compute = 0.01371, 0.004
     y = passed("sample-hold", {"Ts": period, "compute": compute})
@@ -261,6 +281,7 @@ def test_a_delay_in_a_loop_is_the_method_of_steps():
         ("deadband", {"width": 0.6}, lambda s: 0 * s),
         ("deadband-step", {"width": 0.1}, lambda s: 1 + 0 * s),
         ("deadband-step", {"width": 0.6}, lambda s: 0 * s),
+        ("servo", {"T": 0.02, "up": 3.0, "down": 1.0}, lambda s: 1 / (1 + 0.02 * s)),
         ("backlash", {"width": 0.1}, lambda s: 0 * s),
         ("quantisation", {"step": 0.1}, lambda s: 0 * s),
         ("saturation", {"level": 0.5}, lambda s: 1 / np.cosh(1.0) ** 2 + 0 * s),

@@ -48,6 +48,7 @@ NEUTRAL = {
     "sample-hold": ({"Ts": 0.0},),
     "saturation": ({"level": math.inf},),
     "second-order": ({"wn": math.inf},),
+    "servo": ({"T": 0.0},),
     "state-rate-limit": ({"up": math.inf, "down": math.inf},),
     "term": ({"k": 0.0},),
     "window-mean": ({"T": 0.0},),
@@ -62,6 +63,7 @@ NEARLY = {
     "second-order": {"wn": 1e6},
     "inner-loop": {"wn": 1e6},
     "rate-limit": {"rate": 1e7},
+    "servo": {"T": 1e-8, "up": 1e7, "down": 1e7},
     "state-rate-limit": {"up": 1e7, "down": 1e7},
     "non-windup-limit": {"low": -1e6, "high": 1e6},
     "gain": {"k": 1.0 + 1e-9},
@@ -175,6 +177,8 @@ def test_it_changes_what_it_sits_on_and_survives_a_card(name):
 WIDER = {
     ("lead-lag", "lag"): ({"T1": 1e-9, "T2": 0.02}, {"T": 0.02}),
     ("second-order", "lag"): ({"wn": 1e3, "zeta": 10.0}, {"T": 0.02}),
+    ("servo", "lag"): ({"T": 0.02, "up": 1e6, "down": 1e6}, {"T": 0.02}),
+    ("servo", "rate-limit"): ({"T": 2e-4, "up": 0.3, "down": 0.3}, {"rate": 0.3}),
 }
 """Values at which an effect is the one that it widens, to a few per cent."""
 

@@ -223,7 +223,7 @@ def test_one_sided_limits_and_rates_leave_the_other_side_free():
     assert falling.min() == pytest.approx(-1.0) and falling.max() > 3.0
 
 
-def test_limits_of_one_state_work_together():
+def test_limits_of_one_state_work_together_and_on_the_state_that_an_effect_adds():
     both = at(
         EXCITER,
         ("state-rate-limit", "field", {"up": 1.0, "down": 2.0}),
@@ -232,6 +232,15 @@ def test_limits_of_one_state_work_together():
     run = simulate(both, experiment("e", TIME, {"ref": InputSignal.step(0.301, 0.0, 0.3)}), rtol=1e-9)
     early = TIME < 1.1  # before v is so high that the field has to fall
     np.testing.assert_allclose(run["field"][early], np.clip(TIME[early] - 0.301, 0.0, 0.4), atol=1e-8)
+    lag = ("lag", "ref", {"T": 0.02})
+    servo, other = (
+        simulate(at(EXCITER, *uses), experiment("e", TIME, {"ref": InputSignal.step(0.301, 0.0, 0.3)}), rtol=1e-9)["v"]
+        for uses in (
+            [lag, ("state-rate-limit", "lag_ref_y", {"up": 0.5, "down": 0.7})],
+            [("servo", "ref", {"T": 0.02, "up": 0.5, "down": 0.7})],
+        )
+    )
+    np.testing.assert_allclose(servo, other, atol=1e-8)
 
 
 @pytest.mark.parametrize("effect", ["state-rate-limit", "non-windup-limit"])
