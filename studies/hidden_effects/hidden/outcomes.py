@@ -15,6 +15,7 @@ SUMS: Mapping[str, Sequence[set[str]]] = {
     "converter": (
         {"Pref", "erp"}, {"Qref", "err"}, {"idref", "erd"}, {"iqref", "erq"}, {"xd", "vcd"}, {"xq", "vcq"}, {"xl", "wl"},
     ),
+    "hydro": ({"Pref", "perm", "temp", "err"},),
 }  # fmt: skip
 """Slots that only enter one sum together: what is added at one might as well be added at another."""
 ONLY_RECORDED: Mapping[str, Sequence[str]] = {"machine": ("Qe",), "converter": ("V", "df")}
