@@ -201,7 +201,7 @@ def test_other_plants_add_cases_and_change_none():
 
 def test_options_of_the_run():
     assert STUDY.numbered("4,1") == ["station", "converter"]
-    for wrong in ("6", "0", "1,,2", "drive"):
+    for wrong in ("7", "0", "1,,2", "drive"):
         with pytest.raises(argparse.ArgumentTypeError):
             STUDY.numbered(wrong)
     asked = list(STUDY.pending(["single"], 3, 2, set(), plants=("drive", "machine"), messy=(False, True)))

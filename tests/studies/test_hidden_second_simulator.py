@@ -1,4 +1,4 @@
-"""Plant 5 of the study of hidden effects, and the second simulator, which hides effects in how their states move."""
+"""Plants 5 and 6 of the study of hidden effects, and the second simulator, which hides effects in how their states move."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.studies.study_module import STUDIES, load
 
 sys.path.insert(0, str(STUDIES / "hidden_effects"))
 
-from hidden import blocks, cases, kinds, outcomes, sizes
+from hidden import blocks, cases, kinds, mess, outcomes, sizes
 from hidden.diagnosing import CARDS, model_of
 from hidden.operators import CATALOGUE, OUTSIDE, WITH_SOURCE
 from hidden.plant import Plant
@@ -30,8 +30,8 @@ from hidden.simulator import Hidden, Run, Signal, simulate
 from hvdc_ident.model import read_card
 
 STUDY = load("hidden_effects")
-HYDRO = PLANTS["hydro"]
-NEW = [HYDRO]
+HYDRO, PARK = PLANTS["hydro"], PLANTS["park"]
+NEW = [HYDRO, PARK]
 ROWS = 125
 
 
@@ -55,7 +55,7 @@ def own(plant, values=None, hidden=(), rows=ROWS, times=1.0, **more):
 
 
 def test_the_second_simulator_knows_neither_the_package_nor_the_first_one():
-    for name in ("kutta", "blocks", "kinds", "hydro"):
+    for name in ("kutta", "blocks", "kinds", "hydro", "park"):
         tree = ast.parse((STUDIES / "hidden_effects" / "hidden" / f"{name}.py").read_text(encoding="utf-8"))
         only_for_types = {id(n) for branch in tree.body if isinstance(branch, ast.If) for n in ast.walk(branch)}
         imported = {
@@ -85,7 +85,8 @@ def test_both_simulators_agree_on_the_plants(plant):
     assert {n: p.value for n, p in model.parameters.items()} == plant.parameters
     assert {n: s.value for n, s in model.inputs.items()} == plant.inputs
     signals = {s for s in model.insertion_points if not s.startswith("outputs.")}
-    assert set(plant.slots) == signals
+    assert signals - set(plant.slots) <= {"across", "Vre", "Vim"}, "the park's phasors are in another frame"
+    assert set(plant.slots) <= signals
     assert own(plant, values, coarse=True) == pytest.approx(theirs, abs=0.05 * np.ptp(theirs))
 
 
@@ -132,6 +133,23 @@ def test_the_governor_follows_the_published_rule_and_is_damped_alone():
     assert abs(swing) == pytest.approx(np.sqrt(100 * np.pi * synchronising / (2 * p["H"])), rel=0.02)
 
 
+def test_the_park_rests_where_the_load_flow_says():
+    p = PARK.parameters
+    active, reactive, volts, terminals = own(PARK, rows=2)[0]
+    assert active == pytest.approx(0.7, abs=1e-9)
+    assert volts + p["Kc"] * reactive == pytest.approx(1.0, abs=1e-9), "the droop of the plant controller"
+    current = (active - 1j * reactive) / volts
+    assert abs(volts - (p["Rg"] + 1j * p["Xg"]) * current) == pytest.approx(1.0, abs=1e-9)
+    assert abs(volts + (p["Rc"] + 1j * p["Xc"]) * current) == pytest.approx(terminals, abs=1e-9)
+
+
+def test_the_parks_frequency_droop_has_its_dead_band():
+    for off, beyond in ((5e-4, 0.0), (3e-3, 3e-3 - 6e-4)):
+        run = Run({"fbus": Signal(((0.1, 1.0), (0.1, 1.0 + off)))})
+        end = simulate(PARK, [run], rows=400, step=4 * PARK.step)[-1, 0, 0]
+        assert end == pytest.approx(0.7 - 20.0 * beyond, abs=1e-5)
+
+
 TOGETHER = [  # plant, effect, slot, from, parameters
     ("hydro", "lag", "dw", "", {"T": 0.3}),
     ("hydro", "gain", "h", "", {"k": 1.05}),
@@ -145,6 +163,16 @@ TOGETHER = [  # plant, effect, slot, from, parameters
     ("hydro", "saturation", "err", "", {"level": 0.005}),
     ("hydro", "backlash", "gate", "", {"width": 0.001}),
     ("hydro", "loss", "Pm", "q", {"a": 0.01, "b": 0.02, "c": 0.03}),
+    ("park", "droop", "verr", "Q", {"k": 0.1}),
+    ("park", "coupling", "perr", "V", {"k": -1.0}),
+    ("park", "conductance", "Vcmd", "Q", {"g": 0.1}),
+    ("park", "lag", "P", "", {"T": 0.05}),
+    ("park", "window-mean", "Qt", "", {"T": 0.083}),
+    ("park", "inner-loop", "Ipcmd", "", {"wn": 30.0, "zeta": 0.6}),
+    ("park", "deadband", "ferr", "", {"width": 0.001}),
+    ("park", "limit", "Vcmd", "", {"level": 1.02}),
+    ("park", "delay", "Qcmd", "", {"T": 0.103}),
+    ("park", "sample-hold", "Pcmd", "", {"Ts": (1 + sizes.LATE) * 0.051, "compute": 0.0}),
 ]
 
 
@@ -170,7 +198,7 @@ def changed(plant, state, derivative):
     return "\n".join(lines)
 
 
-SLOW = [("hydro", "gate", 0.004), ("hydro", "pilot", 0.01)]
+SLOW = [("hydro", "gate", 0.004), ("hydro", "pilot", 0.01), ("park", "Ip", 0.1), ("park", "Qext", 0.02)]
 
 
 @pytest.mark.parametrize(("name", "state", "rate"), SLOW)
@@ -189,6 +217,12 @@ def test_a_rate_limited_state_is_that_of_a_card_with_a_clipped_derivative(tmp_pa
 
 
 HELD = [("hydro", "gate", {"high": 0.7015}), ("hydro", "pilot", {"low": -3e-4}), ("hydro", "slow", {"high": 0.7004})]
+HELD += [
+    ("park", "xi", {"low": 0.05}),
+    ("park", "xi", {"high": 0.077}),
+    ("park", "xp", {"high": 0.715}),
+    ("park", "Pord", {"high": 0.71}),
+]
 
 
 @pytest.mark.parametrize(("name", "state", "limit"), HELD)
@@ -297,7 +331,7 @@ def test_a_plant_that_rests_at_a_limit_is_held_there_from_the_start():
     assert found == pytest.approx(np.full((50, 2), 0.6), abs=1e-9)
 
 
-@pytest.mark.parametrize(("plant", "at"), [(HYDRO, "Pref")], ids=lambda p: getattr(p, "name", p))
+@pytest.mark.parametrize(("plant", "at"), [(HYDRO, "Pref"), (PARK, "Vref")], ids=lambda p: getattr(p, "name", p))
 def test_a_disturbance_has_acted_until_the_plant_repeats_itself(plant, at):
     values = {"amplitude": 0.02, "frequency": 4.0 / plant.pace, "phase": 1.0}
     hidden = [Hidden("disturbance", at, values)]
@@ -366,3 +400,13 @@ def test_sums_of_the_plants_are_sums(plant):
         assert min(norms) > 0
         for a, n in zip(answers, norms, strict=True):
             assert abs(a @ answers[0]) == pytest.approx(n * norms[0], rel=1e-6), group
+
+
+def test_a_messy_record_of_the_second_simulator_is_near_a_tidy_one():
+    base = sizes.nominal("park", "small", 0)
+    extent = np.ptp(base.outputs[:, :2], axis=(0, 1))
+    found = mess.recorded(PARK, base.runs, [], extent, [1, 2, 3])
+    off = np.abs(found - base.outputs).max(axis=(0, 1)) / extent
+    assert ((off > 1e-3) & (off < 0.3)).all(), (
+        "parameters 1 % off, half a cycle as the step, and late time stamps at jumps"
+    )
