@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import sys
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -186,6 +187,48 @@ def test_both_simulators_agree_on_effects(name, effect, at, source, values):
     size = np.abs((mine - plain) / extent).max()
     assert size > 0.01
     assert np.abs((mine - theirs) / extent).max() < 0.01 * size + 2e-4
+
+
+BOTH = {  # slot of the drive, from, parameters
+    "backlash": ("wm", "", {"width": 0.05}),
+    "conductance": ("v", "w", {"g": 0.1}),
+    "coupling": ("load", "w", {"k": 0.1}),
+    "cubic": ("vo", "", {"k": 0.05}),
+    "deadband": ("load", "", {"width": 0.15}),
+    "delay": ("wm", "", {"T": 0.0102}),
+    "disturbance": ("wref", "", {"amplitude": 0.1, "frequency": 7.0, "phase": 1.0}),
+    "drift": ("wm", "", {"k": 0.3}),
+    "droop": ("wref", "i", {"k": 0.3}),
+    "gain": ("emf", "", {"k": 1.2}),
+    "inner-loop": ("v", "", {"wn": 120.0, "zeta": 0.5}),
+    "lag": ("wm", "", {"T": 0.01}),
+    "lead-lag": ("vo", "", {"T1": 0.03, "T2": 0.01}),
+    "limit": ("v", "", {"level": 0.8}),
+    "loss": ("torque", "w", {"a": 0.01, "b": 0.02, "c": 0.03}),
+    "notch": ("vo", "", {"wn": 40.0, "k": 0.8}),
+    "offset": ("wm", "", {"c": 0.1}),
+    "product": ("torque", "w", {"k": 0.3}),
+    "quantisation": ("wref", "", {"step": 0.07}),
+    "rate-limit": ("wref", "", {"rate": 3.0}),
+    "relay": ("torque", "w", {"k": 0.02, "centre": 1.0, "width": 0.05}),
+    "sample-hold": ("wm", "", {"Ts": (1 + sizes.LATE) * 0.011, "compute": 0.004}),
+    "saturation": ("v", "", {"level": 2.0}),
+    "second-order": ("wm", "", {"wn": 120.0, "zeta": 0.4}),
+    "window-mean": ("wm", "", {"T": 0.0213}),
+}
+
+
+@pytest.mark.parametrize("effect", sorted(blocks.BLOCKS))
+def test_both_programs_of_the_study_hide_the_same(effect):
+    """The drive in the first program and in the second, with the same effect."""
+    drive = PLANTS["drive"]
+    at, source, values = BOTH[effect]
+    hidden = [Hidden(effect, at, values, source)]
+    plain = own(drive, rows=100)
+    first, second = own(drive, hidden=hidden, rows=100), own(replace(drive, scheme="kutta"), hidden=hidden, rows=100)
+    size = np.abs(first - plain).max(axis=0)
+    assert (size > 1e-3).all()
+    assert (np.abs(first - second) < 0.01 * size).all()
 
 
 def changed(plant, state, derivative):
