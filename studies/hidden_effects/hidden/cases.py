@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hidden import mess
 from hidden.campaigns import EVENT, EXCITATIONS, ROWS, VARIANTS
+from hidden.kinds import OF_STATES, SLOW_STATE
 from hidden.noise import KINDS, WRONG, added, whitened
 from hidden.operators import CATALOGUE, OUTSIDE
 from hidden.plant import INTERVAL
@@ -29,6 +30,8 @@ FIRM = 1.0
 """Units by which the answer may change at half the step."""
 LOUDNESS = (math.log(2e-3), math.log(2e-2))
 """Of the noise: its standard deviation in shares of an output's range, as logarithms."""
+FED_BACK = ("coupling", "droop")
+"""Effects that a plant's own list of feedbacks places in every second case."""
 PARTS = {"single": 357, "pair": 60, "clean": 400, "outside": 50, "left-out": 60, "triple": 40}
 """How many cases each part has, of the first two plants together."""
 MORE = {"single": 160, "pair": 30, "clean": 200, "outside": 25, "left-out": 30, "triple": 20}
@@ -120,6 +123,8 @@ def designs(part: str, seed: int, plants: Sequence[str] = FIRST, messy: bool = F
 def _designs(part: str, rng: np.random.Generator, count: int, plants: Sequence[str], first: int) -> Iterator[Design]:
     """Return the designs of one part for plants that share them, with numbers from the first on."""
     known = [n for n in CATALOGUE if n != "inductance" or any(PLANTS[p].resistance[0] for p in plants)]
+    if all(PLANTS[p].servos for p in plants):
+        known += OF_STATES
     names = {"outside": list(OUTSIDE), "clean": [""]}.get(part, known)
     each = -(-count // len(names))
     tables = {name: _balanced(rng, each, part, plants) for name in names}
@@ -264,7 +269,7 @@ def _firm(
     A quantised loop that settles between two levels switches between them from step to step, and the level in a row is
     arbitrary. Static effects and filters are accurate to far less than a unit.
     """
-    if not any((CATALOGUE | OUTSIDE)[h.effect].stepped for h in hidden):
+    if not any(h.effect in OF_STATES or (CATALOGUE | OUTSIDE)[h.effect].stepped for h in hidden):
         return True
     off = simulate(base.plant, base.runs, hidden, step=0.5 * base.plant.step) - clean
     return float(np.linalg.norm(whitened(off, sigma, kind)[..., list(channels)])) < FIRM * UNIT
@@ -285,6 +290,12 @@ def _place(rng: np.random.Generator, base: Nominal, effect: str, taken: list[str
     places = [*plant.slots, *(f"outputs.{o}" for o in plant.outputs)]
     if effect == "inductance":
         return plant.resistance[0], ""
+    if effect in OF_STATES:
+        states = [s for s in (plant.servos if effect == SLOW_STATE else plant.bounded) if s not in taken]
+        return str(rng.choice(states)), ""
+    if effect in FED_BACK and plant.feedbacks and rng.random() < 0.5:
+        pairs = [f for f in plant.feedbacks if f[0] not in taken]
+        return pairs[int(rng.integers(len(pairs)))]
     while True:
         at = str(rng.choice(places))
         if at in taken:

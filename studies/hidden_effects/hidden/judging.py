@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from hidden.kinds import SLOW_STATE
 from hidden.outcomes import Line, effects_found, is_truth, members, named, outcome, same_effect
 from hidden.probabilities import calibration, limit_above
 
@@ -15,9 +16,9 @@ MAIN = {
     "lag": "T", "delay": "T", "window-mean": "T", "sample-hold": "Ts", "second-order": "wn", "inner-loop": "wn",
     "lead-lag": "T1", "limit": "level", "saturation": "level", "rate-limit": "rate", "deadband": "width",
     "backlash": "width", "quantisation": "step", "gain": "k", "offset": "c", "coupling": "k", "droop": "k",
-    "conductance": "g", "inductance": "L", "disturbance": "amplitude",
+    "conductance": "g", "inductance": "L", "disturbance": "amplitude", SLOW_STATE: "up",
 }  # fmt: skip
-"""The parameter that measures the effect."""
+"""The parameter that measures the effect; a limit of a state has one of two."""
 OUTCOMES = ("right", "covered", "place", "wrong", "ambiguous", "abstained", "failed")
 PARTS = ("single", "pair", "clean", "outside", "left-out", "triple")
 

@@ -15,6 +15,8 @@ SUMS: Mapping[str, Sequence[set[str]]] = {
     "converter": (
         {"Pref", "erp"}, {"Qref", "err"}, {"idref", "erd"}, {"iqref", "erq"}, {"xd", "vcd"}, {"xq", "vcq"}, {"xl", "wl"},
     ),
+    "hydro": ({"Pref", "perm", "temp", "err"},),
+    "park": ({"Vref", "Vc", "verr"}, {"xv", "Qcmd"}, {"Qt", "qerr"}, {"Vcmd", "vterr"}, {"Pref", "fdb", "perr"}, {"xp", "Pcmd"}),
 }  # fmt: skip
 """Slots that only enter one sum together: what is added at one might as well be added at another."""
 ONLY_RECORDED: Mapping[str, Sequence[str]] = {"machine": ("Qe",), "converter": ("V", "df")}

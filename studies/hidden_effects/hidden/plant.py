@@ -26,7 +26,9 @@ class Plant:
     pace: of its rows, steps, experiments and effects' times, in multiples of those of the first plants. coarse: steps of the
     simulator that one step of the refits has. lead: time in s that a run without a steady start waits for rest before its first
     row, several times the plant's largest time constant. turning(x): derivatives of the states in steady state (default: 0). timed: True
-    if flow reads the time, as the input "time".
+    if flow reads the time, as the input "time". servos, bounded: states whose speed, or whose range, a hidden effect may limit.
+    feedbacks: pairs of a slot and an output that a hidden coupling or droop feeds back into it in every second case; none: never
+    by choice.
     """
 
     name: str
@@ -39,12 +41,15 @@ class Plant:
     slots: tuple[str, ...]
     resistance: tuple[str, str]
     flow: Flow
-    scheme: Literal["runge-kutta", "trapezoidal"] = "runge-kutta"
+    scheme: Literal["runge-kutta", "trapezoidal", "kutta"] = "runge-kutta"
     pace: float = 1.0
     coarse: int = 10
     lead: float = 1.0
     turning: Callable[[list[Array]], list[Array]] | None = None
     timed: bool = False
+    servos: tuple[str, ...] = ()
+    bounded: tuple[str, ...] = ()
+    feedbacks: tuple[tuple[str, str], ...] = ()
 
     @property
     def interval(self) -> float:

@@ -7,7 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from hidden.converter import CONVERTER
+from hidden.hydro import HYDRO
 from hidden.machine import MACHINE
+from hidden.park import PARK
 from hidden.plant import Array, Plant, See
 
 
@@ -67,7 +69,7 @@ DRIVE = Plant(
     resistance=("", ""),
     flow=_drive,
 )
-PLANTS = {p.name: p for p in (STATION, DRIVE, MACHINE, CONVERTER)}
+PLANTS = {p.name: p for p in (STATION, DRIVE, MACHINE, CONVERTER, HYDRO, PARK)}
 """In the order of their numbers, which begin with 1."""
 FIRST = (STATION.name, DRIVE.name)
 """Those that share the designs of the study's first version; each of the others has designs of its own."""

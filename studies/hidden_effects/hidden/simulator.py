@@ -1,7 +1,7 @@
 """The study's own simulators, each at a fixed step, on a batch of runs at once.
 
-Plants 1 and 2 are integrated by the classical Runge-Kutta method, the others by the trapezoidal rule, as in programs for power
-systems. Both have a coarse variant, Heun's method.
+Plants 1 and 2 are integrated by the classical Runge-Kutta method, plants 3 and 4 by the trapezoidal rule, as in programs for power
+systems. Both have a coarse variant, Heun's method. The others have a program of their own, `kutta`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from hidden.kutta import integrated
 from hidden.operators import CATALOGUE, OUTSIDE, Operator
 from hidden.plant import INTERVAL, STEP, Plant
 
@@ -79,10 +80,14 @@ def simulate(
     interval, step, lead: the plant's own where none is given. lead: time in s before the first row, for a run without a steady
     start to settle or to become periodic. coarse: integrate by Heun's method.
     """
-    kind = _RungeKutta if plant.scheme == "runge-kutta" else _Trapezoidal
     interval = plant.interval if interval is None else interval
     step = plant.step if step is None else step
     lead = plant.lead if lead is None else lead
+    if plant.scheme == "kutta":
+        names = tuple(watch) or tuple(f"outputs.{o}" for o in plant.outputs)
+        settings = {"rows": rows, "interval": interval, "step": step, "lead": lead, "coarse": coarse}
+        return integrated(plant, runs, hidden, watch=names, **settings)  # type: ignore[arg-type]
+    kind = _RungeKutta if plant.scheme == "runge-kutta" else _Trapezoidal
     return kind(plant, runs, hidden, rows, interval, watch, step, lead, coarse).result()
 
 

@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from hidden import kinds
 from hidden.campaigns import ROWS, campaign
 from hidden.noise import whitened
 from hidden.operators import WITH_SOURCE
@@ -27,7 +28,7 @@ ROUNDS, SETTLED = 8, 1e-2
 """Of a refit: runs at most, and the relative fall of the sum of squares at which it has ended."""
 WIDTH = 5.0
 """The bounds of a fitted parameter: its true value divided and multiplied by this."""
-PACED = {"T": 1, "Ts": 1, "compute": 1, "T1": 1, "T2": 1, "wn": -1, "rate": -1, "frequency": -1}
+PACED = {"T": 1, "Ts": 1, "compute": 1, "T1": 1, "T2": 1, "wn": -1, "rate": -1, "up": -1, "down": -1, "frequency": -1}
 """Parameters of effects that are times, with 1, or rates, with -1."""
 LATE = 1e-7
 """By how much a sampler's period is longer than its steps. Rows and samples both begin with the record: without it they
@@ -36,7 +37,10 @@ would meet exactly, and which of the two comes first would be a matter of roundi
 
 @dataclass(frozen=True)
 class About:
-    """Reference of a size: the insertion point's signal (and the other one) in the fitted experiments without the effect."""
+    """Reference of a size: the insertion point's signal (and the other one) in the fitted experiments without the effect.
+
+    start: its value before the event. steepest: its largest speed from row to row, 1/s at a plant with pace 1.
+    """
 
     low: float
     high: float
@@ -44,6 +48,8 @@ class About:
     other_range: float = 1.0
     other_peak: float = 1.0
     other_rest: float = 0.0
+    start: float = 0.0
+    steepest: float = 1.0
 
     @property
     def peak(self) -> float:
@@ -72,6 +78,8 @@ SPANS: Mapping[str, tuple[float, float]] = {
     "quantisation": (0.01, 1.5),
     "inductance": (4e-4, 0.3),
     "notch": (0.01, 0.95),
+    kinds.SLOW_STATE: (0.02, 0.98),
+    kinds.HELD_STATE: (0.02, 0.98),
 }
 """From the smallest to the largest size tried, in what `parameters` counts sizes in; (1e-3, 1) where not listed."""
 
@@ -138,6 +146,13 @@ def parameters(effect: str, x: Array, about: About, rng: np.random.Generator, re
         case "disturbance":
             frequency, phase = rng.uniform(2.0, 25.0), rng.uniform(0, 2 * np.pi)
             return {"amplitude": x * about.range, "frequency": frequency * one, "phase": phase * one}
+        case kinds.SLOW_STATE:
+            return dict.fromkeys(("up", "down"), about.steepest * (1 - x))
+        case kinds.HELD_STATE:
+            up, down = about.high - about.start, about.start - about.low
+            if rng.random() * (up + down) < up:
+                return {"high": about.high - x * up}
+            return {"low": about.low + x * down}
         case "cubic":
             return {"k": sign * x * about.range / about.peak**3}
         case "relay":
@@ -192,6 +207,7 @@ def about(base: Nominal, at: str, source: str) -> About:
     return About(
         float(u.min()), float(u.max()), float(np.abs(u[0]).max()),
         float(np.ptp(o)), float(max(np.abs(o).max(), 1e-9)), float(o[0, 0]),
+        float(u[0, 0]), float(np.abs(np.diff(u, axis=0)).max()) / INTERVAL,
     )  # fmt: skip
 
 
