@@ -8,8 +8,10 @@ many there must be is counted by the argument principle on the same determinant,
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -26,10 +28,9 @@ MOST_WORK = 100_000_000
 """Points of the contour, and points times entries of the pencil, after which counting is given up: some seconds."""
 NEUTRAL = 1e-9
 """Distance from 1 within which rounding hides on which side a gain around a delay without states lies."""
-
-
 FARTHEST = 200.0
 """Largest -Re(s) T of a delay's root that is looked for: its factor there, e^200, is far beyond what rounding leaves of the others."""
+T = TypeVar("T")
 
 
 class Undecided(LinearizationError):
@@ -66,8 +67,7 @@ class Part:
 
     def factors(self, s: Array) -> Array:
         """E(s), (frequencies, delays); as large as at `FARTHEST` left of it, where only states before a delay have roots."""
-        found = [response(c.kind, c.time, c.compute, x) for c, x in zip(self.channels, self._held(s), strict=True)]
-        return np.array(found, dtype=complex).reshape(len(self.channels), s.size).T
+        return np.array(self._of_delays(response, s), dtype=complex).reshape(len(self.channels), s.size).T
 
     def pencil(self, s: Array) -> Array:
         """(frequencies, rows, columns) of the matrix whose determinant is the characteristic function."""
@@ -81,9 +81,7 @@ class Part:
     def pencil_by_s(self, s: Array) -> Array:
         """The derivative of the pencil by s."""
         n = self.nx
-        slopes = [
-            response_by_s(c.kind, c.time, c.compute, x) for c, x in zip(self.channels, self._held(s), strict=True)
-        ]
+        slopes = self._of_delays(response_by_s, s)
         rows = np.concatenate([np.zeros((s.size, n)), np.array(slopes).reshape(len(self.channels), s.size).T], axis=1)
         found = -rows[:, :, None] * self.matrix
         found[:, range(n), range(n)] += 1.0
@@ -91,12 +89,12 @@ class Part:
 
     def factor_slopes(self, s: Array) -> list[tuple[Array, Array]]:
         """Return for each delay the derivatives of its factor by its time and by its compute time."""
-        places = zip(self.channels, self._held(s), strict=True)
-        return [response_slopes(c.kind, c.time, c.compute, x) for c, x in places]
+        return self._of_delays(response_slopes, s)
 
-    def _held(self, s: Array) -> list[Array]:
-        """Return for each delay the frequencies, their real parts not below where the search for its roots ends."""
-        return [np.maximum(s.real, -FARTHEST / length) + 1j * s.imag for length in self.lengths]
+    def _of_delays(self, function: Callable[[str, float, float, Array], T], s: Array) -> list[T]:
+        """Return a function of kind, time, compute time and frequencies for each delay, at the edge of the search left of it."""
+        held = (np.maximum(s.real, -FARTHEST / length) + 1j * s.imag for length in self.lengths)
+        return [function(c.kind, c.time, c.compute, x) for c, x in zip(self.channels, held, strict=True)]
 
     # --- counting ---
 

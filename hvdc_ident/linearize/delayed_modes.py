@@ -111,7 +111,7 @@ def _shape(right: Array, place: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Direction:
-    """What a parameter changes of a part: its matrix, and each delay's times, s."""
+    """Change of a part with a parameter: of its matrix, and of each delay's times, s."""
 
     matrix: Array
     times: tuple[Array, ...]
