@@ -428,7 +428,7 @@ def test_a_case_with_an_effect_on_a_state_is_made_at_its_size():
 
 @pytest.mark.parametrize("plant", NEW, ids=lambda p: p.name)
 def test_sums_of_the_plants_are_sums(plant):
-    """What is added at one slot of a sum is, times a number, added at each of the others."""
+    """An addition at one slot of a sum is, times a number, one at each of the others."""
     p = {n: np.array([v]) for n, v in plant.parameters.items()}
     u = {n: np.array([v]) for n, v in plant.inputs.items()}
     x = [np.array([v * 1.01 + 1e-4]) for v in plant.states.values()]

@@ -24,25 +24,8 @@ NUDGE = 1e-9
 STEPS_TO_REST, AT_REST = 50, 1e-12
 
 
-def integrated(
-    plant: Plant,
-    runs: Sequence[Run],
-    hidden: Sequence[Hidden],
-    *,
-    rows: int,
-    interval: float,
-    watch: Sequence[str],
-    step: float,
-    lead: float,
-    coarse: bool,
-) -> Array:
-    """Return (rows, runs, watched), NaN or infinite where a run diverges. Arguments: as of `simulator.simulate`."""
-    with np.errstate(all="ignore"):
-        return Integration(plant, runs, hidden, rows, interval, watch, step, lead, coarse).rows_found()
-
-
 class Integration:
-    """A batch of runs under way."""
+    """A batch of runs under way. Arguments: as of `simulator.simulate`, none left out."""
 
     def __init__(
         self,
@@ -189,8 +172,12 @@ class Integration:
 
     # --- the run ---
 
-    def rows_found(self) -> Array:
-        """Return (rows, runs, watched)."""
+    def result(self) -> Array:
+        """Return (rows, runs, watched), NaN or infinite where a run diverges."""
+        with np.errstate(all="ignore"):
+            return self._rows()
+
+    def _rows(self) -> Array:
         x = self._at_rest()
         found = np.full((self.rows, x.shape[1], len(self.watch)), np.nan)
         for step in range(self.steps):

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hidden.kutta import integrated
+from hidden.kutta import Integration
 from hidden.operators import CATALOGUE, OUTSIDE, Operator
 from hidden.plant import INTERVAL, STEP, Plant
 
@@ -83,11 +83,8 @@ def simulate(
     interval = plant.interval if interval is None else interval
     step = plant.step if step is None else step
     lead = plant.lead if lead is None else lead
-    if plant.scheme == "kutta":
-        names = tuple(watch) or tuple(f"outputs.{o}" for o in plant.outputs)
-        settings = {"rows": rows, "interval": interval, "step": step, "lead": lead, "coarse": coarse}
-        return integrated(plant, runs, hidden, watch=names, **settings)  # type: ignore[arg-type]
-    kind = _RungeKutta if plant.scheme == "runge-kutta" else _Trapezoidal
+    watch = tuple(watch) or tuple(f"outputs.{o}" for o in plant.outputs)
+    kind = {"runge-kutta": _RungeKutta, "trapezoidal": _Trapezoidal, "kutta": Integration}[plant.scheme]
     return kind(plant, runs, hidden, rows, interval, watch, step, lead, coarse).result()
 
 
@@ -109,7 +106,7 @@ class _Batch:
         self.plant, self.n, self.h, self.coarse = plant, len(runs), step, coarse
         self.rows, self.every = rows, round(interval / step)
         assert abs(self.every * step - interval) < 1e-12, "the rows fall on whole steps"
-        self.watch = tuple(watch) or tuple(f"outputs.{o}" for o in plant.outputs)
+        self.watch = watch
         kinds = CATALOGUE | OUTSIDE
         waits = any(kinds[h.effect].waits_for_rest for h in hidden)
         self.lead = round(lead / step) if waits else 0
