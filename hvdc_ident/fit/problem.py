@@ -183,18 +183,26 @@ class Problem:
         models = {o: (m,) if isinstance(m, float | int) else tuple(m) for o, m in self.rho.items()}
         return Treatment(FrozenMap(models), self.guard, self.band, self.quantised_noise)
 
-    def blocks(self, theta: Array, *, derivatives: bool = True, in_time: bool = False) -> tuple[ResidualBlock, ...]:
+    def blocks(
+        self,
+        theta: Array,
+        *,
+        derivatives: bool = True,
+        in_time: bool = False,
+        also: Mapping[str, float] | None = None,
+    ) -> tuple[ResidualBlock, ...]:
         """Return the residuals of each output in each experiment; jacobians have a column for every unknown.
 
         Neither the loss nor the priors are in them. Without derivatives the columns are 0. in_time: samples in time
-        even where the fit is of spectra. Raises SimulationError where a run fails: theta is then inadmissible.
+        even where the fit is of spectra. also: values of further parameters of the simulator, for these runs. Raises
+        SimulationError where a run fails: theta is then inadmissible.
         """
         treatment = replace(self.treatment, band=None) if in_time else self.treatment
         width = len(self.names)
         blocks: list[ResidualBlock] = []
         for e in self.fitted_experiments:
             columns = self._columns[e.name]
-            answered = self._experiment(e, theta, derivatives, treatment)
+            answered = self._experiment(e, theta, derivatives, treatment, also)
             # Where every unknown is one of this experiment's they are in their order.
             whole = derivatives and len(columns) == width
             blocks += answered if whole else [b.among(columns if derivatives else (), width) for b in answered]
@@ -211,10 +219,12 @@ class Problem:
         """Return the derivatives of the residuals by the unknown initial states, (N, k), one column a state and experiment."""
         return np.asarray(block_diag(*(self._best_start(e, theta, self.treatment)[1] for e in self.fitted_experiments)))
 
-    def _best_start(self, e: Experiment, theta: Array, treatment: Treatment) -> tuple[Experiment, Array]:
+    def _best_start(
+        self, e: Experiment, theta: Array, treatment: Treatment, also: Mapping[str, float] | None = None
+    ) -> tuple[Experiment, Array]:
         """Return the experiment with the initial states that suit its records best, and its residuals' derivatives, (n, k)."""
         states = unknown_initial_states(self.simulator, e)
-        values, nuisance = self.values(theta), self.nuisances(e, theta)
+        values, nuisance = {**self.values(theta), **(also or {})}, self.nuisances(e, theta)
         if states:
             e = with_steady_start(self.simulator, e, values, states, nuisance)
         blocks = residual_blocks(
@@ -226,7 +236,12 @@ class Problem:
         return e, np.vstack([b.jacobian[:, : len(states)] for b in blocks])
 
     def _experiment(
-        self, e: Experiment, theta: Array, derivatives: bool, treatment: Treatment
+        self,
+        e: Experiment,
+        theta: Array,
+        derivatives: bool,
+        treatment: Treatment,
+        also: Mapping[str, float] | None = None,
     ) -> tuple[ResidualBlock, ...]:
         """Return the residuals of one experiment; jacobians have a column for every unknown that it answers."""
         if e.domain == "frequency":  # is compared as it is: whitening, guards and bands are of samples in time
@@ -236,8 +251,8 @@ class Problem:
         )
         return residual_blocks(
             self.simulator,
-            self._best_start(e, theta, treatment)[0] if eliminated else e,
-            self.values(theta),
+            self._best_start(e, theta, treatment, also)[0] if eliminated else e,
+            {**self.values(theta), **(also or {})},
             tuple(f.name for f in self.free),
             self.sigma[e.name],
             nuisance=self.nuisances(e, theta),

@@ -88,11 +88,13 @@ def _with_offsets_and_starts(model: Model, names: tuple[str, ...]) -> tuple[Mode
 class ModelSimulator:
     """Model as a simulator: parameters, and runs with exact sensitivities. It can be sent to other processes.
 
-    tolerance: of every run (default: the engine's own).
+    tolerance: of every run (default: the engine's own). method: of every run; where the engine chooses it, by the first run of a
+    structure in a process, the last digits of a result depend on what was run before.
     """
 
     model: AnyModel
     tolerance: Tolerance | None = None
+    method: Method = "auto"
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
@@ -119,7 +121,7 @@ class ModelSimulator:
         try:
             return simulate(
                 self.model, experiment, values, sensitivities,
-                outputs=experiment.outputs or None, tolerance=self.tolerance,
+                outputs=experiment.outputs or None, tolerance=self.tolerance, method=self.method,
             )  # fmt: skip
         except (SteadyStateError, TimingError) as e:
             raise SimulationError(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None
