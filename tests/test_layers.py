@@ -18,10 +18,9 @@ fmu linearize sensitivity fit identifiability discrepancy report study api app c
 # Rooms with rooms inside, and the order of those.
 INSIDE = {
     "discrepancy": """
-noise_colour options result signatures placed record_noise size_curves nominal size_line refit implied scores bode evidence
-explain formula latent race residual_checks context localise refit_jobs size_profile proposals
-refitted remainder clocks released neighbours outside explore rounds alternatives search candidate_table classes findings verdict
-stand_ins diagnosis
+noise_colour options result candidates movable size_curves record_noise placed nominal refit screen localise evidence pushes
+race bode implied refit_jobs explain residual_checks formula latent refitted context clocks stand_ins stand remainder released
+outside met rounds alternatives search candidate_table classes findings verdict diagnosis
 """
 }
 

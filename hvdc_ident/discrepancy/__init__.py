@@ -4,14 +4,15 @@ A hypothesis is the model with some effects at insertion points, their sizes and
 of one diagnosis through the modules:
 
     nominal, record_noise   the model without effects at its own best, and the noise of the records
-    signatures, scores      how the outputs would differ if an effect were there, and how far chi2 would then fall
-    latent                  what any effect at an insertion point could explain: a bound, and the signal that is truly there
-    proposals, refit, race  effects with sizes that promise most, refitted together with the parameters
-    explore, size_profile   their neighbours (another place, another effect), and sizes that no slope leads to
+    candidates, movable     every effect at every place in a few sizes; an effect compiled once whose place is chosen at run time
+    screen, stand           all of them simulated, with the parameters' answer; the best refitted in a race
+    met                     sizes that no slope leads to: levels of a quantiser, periods of a sampler
+    refit, race             effects with sizes and the model's parameters, refitted together
     released, clocks        parameters that were held, set free where the records speak against their values; and their clocks
     rounds, search          one effect after the other, each looked for again beside the others, or done without
     outside, alternatives   forms that the catalogue has no name for
     evidence, classes       what each hypothesis gains; effects that are one equation, wherever they are
+    pushes, latent          what any effect at an insertion point could explain
     remainder, verdict      what is left, whether anything more could explain it, and what is told
     diagnosis, result       the verb and its result
 """

@@ -7,20 +7,20 @@ name for it takes a form for told that the data do not tell.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
-from hvdc_ident.discrepancy.evidence import CandidateFit
+from hvdc_ident.discrepancy.candidates import additive, proportional, source_signals
+from hvdc_ident.discrepancy.context import Round, SearchContext
+from hvdc_ident.discrepancy.evidence import CandidateFit, alike
 from hvdc_ident.discrepancy.formula import Term, at_run, at_runs, formula_job, terms
+from hvdc_ident.discrepancy.movable import added, in_proportion
 from hvdc_ident.discrepancy.outside.filtered import filters
 from hvdc_ident.discrepancy.outside.law import regression
+from hvdc_ident.discrepancy.pushes import Pushed
 from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Refit, RefitJob
+from hvdc_ident.discrepancy.refit import RefitJob
 from hvdc_ident.discrepancy.rounds import gained
-from hvdc_ident.discrepancy.scores import Path
-from hvdc_ident.discrepancy.signatures.candidates import additive, proportional, source_signals
-from hvdc_ident.discrepancy.signatures.finite import additions, alike, is_linear, kind_of
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import ModelError
 from hvdc_ident.model import Model
@@ -40,7 +40,7 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, flo
     placed = winner.refit.placed[-1]
     effect = effects()[placed.candidate.effect]
     if effect.equivalent_delay is not None and not effect.needs_grid:
-        tried = filters(search, found, found.before.nominal()) if found.filters is None else found.filters
+        tried = filters(search, found) if found.filters is None else found.filters
         places = {c.at for c in found.candidates if c.effect == effect.name}
         return tuple((gained(t, found.before, found.ruler), 1.0 / len(places)) for t in tried)
     # Of what is brought in the start value alone is kept: that is no memory of where the signal has been.
@@ -50,34 +50,22 @@ def beyond(search: SearchContext, found: Round) -> tuple[tuple[CandidateFit, flo
     if not isinstance(found.before.model, Model) or len(placed.candidate.at) > 1:
         return ()
     place, source, paths = placed.candidate.at, placed.candidate.source, found.answers()
-    jobs, formulas, shares = _jobs(found, paths, place[0], source)
+    jobs, shares = _jobs(found, paths, place[0], source)
     elsewhere = sum(c.effect == effect.name and len(c.at) == 1 for c in found.candidates)
     texts = [f"outside the catalogue: {job.placed[-1].use.expression} at {place[0]}" for job in jobs]
-    own = None
-    if is_linear(kind_of(placed.candidate, winner.pick.probe)):
-        sizes = winner.refit.sizes(placed)
-        own = found.shown(place, additions(effect.name, sizes, place, source, paths.values()))
+    linear = in_proportion(found.candidates[winner.pick.candidate], winner.pick.probe)
     weighed = []
-    for refit, formula, share in zip(done(search, jobs, texts), formulas, shares, strict=True):
+    for refit, share in zip(done(search, jobs, texts), shares, strict=True):
         if refit.failure:
             continue
-        same = own is not None and alike(own, found.shown(place, _added(formula, refit, paths)))
+        same = linear and alike(winner.refit, refit, found.before)
         trial = gained(CandidateFit(winner.pick, refit, 0.0), found.before, found.ruler)
         weighed.append((trial, 0.0 if same else share / elsewhere))
     return tuple(weighed)
 
 
-def _added(formula: Sequence[Term], refit: Refit, paths: Mapping[str, Path]) -> list[Array]:
-    """Return what a refitted formula adds to its slot along each run, (K,) each."""
-    sizes = refit.sizes(refit.placed[-1]).values()
-    terms = [at_runs(term, paths) for term in formula]
-    return [sum(k * run for k, run in zip(sizes, runs, strict=True)) for runs in zip(*terms, strict=True)]
-
-
-def _jobs(
-    found: Round, paths: Mapping[str, Path], place: str, source: str
-) -> tuple[list[RefitJob], list[list[Term]], list[float]]:
-    """Return for each form the refit and the terms of the formula that by regression leaves least, and its share of the form.
+def _jobs(found: Round, paths: Mapping[str, Pushed], place: str, source: str) -> tuple[list[RefitJob], list[float]]:
+    """Return for each form the refit of the formula that by regression leaves least, and its share of the form.
 
     Of formulas that are the same signal in these records the first is tried: of a signal above 0 the magnitude is itself.
     """
@@ -88,7 +76,7 @@ def _jobs(
         coefficients, gain = regressed.solved(formula)
         if coefficients.all():
             of_form.setdefault(tuple(library[k].form for k in formula), []).append((gain, formula, coefficients))
-    jobs, chosen, shares = [], [], []
+    jobs, shares = [], []
     shapes: list[tuple[int, list[Array]]] = []
     for members in of_form.values():
         _, formula, coefficients = max(members, key=lambda m: m[0])
@@ -99,19 +87,18 @@ def _jobs(
             jobs.append(formula_job(found.before, place, [library[k] for k in formula], coefficients))
         except ModelError:  # a formula that would close a loop through itself is none of this model
             continue
-        chosen.append([library[k] for k in formula])
         shapes.append((len(formula), shape))
         shares.append(1.0 / len(members))
-    return jobs, chosen, shares
+    return jobs, shares
 
 
 def _formulas(
-    found: Round, paths: Mapping[str, Path], place: str, source: str
+    found: Round, paths: Mapping[str, Pushed], place: str, source: str
 ) -> tuple[tuple[Term, ...], list[tuple[int, ...]]]:
     """A library, the slot's own signal first in it, and formulas as places in that: powers, magnitudes and products of the
     signal with what is brought in, or with any; each also beside a gain. None that an effect of the catalogue is."""
     own = place.removeprefix("outputs.")
-    others = (source,) if source else source_signals(found.before.model, slot_signals(found.before.model, paths))
+    others = (source,) if source else source_signals(found.before.model, found.signals)
     library = terms([own, *(s for s in others if s != own)])
     within = [t.form != "x" and (own in t.signals or source in t.signals) for t in library]
     stated = _stated(found, paths, place) if any(within) else []
@@ -124,7 +111,7 @@ def _formulas(
     return library, [*((k,) for k in near), *((k, 0) for k in near)]
 
 
-def _stated(found: Round, paths: Mapping[str, Path], place: str) -> list[list[Array]]:
+def _stated(found: Round, paths: Mapping[str, Pushed], place: str) -> list[list[Array]]:
     """By run what each effect of the catalogue that is one number times a function of signals adds at the place.
 
     A formula in proportion to one of them is that effect: a square of a signal is the loss by it.
@@ -134,6 +121,8 @@ def _stated(found: Round, paths: Mapping[str, Path], place: str) -> list[list[Ar
         if c.at != (place,):
             continue
         for k, probe in enumerate(c.probes):
-            if len(probe.free) == 1 and is_linear(kind_of(c, k)):
-                shapes.append(additions(c.effect, probe.values, c.at, c.source, paths.values()))
+            if len(probe.free) == 1 and in_proportion(c, k):
+                brought = [path.signal(c.source) if c.source else None for path in paths.values()]
+                own = [path.signal(place) for path in paths.values()]
+                shapes.append([added(c, probe, u, s) for u, s in zip(own, brought, strict=True)])
     return shapes

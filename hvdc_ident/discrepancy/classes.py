@@ -10,15 +10,15 @@ from typing import TypeVar
 
 import numpy as np
 
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.context import Round
-from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, at_edge, behinds, best_gain, best_of, evidence_between
+from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, at_edge, behinds, best_gain, evidence_between
 from hvdc_ident.discrepancy.implied import TIED, apart, implied, nearest, off_given
+from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import Hypothesis, Rival
 from hvdc_ident.discrepancy.search import SearchOutcome
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.signatures.finite import additions, alike, is_linear, kind_of
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 
@@ -74,24 +74,32 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
 
 
 def _akin(found: Round, group: Sequence[Rival], further: Sequence[Rival] = ()) -> list[str]:
-    """For each of both the first effect of the group before it that adds the same to the same signals, within the tolerance;
-    empty where none does.
+    """For each of both the first effect of the group before it that does the same at its place in these records, within the
+    tolerance; empty where none does.
 
     A dead band whose signal stays beyond its edge is an offset; so are, where a signal hardly moves, its gain error and
-    what is lost in proportion to it. Where the records do not show an offset, what differs by one is the same.
+    what is lost in proportion to it.
     """
     both = [*group, *further]
-    paths = found.answers().values() if len({r.effect for r in both if r.parameters}) > 1 else ()
-    signals = [
-        found.shown(r.at, additions(r.effect, r.parameters, r.at, r.source, paths)) if paths and r.parameters else None
-        for r in both
-    ]
+    refits = {
+        (
+            t.refit.placed[-1].candidate.effect,
+            t.refit.placed[-1].candidate.at,
+            t.refit.placed[-1].candidate.source,
+        ): t.refit
+        for t in found.trials
+    }
+    own = [refits.get((r.effect, r.at, r.source)) if r.refitted else None for r in both]
     akin = []
-    for k, (r, own) in enumerate(zip(both, signals, strict=True)):
+    for k, r in enumerate(both):
         earlier = (
             q.effect
-            for q, other in zip(group[:k], signals, strict=False)
-            if own is not None and other is not None and q.at == r.at and q.effect != r.effect and alike(own, other)
+            for q, other in zip(group[:k], own, strict=False)
+            if (one := own[k]) is not None
+            and other is not None
+            and q.at == r.at
+            and q.effect != r.effect
+            and alike(one, other, found.before)
         )
         akin.append(next(earlier, ""))
     return akin
@@ -140,19 +148,19 @@ def _rival(trial: CandidateFit, behind: float) -> Rival:
 
 
 def _unfitted(found: Round, best: float, options: DiagnosisOptions) -> list[Rival]:
-    """Candidates that were not refitted but, being linear in their size, gain what their score says."""
+    """Candidates that were not refitted but, being linear in their size, gain what their screen says."""
     assert found.ruler is not None
     done = {t.pick.candidate for t in (*found.trials, *found.failed)}
     group = []
-    for p in best_of(found.scores, found.candidates):
-        c = found.candidates[p.candidate]
-        if p.candidate in done or not is_linear(kind_of(c, p.probe)):
+    for k, shot in found.screen.best().items():
+        c = found.candidates[k]
+        if k in done or shot.probe >= len(c.probes) or not in_proportion(c, shot.probe):
             continue
-        probe = c.probes[p.probe]
-        behind = best - found.ruler.gain(p.score, 0.0, len(probe.free))
+        probe = c.probes[shot.probe]
+        behind = best - found.ruler.gain(shot.fall, 0.0, len(probe.free))
         if behind <= options.set_bic:
             only = dict(probe.values) if len(probe.free) == 1 else {}
-            sizes = FrozenMap({n: p.factor * v if n in probe.free else v for n, v in only.items()})
+            sizes = FrozenMap({n: shot.factor * v if n in probe.free else v for n, v in only.items()})
             group.append(Rival(c.effect, c.at, max(behind, 0.0), sizes, c.source, refitted=False))
     return group
 
@@ -178,10 +186,10 @@ def _equal(found: Round, group: Sequence[Rival], tries: Callable[[str], bool]) -
     known = [
         (r, other, equality) for r in group for other, equality in effects()[r.effect].equals.items() if tries(other)
     ]
-    paths = found.answers().values() if known else ()
     equal = []
     for r, other, equality in known:
-        brought = [p.signal(s) for p in paths for s in split_sources(r.source, r.at) if s in p.slots] or [np.empty(0)]
+        own = [s for s in split_sources(r.source, r.at) if s in found.signals]
+        brought = [u for s in own for u in found.signals[s]] or [np.empty(0)]
         told = [equality(r.parameters, signal) if r.parameters or not r.refitted else None for signal in brought]
         if all(t is not None for t in told):
             sizes = FrozenMap(told[0] or {})

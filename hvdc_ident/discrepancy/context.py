@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler
 from hvdc_ident.discrepancy.formula import Law
-from hvdc_ident.discrepancy.latent import Reach
 from hvdc_ident.discrepancy.options import DiagnosisOptions
-from hvdc_ident.discrepancy.placed import Placed
-from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.scores import Path, Scores, runs
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
+from hvdc_ident.discrepancy.pushes import Pushed, pushed
+from hvdc_ident.discrepancy.refit import Refit, signal
+from hvdc_ident.discrepancy.screen import Screen
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel
+from hvdc_ident.model import Model, insertion_point
+from hvdc_ident.simulate import ModelSimulator, simulate
 
 STEPS_AFTER = 60
 """Steps that the bar leaves room for behind those that are known: about what one more round of refits takes."""
@@ -109,75 +109,57 @@ class SearchContext:
 class Round:
     """Result of one round. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
 
-    trials: every refit, the best first. ruler: what BIC counts by. reach: what of the gap could be made good at each slot; None
-    where that is not known. laws: the formula outside the catalogue that explains most, or nothing; None where none was
-    looked for. filters: the refits of linear filters; None where there are none. untried: proposals that were not refitted
-    though nothing came near the noise.
+    signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: every refit,
+    the best first. ruler: what BIC counts by. laws: the formula outside the catalogue that explains most, or nothing; None
+    where none was looked for. filters: the refits of linear filters; None where there are none.
     """
 
     before: Refit
-    paths: Mapping[str, Path]
+    signals: Mapping[str, tuple[Array, ...]]
     candidates: tuple[CandidateEffect, ...]
-    scores: Scores
-    trials: tuple[CandidateFit, ...]
-    failed: tuple[CandidateFit, ...]
-    winner: CandidateFit | None
-    why: str
-    significant: bool
-    ruler: Ruler | None
-    reach: Reach | None = None
+    screen: Screen
+    trials: tuple[CandidateFit, ...] = ()
+    failed: tuple[CandidateFit, ...] = ()
+    winner: CandidateFit | None = None
+    why: str = ""
+    significant: bool = False
+    ruler: Ruler | None = None
     laws: tuple[Law, ...] | None = None
     filters: tuple[CandidateFit, ...] | None = None
-    untried: int = 0
 
     @property
     def law(self) -> Law | None:
         """The formula that leaves next to nothing but noise, where no effect that was refitted does."""
         return next((one for one in self.laws or () if one.near), None)
 
-    def reaches(self, candidate: CandidateEffect) -> bool:
-        """Return True for a candidate at a slot where enough of the gap could be explained."""
-        return self.reach is None or any(p in self.reach.enough for p in candidate.at)
-
-    def bound(self, candidate: CandidateEffect) -> float:
-        """The share of the gap that anything at the candidate's slots could explain; infinite where that is not known."""
-        return math.inf if self.reach is None else max(self.reach.shares.get(p, math.inf) for p in candidate.at)
-
-    def answers(self) -> Mapping[str, Path]:
-        """The model's answers at its slots, by experiment: computed again where the round has released them."""
-        return self.paths or runs(self.before.model, self.before.nominal())
-
-    def shown(self, at: tuple[str, ...], added: Sequence[Array]) -> Array:
-        """Return what the records show of additions to the signals of slots, (K,) each: all of it, one behind the other; less
-        their mean where an offset was looked for at the slots and none could be seen."""
-        whole = np.concatenate(added)
-        offsets = {i for i, c in enumerate(self.candidates) if c.effect == "offset" and c.at == at}
-        seen = {c.candidate for c, usable in zip(self.scores.columns, self.scores.usable, strict=True) if usable}
-        return whole - np.mean(whole) if offsets and not offsets & seen else whole
-
-    def light(self) -> Round:
-        """The round without those answers, which are hundreds of MiB of a large model."""
-        return replace(self, paths={})
-
-    def score_p(self, candidate: int) -> tuple[float, float, int]:
-        """The best score of a candidate, its p, and the column it stands in (-1: none)."""
-        t = self.scores.t
-        own = [k for k, c in enumerate(self.scores.columns) if c.candidate == candidate]
-        if not own:
-            return 0.0, 1.0, -1
-        k = max(own, key=lambda j: t[j])
-        return float(t[k]), self.scores.p(float(t[k])), k
+    def answers(self) -> Mapping[str, Pushed]:
+        """Return the model's runs with their answers to pushes, by experiment; none of a model that is closed inside."""
+        return pushed(self.before, self.signals) if isinstance(self.before.model, Model) else {}
 
 
-def slot_signals(
-    model: AnyModel, paths: Mapping[str, Path], placed: Sequence[Placed] = ()
-) -> dict[str, tuple[Array, ...]]:
-    """The signal at every slot of the model that all experiments have, one array an experiment.
+def slot_signals(before: Refit) -> dict[str, tuple[Array, ...]]:
+    """The signal at every slot of the model that all experiments have, one array an experiment, at its rows.
 
-    An instrument has slots of its own in the run of its experiment, which are none of the model's. placed: effects that
-    are in the model already; nothing is looked for inside them.
+    An instrument has slots of its own in the run of its experiment, which are none of the model's. Nothing is looked for
+    inside the effects that are in the model already.
     """
-    first, *others = (a.slots for a in paths.values())
-    common = [p for p in first if p in model.insertion_points and all(p in slots for slots in others)]
-    outer = [p for p in common if not any(one.use.made(p) for one in placed)]
-    return {p: tuple(a.signal(p) for a in paths.values()) for p in outer}
+    model, experiments = before.model, before.problem.fitted_experiments
+    slots = [p for p in model.insertion_points if not any(one.use.made(p) for one in before.placed)]
+    if not isinstance(model, Model):
+        inputs = {p: tuple(signal(before, p).values()) for p in slots if p in model.inputs}
+        outputs = [o for o in experiments[0].outputs if all(o in e.outputs for e in experiments)]
+        runs = [simulate(model, e.with_(measured=None), before.values, outputs=outputs) for e in experiments]
+        ends = {o if o not in model.inputs else f"outputs.{o}": o for o in outputs}
+        return inputs | {p: tuple(np.asarray(r[o]) for r in runs) for p, o in ends.items() if p in slots}
+    # Of outputs those that are recorded: an effect at another one is not seen.
+    recorded = {o for e in experiments for o in e.outputs}
+    kinds = {p: insertion_point(model, p) for p in slots}
+    kept = [p for p in slots if kinds[p][0] != "output" or kinds[p][1] in recorded]
+    names = list(dict.fromkeys(kinds[p][1] for p in kept))
+    tolerance = before.problem.simulator.tolerance if isinstance(before.problem.simulator, ModelSimulator) else None
+    found: dict[str, list[Array]] = {p: [] for p in kept}
+    for e in experiments:
+        run = simulate(model, e.with_(measured=None, instrument={}), before.values, outputs=names, tolerance=tolerance)
+        for p in kept:
+            found[p].append(np.asarray(run[kinds[p][1]]))
+    return {p: tuple(own) for p, own in found.items()}

@@ -12,14 +12,14 @@ import numpy as np
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.bode import responses
-from hvdc_ident.discrepancy.candidate_table import detectable, lines
+from hvdc_ident.discrepancy.candidate_table import lines
+from hvdc_ident.discrepancy.candidates import entries
 from hvdc_ident.discrepancy.classes import compared
 from hvdc_ident.discrepancy.clocks import clocks, told
-from hvdc_ident.discrepancy.context import Course, SearchContext
+from hvdc_ident.discrepancy.context import Course, Round, SearchContext
 from hvdc_ident.discrepancy.evidence import louder_than_noise
 from hvdc_ident.discrepancy.explain import at_given, beside_stand_ins, found_of, gap, off_given
 from hvdc_ident.discrepancy.findings import separating
-from hvdc_ident.discrepancy.latent import Reach
 from hvdc_ident.discrepancy.localise import localise
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import DiagnosisOptions
@@ -27,11 +27,11 @@ from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_foun
 from hvdc_ident.discrepancy.race import UNTRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.record_noise import LOUDER, QUIETER, OutputNoise
 from hvdc_ident.discrepancy.refit import Refit, judged
+from hvdc_ident.discrepancy.refitted import all_far
 from hvdc_ident.discrepancy.released import stated
 from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect, StandIn
 from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
-from hvdc_ident.discrepancy.signatures.candidates import entries
 from hvdc_ident.discrepancy.stand_ins import stand_ins
 from hvdc_ident.discrepancy.verdict import (
     Judgement,
@@ -58,8 +58,8 @@ CLOSED = (
 )
 
 UNTRIED = (
-    "No single effect came near the noise. {} proposals that promise less were not refitted; a thorough search does that "
-    "(thorough = true in [diagnose], and no budget)."
+    "No single effect came near the noise. {} candidates that promise less were not refitted; a thorough search refits more of "
+    "them (thorough = true in [diagnose])."
 )
 
 
@@ -120,11 +120,19 @@ def diagnose(
         other = fallback(search, outcome.rounds[0])
     if not inside:
         notes = (*notes, CLOSED)
-    if (untried := outcome.rounds[0].untried) and judgement.verdict != "named":
-        notes = (*notes, UNTRIED.format(untried))
+    if left := 0 if chosen.thorough else _left_out(first, outcome.rounds[0]):
+        notes = (*notes, UNTRIED.format(left))
     if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.rounds for t in r.failed):
         notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
+
+
+def _left_out(first: Refit, found: Round) -> int:
+    """Return how many candidates of a round were not refitted, where those that were leave more than anybody asks about; else 0."""
+    if not found.significant or not all_far(first, found.trials):
+        return 0
+    tried = {t.pick.candidate for t in (*found.trials, *found.failed)}
+    return len(set(found.screen.best()) - tried)
 
 
 def _model_of(subject: AnyModel | Simulator) -> AnyModel:
@@ -195,7 +203,7 @@ def _assembled(
     if louder := contradiction(model, first.noise, LOUDER):
         text = f"{text} {louder}"
     notes = (*notes, *filter(None, [contradiction(model, first.noise, QUIETER)]))
-    left, bound = judgement.remainder, outcome.rounds[0].reach
+    left = judgement.remainder
     return Diagnosis(
         verdict=judgement.verdict,
         text=text if other is None else f"{text} {other.text}",
@@ -203,8 +211,7 @@ def _assembled(
         ambiguity=sets,
         separating_experiment=separating(sets, {o for e in last.problem.experiments for o in e.outputs}) or judgement.experiment,
         candidates=lines(outcome),
-        location=localise(model if isinstance(model, Model) else None, first.nominal(), outcome.rounds[0].reach),
-        detectable=detectable(outcome, search.options),
+        location=localise(first.nominal()),
         gap=gap(given, first, last),
         remaining=rest,
         beyond_noise=beyond,
@@ -220,7 +227,6 @@ def _assembled(
         findings=findings,
         remainder={} if left is None else plain(left) | {"below_tolerance": left.below_tolerance},
         hypotheses=compared(first, outcome),
-        latent={} if bound is None else _latent(bound),
         values_by_place=FrozenMap(depend),
         stand_ins=others,
     )  # fmt: skip
@@ -249,15 +255,6 @@ def contradiction(model: AnyModel, noise: Mapping[str, OutputNoise], how: str) -
     return f"The records before the event are less noisy than was stated; the stated noise was used: {', '.join(each)}."
 
 
-def _latent(bound: Reach) -> dict[str, Any]:
-    """By insertion point the bound on the share that any effect there could explain, and at the best the course of what is missing."""
-    curves = {
-        place: {experiment: {"time": c[0], "value": c[1]} for experiment, c in courses.items()}
-        for place, courses in bound.curves.items()
-    }
-    return {p: {"bound": share, "curve": plain(curves.get(p, {}))} for p, share in bound.shares.items()}
-
-
 def _own(refit: Refit) -> dict[str, float]:
     """The estimated values, inside the model's own bounds to the last digit."""
     known = refit.model.parameters
@@ -268,7 +265,7 @@ def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: Sear
     """Return the remaining residual: a test against noise, the explained share, and where it lies."""
     rest: Nominal = last.nominal()
     excess, left = first.chi2 - first.rows, max(last.chi2 - last.rows, 0.0)
-    place = localise(None, rest)
+    place = localise(rest)
     worst = min(tests, key=lambda b: b.p, default=None)
     return {
         "adequate": worst is None or worst.p > 0.05 / max(len(tests), 1),

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.discrepancy.options import SURE, DiagnosisOptions
+from hvdc_ident.discrepancy.options import SURE, TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.record_noise import freedom_of
 from hvdc_ident.discrepancy.refit import Refit, held_out, held_out_by_record, unseen
-from hvdc_ident.discrepancy.scores import Scores
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import effects
 from hvdc_ident.text import figures, percentage
 
@@ -24,19 +22,12 @@ CLEAR = 2.0
 
 @dataclass(frozen=True)
 class Pick:
-    """A candidate to refit: its best probe, the size asked for in units of the probe's, and its score.
-
-    gains: unknowns of the model before that go with this size, where they are known. fall: by how much chi2 is expected to fall.
-    swept: whether the refit looks at many sizes before it begins, for a bend far from its own level leaves no slope.
-    """
+    """A candidate to refit: the probe it begins at, the size asked for in units of the probe's, and the fall of chi2 expected."""
 
     candidate: int
     probe: int
     factor: float
-    score: float
-    gains: tuple[float, ...] = ()
-    fall: float = 0.0
-    swept: bool = False
+    fall: float
 
 
 @dataclass(frozen=True)
@@ -71,28 +62,6 @@ def best_gain(trials: Sequence[CandidateFit]) -> float:
     """The largest gain of those that the held-out data do not speak clearly against."""
     told = max((t.told for t in trials), default=0.0)
     return max((t.gain for t in trials if told - t.told < CLEARLY), default=0.0)
-
-
-def best_of(scores: Scores, found: Sequence[CandidateEffect]) -> tuple[Pick, ...]:
-    """Each candidate at its best size, by falling score."""
-    t, expected = scores.t, scores.expected
-    best: dict[int, int] = {}
-    for k, column in enumerate(scores.columns):
-        c = column.candidate
-        if t[k] > 0 and (c not in best or t[k] > t[best[c]]):
-            best[c] = k
-    picks = [
-        # The size of an effect that is scanned is met or it is not.
-        Pick(
-            c,
-            scores.columns[k].probe,
-            1.0 if effects()[found[c].effect].needs_grid else float(expected[k]),
-            float(t[k]),
-        )
-        for c, k in best.items()
-    ]
-    # Of equal scores the simpler: fewer places first, as listed.
-    return tuple(sorted(picks, key=lambda p: (-round(p.score, 6), len(found[p.candidate].at), p.candidate)))
 
 
 @dataclass(frozen=True)
@@ -226,6 +195,15 @@ def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> fl
         return fitted
     share = ruler.effective / ruler.rows / ruler.scale
     return fitted + share * (was**2 - now**2) * unseen_rows(after)
+
+
+def alike(one: Refit, other: Refit, before: Refit) -> bool:
+    """Return True for two hypotheses whose answers differ, in the fitted records, by less than the tolerance: that share of the
+    square of what the effects do beside the model without them."""
+    was, a, b = (
+        np.concatenate([x.residual for x in r.problem.blocks(r.theta, derivatives=False)]) for r in (before, one, other)
+    )
+    return bool(np.sum((a - b) ** 2) <= TOLERANCE * max(np.sum((was - a) ** 2), np.sum((was - b) ** 2)))
 
 
 def speaks_against(before: Refit, after: Refit) -> str:

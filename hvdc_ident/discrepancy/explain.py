@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.refit import Refit, held_out, unseen
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, StandIn, Table
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem

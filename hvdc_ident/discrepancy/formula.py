@@ -9,10 +9,10 @@ from itertools import pairwise
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.placed import Placed
+from hvdc_ident.discrepancy.pushes import Pushed
 from hvdc_ident.discrepancy.refit import Refit, RefitJob
-from hvdc_ident.discrepancy.scores import Path
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
@@ -143,11 +143,11 @@ def filled(text: str, sizes: Mapping[str, float]) -> str:
     return text.replace("+ -", "- ")
 
 
-def at_run(term: Term) -> Callable[[str, Path], Array]:
+def at_run(term: Term) -> Callable[[str, Pushed], Array]:
     """The term along an experiment's run, as a regression takes it."""
     return lambda _, path: along(term, path.time, path.values)
 
 
-def at_runs(term: Term, paths: Mapping[str, Path]) -> list[Array]:
+def at_runs(term: Term, paths: Mapping[str, Pushed]) -> list[Array]:
     """The term along every run, (K,) each."""
     return [along(term, path.time, path.values) for path in paths.values()]

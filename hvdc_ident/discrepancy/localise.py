@@ -1,4 +1,4 @@
-"""Where model and data differ: by output, experiment, time, frequency, region, and block by block."""
+"""Where model and data differ: by output, experiment, time, frequency and region."""
 
 from __future__ import annotations
 
@@ -7,27 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import Array, Experiment, InputSignal
-from hvdc_ident.discrepancy.latent import Reach
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.fit.simulator import observe
-from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model, insertion_point
-from hvdc_ident.simulate import ModelSimulator, Tolerance
 
 MOST_OF = 0.8
 """Share of the gap that a time window, a band or a region has to hold."""
 SEGMENTS = 6
-ROUGH = Tolerance(rtol=1e-4, atol=1e-6)
-"""Of runs driven by records: every row of noise is a corner, and where a gap lies takes no more digits."""
 
 
-def localise(model: Model | None, nominal: Nominal, reach: Reach | None = None) -> dict[str, Any]:
-    """Shares of the gap beyond noise, by what it can be sorted by. model: for the blocks, where there are equations.
-
-    slots: what of the gap could be made good at each, from `reach`; none where that is not known.
-    """
+def localise(nominal: Nominal) -> dict[str, Any]:
+    """Shares of the gap beyond noise, by what it can be sorted by."""
     power = {(b.experiment, b.output): b.chi2 - b.residual.size for b in nominal.blocks}
     return {
         "outputs": _shares(power, 1),
@@ -36,8 +25,6 @@ def localise(model: Model | None, nominal: Nominal, reach: Reach | None = None) 
         "phases": _phases(nominal),
         "band_hz": _band(nominal),
         "region": _region(nominal),
-        "blocks": _blocks(model, nominal) if model is not None else [],
-        "slots": {} if reach is None else dict(reach.shares),
     }
 
 
@@ -167,54 +154,3 @@ def _smooth(v: Array) -> Array:
     if v.size < 5:
         return v
     return np.convolve(np.pad(v, 2, mode="edge"), np.ones(5) / 5.0, "valid")
-
-
-def _blocks(model: Model, nominal: Nominal) -> list[dict[str, Any]]:
-    """Each recorded output with the other recorded signals played in: what its own part of the model leaves.
-
-    Noise enters with the records, and in a closed loop it is correlated with them: this locates, it does not name.
-    """
-    found = []
-    for output in nominal.problem.outputs:
-        total, rows, why = 0.0, 0, ""
-        driven: tuple[str, ...] = ()
-        for e in nominal.problem.fitted_experiments:
-            if output not in e.outputs:
-                continue
-            driven = tuple(o for o in e.outputs if o != output and _is_inner(model, o) and o not in e.drive)
-            if not driven:
-                why = "no other signal of the model is recorded"
-                continue
-            inputs = {o: InputSignal(*_even(e, o), np.empty(0)) for o in driven}
-            played = e.with_(inputs=FrozenMap({**e.inputs, **inputs}), drive=(*e.drive, *driven), instrument={})
-            try:
-                seen = observe(ModelSimulator(model, ROUGH), played, nominal.values)
-            except HvdcIdentError as error:
-                why = str(error)
-                continue
-            keep = e.compared & np.isfinite(_raw(e, output))
-            r = (_raw(e, output) - seen.values[output])[keep] / nominal.problem.sigma[e.name][output]
-            total, rows = total + float(r @ r), rows + r.size
-        line: dict[str, Any] = {"output": output, "driven": list(driven)}
-        line |= {"rms_in_noise": float(np.sqrt(total / rows))} if rows else {"rms_in_noise": None, "reason": why}
-        found.append(line)
-    return sorted(found, key=lambda b: -(b["rms_in_noise"] or 0.0))
-
-
-def _raw(e: Experiment, output: str) -> Array:
-    assert e.measured is not None
-    return e.measured[output]
-
-
-def _even(e: Experiment, output: str) -> tuple[Array, Array]:
-    """The record as a signal: finite rows, at most two at one instant."""
-    v = _raw(e, output)
-    keep = np.isfinite(v)
-    keep[2:] &= ~((e.time[2:] == e.time[1:-1]) & (e.time[1:-1] == e.time[:-2]))
-    return e.time[keep], v[keep]
-
-
-def _is_inner(model: Model, name: str) -> bool:
-    """Return True where a recorded output is a signal of the model, not a mere output or an input."""
-    inner = name in model.signals or name in model.algebraic or name in model.states
-    return inner and insertion_point(model, name)[0] != "input"

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.data import Array, Experiment
+from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.discrepancy.record_noise import GIVEN, OutputNoise, draws, noise_of, stated_by
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor
@@ -25,6 +25,9 @@ from hvdc_ident.sensitivity import independent, null_directions
 
 NEAR = 0.05
 """Share of the rows' interval: a row this near to a jump of an input lies on it."""
+ROWS, ALONE = 300, 20
+"""Rows of a thinned record, about, and those behind a break of an input that stay as they are: a search looks at thousands of runs,
+and what it ranks moves over many rows."""
 F = TypeVar("F", bound=np.floating)
 
 
@@ -112,6 +115,59 @@ def orthonormal(columns: Array) -> Array:
         return unit
     u, s, _ = np.linalg.svd(unit, full_matrices=False)
     return np.asarray(u[:, s > 1e-7 * s[0]])
+
+
+def thinned(nominal: Nominal) -> Nominal:
+    """Return the model at its optimum against means over neighbouring rows, about `ROWS` of each record; as it is where noise is
+    coloured, or a record is no course over time.
+
+    Behind each break of an input, where things are quick, every row stays. What a mean over rows bends is taken from the
+    model's own run, so that the residual is exactly the mean of the rows' residuals; white noise keeps its information.
+    """
+    problem = nominal.problem
+    plain = all(e.domain == "time" and not e.nuisance for e in problem.fitted_experiments)
+    if problem.rho or problem.band is not None or not plain:
+        return nominal
+    blocks: dict[str, list[tuple[ResidualBlock, Array]]] = {}
+    for b, run in zip(nominal.blocks, nominal.fitted(), strict=True):
+        blocks.setdefault(b.experiment, []).append((b, run))
+    fewer = tuple(_means(e, blocks[e.name]) for e in problem.fitted_experiments)
+    # Means of rounded rows are no levels any more.
+    noise = FrozenMap({o: replace(n, step=0.0) for o, n in nominal.noise.items()})
+    return Nominal(replace(problem, experiments=fewer, quantised_noise=FrozenMap()), nominal.theta, noise)
+
+
+def _means(experiment: Experiment, blocks: Sequence[tuple[ResidualBlock, Array]]) -> Experiment:
+    """Return an experiment whose rows are means over the compared rows of its outputs. blocks: with the model's run at their rows."""
+    time, count = experiment.time, experiment.time.size
+    width = -(-count // ROWS)
+    breaks = np.unique(np.concatenate([time[:1], *(s.breaks for s in experiment.inputs.values())]))
+    first = np.searchsorted(time, breaks[breaks <= time[-1]])
+    if width == 1 or first.size * ALONE > ROWS:  # few rows; or an input that was recorded, with a corner at each
+        return experiment
+    behind = np.arange(count) - first[np.searchsorted(first, np.arange(count), "right") - 1]
+    begins = np.zeros(count, dtype=bool)
+    begins[first] = True
+    begins |= (behind < ALONE) | ((behind - ALONE) % width == 0)
+    group = np.cumsum(begins) - 1
+    edges = np.append(np.flatnonzero(begins), count)
+    middle = (edges[:-1] + edges[1:] - 1) // 2
+    values = np.full((middle.size, len(blocks)), np.nan)
+    profile = {}
+    for k, (b, run) in enumerate(blocks):
+        weight = 1.0 if b.profile is None else b.profile**-2.0
+        total = np.bincount(group[b.rows], weights=np.broadcast_to(weight, b.rows.shape), minlength=middle.size)
+        left = np.bincount(group[b.rows], weights=weight * b.misfit, minlength=middle.size)
+        own = np.interp(time[middle], time[b.rows], run)
+        values[:, k] = np.where(total > 0, own + left / np.where(total > 0, total, 1.0), np.nan)
+        profile[b.output] = np.where(total > 0, total, 1.0) ** -0.5
+    assert experiment.measured is not None
+    names = tuple(b.output for b, _ in blocks)
+    units = tuple(experiment.measured.unit(n) for n in names)
+    measured = Trajectory(time[middle], values, names, units)
+    return experiment.with_(
+        time=time[middle], measured=measured, noise_profile=FrozenMap(profile), noise=experiment.noise, window=None
+    )
 
 
 def nominal(

@@ -32,7 +32,7 @@ class DiagnosisOptions:
     holdout_share: the held-out gap has to shrink by more than this share of the noise.
     starts: runs of the nominal multistart.
     fallback: search for a form outside the catalogue.
-    thorough: refit candidates, too, whose scores tell little, where no other comes near the noise.
+    thorough: refit four times as many candidates of each effect.
     budget: seconds after which nothing further is looked for; None: no limit.
 
     Declared nuisances are estimated with the parameters; a start state is one where the card leaves it free.

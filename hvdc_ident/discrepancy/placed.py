@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
+from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
@@ -28,13 +28,17 @@ ROOM = 3.0
 
 @dataclass(frozen=True)
 class Placed:
-    """An effect in a model: its candidate, its use, and by its own parameter names those of the model."""
+    """An effect in a model: its candidate, its use, and by its own parameter names those of the model.
+
+    movable: whether its place is chosen at run time, so that its use is none of the model's own.
+    """
 
     candidate: CandidateEffect
     use: EffectUse
     names: FrozenMap[str]
     bounds: FrozenMap[tuple[float, float]]
     start: FrozenMap[float]
+    movable: bool = False
 
 
 def added(
@@ -108,7 +112,7 @@ def reaching(candidate: CandidateEffect, probe: int, factor: float) -> Candidate
     What a slot carries by itself is no measure of what is added there: a friction that hardly moves may be kicked hard.
     """
     chosen, entry = candidate.probes[probe], effects()[candidate.effect]
-    if not np.isfinite(factor) or abs(factor) <= 1.0 or not is_linear(kind_of(candidate, probe)):
+    if not np.isfinite(factor) or abs(factor) <= 1.0 or not in_proportion(candidate, probe):
         return candidate
     free = dict(chosen.free)
     for n in (n for n in free if entry.parameters[n].neutral == 0.0):
@@ -123,7 +127,7 @@ def moved(candidate: CandidateEffect, probe: int, factor: float) -> dict[str, fl
     """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant."""
     values, free = candidate.probes[probe].values, candidate.probes[probe].free
     entry, found = effects()[candidate.effect], dict(values)
-    most = EXACT if is_linear(kind_of(candidate, probe)) else FAR
+    most = EXACT if in_proportion(candidate, probe) else FAR
     size = float(np.clip(abs(factor), 1.0 / most, most)) if np.isfinite(factor) and factor else 1.0
     if factor < 0 and "phase" in found:
         found["phase"] += np.pi if found["phase"] <= 0 else -np.pi

@@ -12,8 +12,7 @@ from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out, orthonormal
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.record_noise import OutputNoise
-from hvdc_ident.discrepancy.size_line import BENT, SizeLine
-from hvdc_ident.effects import SMALLEST, distance_from_neutral, effects
+from hvdc_ident.effects import distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
@@ -40,8 +39,7 @@ class RefitJob:
     """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start).
 
     evaluations: of each start at most. spare: starts that are tried, one after the other, where none of the others runs.
-    swept: the size of which many are looked at beside each start, empty where it begins as given: each start has then one more,
-    at the size that leaves least.
+    judged: whether its end is judged on data that it has not seen.
     """
 
     model: AnyModel
@@ -51,7 +49,7 @@ class RefitJob:
     noise: FrozenMap[OutputNoise]
     evaluations: int = METHOD.max_evaluations
     spare: tuple[Array, ...] = ()
-    swept: str = ""
+    judged: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +174,8 @@ def run(job: RefitJob) -> Refit:
         return Refit(job.model, job.placed, job.problem, job.noise, job.begins[0], failure=end.message)
     ended = scanned or end.status != "max-evaluations"
     best = Refit(job.model, job.placed, job.problem, job.noise, end.theta, 2.0 * end.cost, ended=ended)
+    if not job.judged:
+        return best
     try:
         return judged(best)
     except FAILURES as error:
@@ -184,7 +184,7 @@ def run(job: RefitJob) -> Refit:
 
 def _best_walk(job: RefitJob, most: int) -> OptimiserResult:
     """The end of a walk of so many evaluations from the start whose first steps come lowest; a failed one where none runs."""
-    starts = _apart([*job.begins, *(_swept(job, b) for b in job.begins if job.swept)])
+    starts = _apart(job.begins)
     glance = most if len(starts) == 1 else min(GLANCE, most)
     walks = [_walk(job.problem, begin, glance) for begin in starts]
     best = min(walks, key=_cost)
@@ -196,20 +196,6 @@ def _best_walk(job: RefitJob, most: int) -> OptimiserResult:
         return best
     further = _walk(job.problem, best.theta, most - glance)
     return further if _cost(further) <= _cost(best) else best
-
-
-def _swept(job: RefitJob, begin: Array) -> Array:
-    """The start with the size that leaves least, the others' answer to first order; as it is where the model does not run there."""
-    at = job.problem.names.index(job.swept)
-    unknown = job.problem.unknowns[at]
-    try:
-        line = SizeLine.of(job.model, job.problem, begin, at)
-    except FAILURES:
-        return begin
-    sizes = np.geomspace(max(unknown.min, SMALLEST * unknown.max), unknown.max, BENT)
-    best = begin.copy()
-    best[at] = sizes[np.argmin([line.fitted(s) for s in sizes])]
-    return best
 
 
 def _walk(problem: Problem, begin: Array, evaluations: int) -> OptimiserResult:

@@ -1,81 +1,101 @@
-"""Refits to be done: a model, and the effects that picked candidates would add to it."""
+"""Refits to be done: a model, and the effects that candidates would add to it."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.evidence import Pick
-from hvdc_ident.discrepancy.placed import PATIENCE, Placed, added, begins_anywhere, moved
+from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.movable import Movable
+from hvdc_ident.discrepancy.placed import PATIENCE, Placed, added, begins_anywhere, moved, reaching
 from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, run
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.signatures.finite import is_linear, kind_of
-from hvdc_ident.effects import apply_effects
+from hvdc_ident.effects import Probe, apply_effects, effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator
+
+
+def job(
+    before: Refit,
+    candidate: CandidateEffect,
+    probe: int,
+    factor: float,
+    theta: Array,
+    movable: Movable | None = None,
+) -> RefitJob:
+    """Return the refit of a model with one more effect, at a probe times a factor, begun beside the unknowns `theta`.
+
+    movable: the model with an effect of this form that can be moved, where there is one; else the effect is put in.
+    Raises ModelError where the effect cannot sit there.
+    """
+    k = len(before.problem.free)
+    if movable is None:
+        model, problem, placed, sizes = added(before.model, before.problem, candidate, probe, factor)
+    else:
+        candidate = reaching(candidate, probe, factor)
+        values, chosen = moved(candidate, probe, factor), candidate.probes[probe]
+        model = movable.model
+        known = before.values
+        named = {n: known.get(p, model.parameters[p].value) for n, p in candidate.named.items()}
+        names = {n: name for n, name in movable.names.items() if n not in candidate.named}
+        bounds = {n: b for n, b in chosen.free.items() if n in names}
+        free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
+        weights = movable.placed(candidate) | movable.sized({**values, **named})
+        held = {n: v for n, v in weights.items() if n not in {f.name for f in free}}
+        use = candidate.use(replace(chosen, values=FrozenMap(values)))
+        entry = effects()[candidate.effect]
+        anywhere = before.problem.free_initial_states or entry.self_exciting
+        if entry.holds and not anywhere:
+            anywhere = begins_anywhere(apply_effects(before.model, [use]), before.model, [use])
+        problem = replace(
+            before.problem,
+            simulator=ModelSimulator(model, PATIENCE, "rosenbrock"),
+            free=(*before.problem.free, *free),
+            held=before.problem.held | held,
+            free_initial_states=anywhere,
+        )
+        placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values), movable=True)
+        sizes = np.array([f.start for f in free])
+    begin = np.concatenate([theta[:k], sizes, theta[k:]])
+    return RefitJob(model, (*before.placed, placed), problem, (begin,), before.noise)
+
 
 BIASED = 0.4
 """Share of its given value by which a gain has moved when it may have taken an effect's place."""
 
 
-def job(
-    before: Refit, found: Sequence[CandidateEffect], picks: Sequence[Pick], made: dict[Hashable, AnyModel] | None = None
-) -> RefitJob:
-    """The refit of a model with some more effects, from where their scores put them.
-
-    Gains that have taken an effect's place hold the refit where they are: where one has moved far, or stands on a bound,
-    another start is with the gains as they were given. A single effect, too, begins a second time where the score asks for a
-    size far from the one probed, and is not right at every size; where a model does not run at its size, it begins at the
-    next of those probed. made: models with the first of the picks, which may be used again, and are added to.
-    Raises ModelError where an effect cannot sit there.
-    """
-    model, problem, placed, sizes = before.model, before.problem, list(before.placed), []
-    for n, p in enumerate(picks):
-        model, problem, one, start = added(
-            model, problem, found[p.candidate], p.probe, p.factor, made if n == 0 else None
-        )
-        placed.append(one)
-        sizes.append(start)
-    asked = np.concatenate(sizes)
-    begins = [_begin(before, np.array(p.gains), asked) for p in picks[:1] if p.gains]
-    begins.append(_begin(before, before.theta, asked))
-    only = found[picks[0].candidate]
-    exact = is_linear(kind_of(only, picks[0].probe))
-    if len(picks) == 1 and not exact and not 0.5 <= abs(picks[0].factor) <= 2.0:
-        at = moved(only, picks[0].probe, float(np.sign(picks[0].factor)) or 1.0)
-        begins.append(_begin(before, before.theta, np.array([at[n] for n in placed[-1].bounds])))
-    if (given := as_given(before)) is not None:
-        begins.append(_begin(before, given, asked))
-    spare = [] if exact or len(picks) > 1 else [_begin(before, before.theta, s) for s in _sizes(only, placed[-1])]
-    swept = placed[-1].names[next(iter(placed[-1].bounds))] if picks[0].swept else ""
-    return RefitJob(model, tuple(placed), problem, tuple(begins), before.noise, spare=tuple(spare), swept=swept)
-
-
-def _sizes(candidate: CandidateEffect, placed: Placed) -> list[Array]:
-    """Of a candidate's probes that have the same parameters free, and lie within their bounds, the values of these."""
-    bounds = placed.bounds
-    alike = [p.values for p in candidate.probes if set(p.free) == set(bounds)]
-    return [np.array([v[n] for n in bounds]) for v in alike if all(b[0] < v[n] < b[1] for n, b in bounds.items())]
-
-
-def _begin(before: Refit, theta: Array, sizes: Array) -> Array:
-    k = len(before.problem.free)
-    return np.concatenate([theta[:k], sizes, theta[k:]])
+def moved_far(refit: Refit) -> bool:
+    """Return True where a gain has moved so far, or stands on a bound, that it may have taken an effect's place."""
+    gains = ((refit.problem.free[k], float(refit.theta[k])) for k in refit.gains)
+    return any(abs(value - f.given) > BIASED * abs(f.given) or f.on_bound(value) for f, value in gains)
 
 
 def as_given(refit: Refit) -> Array | None:
-    """The unknowns with the gains at their given values, as near as the bounds let; None where none of them has moved far."""
-    theta, far = refit.theta_at_given, False
+    """The unknowns with the gains at their given values, as near as the bounds let; None where they are there already."""
+    theta = refit.theta_at_given
     for k in refit.gains:
-        f, value = refit.problem.free[k], refit.theta[k]
-        far = far or abs(value - f.given) > BIASED * abs(f.given) or f.on_bound(value)
-        theta[k] = min(max(f.given, f.min), f.max)
-    return theta if far else None
+        f = refit.problem.free[k]
+        theta[k] = min(max(theta[k], f.min), f.max)
+    return None if np.array_equal(theta, refit.theta) else theta
+
+
+def in_place(before: Refit, trial: Refit) -> Refit:
+    """Return a refit with its last effect put into the model `before` for good, refitted from there; a failure is told."""
+    placed = trial.placed[-1]
+    if not placed.movable:
+        return trial
+    sizes = FrozenMap(trial.sizes(placed))
+    probe = Probe(placed.candidate.effect, sizes, placed.bounds)
+    try:
+        only = replace(placed.candidate, probes=(probe,))
+        found = run(replace(job(before, only, 0, 1.0, before.theta), begins=(trial.theta,)))
+    except FAILURES as error:
+        return replace(trial, failure=str(error))
+    candidate = replace(found.placed[-1].candidate, probes=placed.candidate.probes)
+    return replace(found, placed=(*found.placed[:-1], replace(found.placed[-1], candidate=candidate)))
 
 
 def refit_again(first: Refit, here: Refit, placed: Sequence[Placed]) -> Refit:

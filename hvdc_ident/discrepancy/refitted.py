@@ -1,23 +1,17 @@
-"""Candidates refitted, in a race with each other, and how good what they come to is."""
+"""How good what refits come to is."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 
-from hvdc_ident.discrepancy.context import Round, SearchContext
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, level_error, unseen_rows
+from hvdc_ident.discrepancy.evidence import CandidateFit, level_error, unseen_rows
+from hvdc_ident.discrepancy.implied import TIED, off_given
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import SURE
-from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, failed_at, unseen
-from hvdc_ident.discrepancy.refit_jobs import job
+from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.residual_checks import loud_after_breaks, residual_tests
-from hvdc_ident.discrepancy.size_profile import hopped
-from hvdc_ident.effects import effects
-from hvdc_ident.model import AnyModel
 
 PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
@@ -31,74 +25,8 @@ FAINT = 0.1
 """Correlation of neighbours up to which nothing is made of it: records that stand still are rounded alike."""
 LOOKED_AT = 3
 """Of the refits the best, of which this is asked."""
-AGAIN = 4
-"""Refits of one effect at most whose size is looked for again beside the gains they came to."""
-WORTHY = 0.5
-"""Share of the best fall of chi2 from which that is worth its time."""
 TELLING = 0.1
 """Share of what the model before leaves beyond noise from which it is: noise that is louder than was told leaves falls too."""
-
-
-def refitted(
-    search: SearchContext,
-    opened: Round,
-    picks: Sequence[Pick],
-    text: str,
-    earlier: Sequence[CandidateFit] = (),
-) -> list[CandidateFit]:
-    """The picks refitted in a race with each other and with those refitted earlier."""
-    before, found = opened.before, opened.candidates
-    jobs, of, trials = [], [], []
-    made: dict[Hashable, AnyModel] = {}
-    for p in picks:
-        try:
-            jobs.append(job(before, found, [p], made))
-            of.append(p)
-        except FAILURES as error:
-            trials.append(CandidateFit(p, failed_at(before, str(error) or type(error).__name__), -np.inf))
-    texts = [f"{text}: {found[p.candidate].label}" for p in of]
-    best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
-    refits = Race().run(search, before.chi2, jobs, texts, best)
-    if sound := [r for r in refits if not r.failure]:
-        search.lead(min(sound, key=lambda r: r.chi2))
-    return [*trials, *(CandidateFit(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
-
-
-def once_more(
-    search: SearchContext,
-    opened: Round,
-    trials: Sequence[CandidateFit],
-    text: str,
-) -> list[CandidateFit]:
-    """The trials, with another size where one is found beside the gains that a refit came to.
-
-    Those far behind the best are left as they are. Of each effect the best comes first, and the others where still nothing comes
-    near the noise.
-    """
-    found, was = opened.candidates, opened.before.chi2
-    order = by_cost(trials)
-    goal = max(WORTHY * (was - min((t.refit.chi2 for t in order), default=was)), telling(opened.before))
-    chosen: dict[str, list[CandidateFit]] = {}
-    for t in sorted(order, key=lambda t: t.refit.chi2):
-        effect = found[t.pick.candidate].effect
-        if effects()[effect].needs_grid and was - t.refit.chi2 >= goal and len(chosen.setdefault(effect, [])) < AGAIN:
-            chosen[effect].append(t)
-    kept = list(trials)
-    for heat in ([group[:1] for group in chosen.values()], [group[1:] for group in chosen.values()]):
-        kept = _resized(search, opened, kept, [t for group in heat for t in group], text)
-        if not all_far(opened.before, kept):
-            break
-    return kept
-
-
-def _resized(
-    search: SearchContext, opened: Round, trials: Sequence[CandidateFit], again: Sequence[CandidateFit], text: str
-) -> list[CandidateFit]:
-    """The trials, some of them with another size where one is found."""
-    jobs = [RefitJob(t.refit.model, t.refit.placed, t.refit.problem, (t.refit.theta,), t.refit.noise) for t in again]
-    refits = hopped(search, jobs, [f"{text}: {opened.candidates[t.pick.candidate].label}" for t in again])
-    better = {id(t): replace(t, refit=r) for t, r in zip(again, refits, strict=True) if not r.failure}
-    return [better.get(id(t), t) for t in trials]
 
 
 def telling(before: Refit) -> float:
@@ -107,12 +35,17 @@ def telling(before: Refit) -> float:
 
 
 def best_each(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
-    """Of the trials of each candidate the best, in their order."""
+    """Of the trials of each candidate the best, in their order; of those that are as good the one with the values nearest to the
+    given ones."""
     kept: dict[int, CandidateFit] = {}
     for t in trials:
         had = kept.get(t.pick.candidate)
-        if had is None or had.refit.failure or (not t.refit.failure and cost_of(t) < cost_of(had)):
+        if had is None or had.refit.failure:
             kept[t.pick.candidate] = t
+        elif not t.refit.failure:
+            first, other = sorted((had, t), key=cost_of)
+            tied = cost_of(other) - cost_of(first) <= TIED and off_given(other.refit) < off_given(first.refit)
+            kept[t.pick.candidate] = other if tied else first
     return list(kept.values())
 
 

@@ -11,7 +11,7 @@ Young, 1993 (the largest of several statistics under noise).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,15 +25,17 @@ from hvdc_ident.discrepancy.evidence import unseen_rows
 from hvdc_ident.discrepancy.latent import Inversion
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE
+from hvdc_ident.discrepancy.pushes import Pushed, pushed
 from hvdc_ident.discrepancy.record_noise import draws, freedom_of
 from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
 from hvdc_ident.discrepancy.refitted import left_by
-from hvdc_ident.discrepancy.scores import runs
-from hvdc_ident.discrepancy.signatures.response import Along, alone
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.executor import Made, mapped
+from hvdc_ident.executor import mapped
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import Model
 
+ALIKE = 1e-5
+"""Of one less the cosine between two answers that are in proportion: runs tell them to a few parts in a thousand."""
 NOISE_SHARE, RANGE_SHARE = 0.1, 0.01
 """Of an output's noise, and of its range: an error below the larger is of no interest where the study says nothing else."""
 
@@ -83,12 +85,11 @@ def is_small(search: SearchContext, first: Refit, last: Refit) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class _LatentJob:
-    """One insertion point's share of the work; noise: (N, B) records of noise, projected, or None."""
+    """One insertion point's share of the work."""
 
     nominal: Nominal
-    paths: Mapping[str, Along]
+    paths: Mapping[str, Pushed]
     place: str
-    noise: NDArray[np.float32] | None
 
 
 def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float) -> Remainder:
@@ -152,42 +153,56 @@ def _beyond(tolerance: Mapping[str, float], last: Refit, floor: float) -> Frozen
 def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     """The remainder with the test for a latent input; as it is for a model that is closed inside, or cannot be linearised."""
     nominal = last.nominal()
+    if not isinstance(last.model, Model):
+        return found
     try:
-        paths = runs(last.model, nominal)
+        signals = slot_signals(last)
+        paths = pushed(last, signals)
     except SimulationError:
         return found
-    inner = {n: p for n, p in paths.items() if isinstance(p, Along)}
-    if len(inner) < len(paths):
-        return found
-    places = list(slot_signals(last.model, inner, last.placed))
     search.tell(0, 1, "anything else that is missing")
-
-    def job(place: str, noise: NDArray[np.float32] | None = None) -> _LatentJob:
-        return _LatentJob(nominal, alone(inner, place), place, noise)
-
-    falls = list(mapped(search.executor, _fall, Made(job, places)))
-    best = sorted(range(len(places)), key=lambda k: -falls[k])[:SHORTLIST]
+    places = _apart(paths, list(signals), search.seed)
     noise = nominal.projected(nominal.drawn(_least_draws(search), search.seed + 5))
-    jobs = [job(places[k], noise) for k in best]
-    table = np.array(list(mapped(search.executor, _log_evidence, jobs))).reshape(len(jobs), -1)
+    inversions = list(mapped(search.executor, _inverted, [_LatentJob(nominal, paths, p) for p in places]))
+    best = sorted(range(len(places)), key=lambda k: -_beyond_noise(inversions[k]))[:SHORTLIST]
+    table = np.array([_log_evidence(inversions[k], noise) for k in best]).reshape(len(best), -1)
     if not table.size:
         return found
     largest = table.max(axis=0)
     k = int(np.argmax(table[:, 0]))
     p = float((1 + np.count_nonzero(largest[1:] >= largest[0])) / largest.size)
-    return replace(found, p=p, at=jobs[k].place, log_evidence=float(largest[0]))
+    return replace(found, p=p, at=places[best[k]], log_evidence=float(largest[0]))
 
 
-def _fall(job: _LatentJob) -> float:
-    """By how much more chi2 falls with a latent input at the place than noise would."""
-    fall, count = Inversion.of(job.nominal, job.paths, job.place).reach
+def _apart(paths: Mapping[str, Pushed], places: Sequence[str], seed: int) -> list[str]:
+    """Return the places, of those that answer every push in proportion to each other the first: what one explains all do.
+
+    Told by one push of random course: of linear answers those are in proportion that are so for it.
+    """
+    random = np.random.default_rng(seed)
+    pushes = {name: random.standard_normal((path.time.size, 1)).cumsum(axis=0) for name, path in paths.items()}
+    kept: dict[str, Array] = {}
+    for place in places:
+        answer = np.concatenate([path.answer(place, pushes[name]).ravel() for name, path in paths.items()])
+        size = float(np.linalg.norm(answer))
+        unit = answer / size if 0.0 < size < np.inf else np.zeros_like(answer)
+        if not any(1.0 - abs(float(unit @ other)) < ALIKE for other in kept.values()):
+            kept[place] = unit
+    return list(kept)
+
+
+def _inverted(job: _LatentJob) -> Inversion:
+    return Inversion.of(job.nominal, job.paths, job.place)
+
+
+def _beyond_noise(latent: Inversion) -> float:
+    """By how much more chi2 falls with a latent input than noise would."""
+    fall, count = latent.reach
     return fall - count
 
 
-def _log_evidence(job: _LatentJob) -> Array:
-    """(1 + B,) log marginal likelihood of a latent input at the place, in nats: of the residual, then of records of noise."""
-    latent = Inversion.of(job.nominal, job.paths, job.place)
-    assert job.noise is not None
+def _log_evidence(latent: Inversion, noise: NDArray[np.float32]) -> Array:
+    """(1 + B,) log marginal likelihood of a latent input, in nats: of the residual, then of records of noise."""
     if not latent.strength.size:
-        return np.zeros(1 + job.noise.shape[1])
-    return latent.log_evidence(np.column_stack([latent.wanted, latent.against(job.noise)]))
+        return np.zeros(1 + noise.shape[1])
+    return latent.log_evidence(np.column_stack([latent.wanted, latent.against(noise)]))

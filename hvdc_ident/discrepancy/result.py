@@ -175,10 +175,9 @@ class Hypothesis:
 class Line:
     """Score, p, size and status of one candidate effect.
 
-    score: T = (s'Mr)^2/(s'Ms) at its best size. p: chance of such a score anywhere, under the noise. delta_bic: gain over
-    the refitted nominal, None where not refitted. holdout_rmse: pooled in noise units. absorbed: share of its signature
-    that the fitted parameters take up. status: refitted, scored, not-excited, absorbed or failed: REASON.
-    detectable: the smallest size that would have been seen, None where none would.
+    score: fall of chi2 at its best size, with the parameters' answer. p: chance of such a fall anywhere, under the noise.
+    delta_bic: gain over the refitted nominal, None where not refitted. holdout_rmse: pooled in noise units. status: refitted,
+    screened, not-excited, absorbed (by the fitted parameters), or failed: REASON.
     """
 
     effect: str
@@ -189,8 +188,6 @@ class Line:
     size: FrozenMap[float] = field(default_factory=FrozenMap)
     delta_bic: float | None = None
     holdout_rmse: float | None = None
-    absorbed: float | None = None
-    detectable: FrozenMap[float] | None = None
     source: str = ""
     round: int = 1
 
@@ -223,16 +220,15 @@ class Diagnosis(Shown):
     there is more than one, or where that one is in doubt. doubt: what tells that something else stands behind the effects,
     though nothing that was tried explains as much; empty where nothing does. separating_experiment: what would tell them
     apart, or show what was not excited or is in doubt.
-    candidates: every candidate's line, the best first. location: where model and data differ. detectable: smallest size
-    by candidate. gap: before and after. remaining: what is left. beyond_noise: whether that is more than noise; the values and
+    candidates: every candidate's line, the best first. location: where model and data differ.
+    gap: before and after. remaining: what is left. beyond_noise: whether that is more than noise; the values and
     the intervals then hold only if nothing else is missing. parameters_*: by name; `parameters_refitted` are the
     nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in.
     fallback: the form found outside the catalogue, if one was looked for. bode: responses of nominal and augmented
     models with the data's. noise: standard deviation and AR coefficient by output, and where they come from.
     findings: what is missing, each effect with its probability and its likely places, the likeliest first. remainder: {share of
-    the gap, held_out, noise_units, p, at, below_tolerance}. hypotheses: those compared, the likeliest first. latent: by insertion
-    point {bound, curve}: the share of the gap that any effect there could explain, and by experiment {time, value} of what would
-    have to be added there (at the three best points; empty at the others). values_by_place: of each parameter whose value depends
+    the gap, held_out, noise_units, p, at, below_tolerance}. hypotheses: those compared, the likeliest first.
+    values_by_place: of each parameter whose value depends
     on which of the likely effects or places is the true one, the value of each; `parameters_after` has the first of them.
     stand_ins: where values that are off explain the gap, the effects that explain it as well with these values as given.
     """
@@ -244,7 +240,6 @@ class Diagnosis(Shown):
     separating_experiment: Mapping[str, Any]
     candidates: tuple[Line, ...]
     location: Mapping[str, Any]
-    detectable: Mapping[str, Any]
     gap: Gap
     remaining: Mapping[str, Any]
     parameters_before: FrozenMap[float]
@@ -259,7 +254,6 @@ class Diagnosis(Shown):
     findings: tuple[Finding, ...] = ()
     remainder: Mapping[str, Any] = field(default_factory=dict)
     hypotheses: tuple[Hypothesis, ...] = ()
-    latent: Mapping[str, Any] = field(default_factory=dict)
     beyond_noise: bool = False
     values_by_place: FrozenMap[tuple[ValueAt, ...]] = field(default_factory=FrozenMap)
     stand_ins: tuple[StandIn, ...] = ()

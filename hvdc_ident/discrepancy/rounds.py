@@ -1,87 +1,287 @@
-"""One round of the search: score everything on the model as it stands, refit the best, judge the winner."""
+"""One round of the search: screen everything on the model as it stands, refit the best, judge the winner.
+
+What is refitted leads on: with the gains of the best refits the candidates at their places, and their effects at all places, are
+screened again, until nothing comes nearer. The gains that the misfit has moved, and the given ones, are where a round begins.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
-from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, behinds, best_of, evidence_between, objections
-from hvdc_ident.discrepancy.explore import explored
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, behinds, evidence_between, objections
 from hvdc_ident.discrepancy.implied import TIED, implied, nearest, off_given
-from hvdc_ident.discrepancy.latent import reach
-from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.options import FIELD
-from hvdc_ident.discrepancy.proposals import by_latent, views_of
+from hvdc_ident.discrepancy.met import met
+from hvdc_ident.discrepancy.movable import in_proportion
+from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE
+from hvdc_ident.discrepancy.outside.filtered import filtered, filters
+from hvdc_ident.discrepancy.outside.law import law
+from hvdc_ident.discrepancy.placed import moved
+from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.refitted import all_far, excess, like_noise, once_more, refitted
-from hvdc_ident.discrepancy.scores import runs, scored, tones
-from hvdc_ident.discrepancy.signatures.candidates import candidates
+from hvdc_ident.discrepancy.refit_jobs import as_given, in_place
+from hvdc_ident.discrepancy.refitted import all_far, best_each, by_cost, excess, is_noise, like_noise, telling
+from hvdc_ident.discrepancy.remainder import is_small
+from hvdc_ident.discrepancy.residual_checks import tones
+from hvdc_ident.discrepancy.screen import Shot
+from hvdc_ident.discrepancy.stand import Stand, gains_of, larger
+from hvdc_ident.effects import Probe, effects
+from hvdc_ident.immutable import FrozenMap
 
-SCORED = 0.25
-"""Part of a refit's fall of chi2 that counts as a score: a refit moves more than a score does, and ends at sizes not scored."""
-LARGE = 2.0
-"""Times its rows: chi2 of a model with an effect in it from which it is asked where anything would explain the rest."""
+OF_EFFECT = 8
+"""Refits of one effect in a field, at least where so many come into question: places that cannot be told apart are neighbours."""
+THOROUGH = 4
+"""Times as many of a thorough search."""
+TOGETHER = 6
+"""Effects at several places in a field: each takes a compilation of its own."""
+TURNS = 3
+"""Times that a round goes on from the gains of its best refits."""
+LEVEL = 0.9
+"""Share of the best fall of chi2 from which a refit leads on."""
 NEARLY = 0.1
-"""Chance under noise of the best score below which a closer look is taken before nothing is said to be there."""
-
-
+"""Chance under noise of the best fall below which a closer look is taken before nothing is said to be there."""
 BEYOND = "none of it leaves noise, and what is found from the data alone does"
 
 
-def one_round(search: SearchContext, before: Refit, number: int) -> Round:
-    """A round on the model as it stands. Raises SimulationError where that model cannot be run."""
-    options, nominal = search.options, before.nominal()
-    search.tell(0, 1, f"round {number}: the model's answers at every slot")
-    paths = runs(before.model, nominal)
-    signals = slot_signals(before.model, paths, before.placed)
-    found = candidates(
-        before.model,
-        signals,
-        [a.time for a in paths.values()],
-        search.effects,
-        search.places,
-        tones(nominal),
-    )
+def one_round(search: SearchContext, before: Refit, number: int, *, little: bool = False) -> Round:
+    """Return a round on the model as it stands. Raises SimulationError where that model cannot be run.
+
+    little: whether so little is left that only an effect that explains it is worth adding: a few refits tell whether one may.
+    """
+    nominal = before.nominal()
+    search.tell(0, 1, f"round {number}: the signals")
+    signals = slot_signals(before)
+    times = [e.time for e in before.problem.fitted_experiments]
+    found = candidates(before.model, signals, times, search.effects, search.places, tones(nominal))
     there = {(p.candidate.effect, p.candidate.at, p.candidate.source) for p in before.placed}
     found = tuple(c for c in found if (c.effect, c.at, c.source) not in there and c.probes)
-    search.tell(0, 1, f"round {number}: scores of {len(found)} candidates")
-    scores = scored(
-        nominal, found, paths, bootstraps=options.bootstraps, seed=search.seed + number,
-        executor=search.executor,
-    )  # fmt: skip
-    opened = Round(before, paths, found, scores, (), (), None, "", False, None)
-    picks = best_of(scores, found)
-    if not picks:
+    stand = Stand.of(search, before, found, number)
+    text = f"round {number}: {len(found)} candidates"
+    screen = stand.screen(found, text)
+    opened = Round(before, signals, found, screen)
+    if not screen.shots:
         return replace(opened, why="no candidate leaves a trace in these data")
-    p = scores.p(picks[0].score)
-    if p > options.significance:
-        nothing = replace(opened, why=f"the best score of all is what noise gives (p = {p:.2g})")
-        worth = p < NEARLY or (excess(before) and not like_noise(before))
-        return _met(search, nothing, nominal) if number == 1 and worth else nothing
-    opened = replace(opened, significant=True)
-    if number == 1 or before.chi2 > LARGE * before.rows:  # else too little is left to save by it
-        search.tell(0, 1, f"round {number}: what could be made good at each slot")
-        opened = replace(opened, reach=reach(nominal, paths, list(signals), search.executor))
-    return closed(search, *explored(search, opened, nominal, number), number)
+    p = screen.p(max(screen.shots[0].fall, 0.0))
+    nothing = f"the best of all is what noise gives (p = {p:.2g})"
+    loud = excess(before) and not like_noise(before)
+    if p > NEARLY and not loud:
+        return replace(opened, why=nothing)
+    if little or (p > search.options.significance and not loud):
+        first = stand.refitted(found, _field(search, found, screen.shots)[:SHORTLIST], f"round {number}")
+        if not _significant(search, opened, first) or (little and all_far(before, first)):
+            return replace(opened, failed=tuple(t for t in first if t.refit.failure), why=nothing)
+    opened, trials = _explored(search, stand, opened, number)
+    if not _significant(search, opened, trials):
+        return replace(opened, failed=tuple(t for t in trials if t.refit.failure), why=nothing)
+    return closed(search, replace(opened, significant=True), trials, number)
 
 
-def _met(search: SearchContext, opened: Round, nominal: Nominal) -> Round:
-    """The round with sizes that the scores did not look at, where nothing else has a score though more than noise is left."""
-    opened, picks = by_latent(search, opened, views_of(opened, nominal), 1, lambda _: True)
-    if not picks or opened.scores.p(max(p.score for p in picks)) > search.options.significance:
-        return opened
-    trials = refitted(search, opened, picks[:FIELD], "round 1: refits of many sizes")
+def _significant(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> bool:
+    """Return True where a refit makes chi2 fall by more than noise gives anywhere."""
+    falls = [opened.before.chi2 - t.refit.chi2 for t in trials if not t.refit.failure]
+    return opened.screen.p(max(falls, default=0.0)) <= search.options.significance
+
+
+def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -> tuple[Round, list[CandidateFit]]:
+    """Return the round with its refits."""
+    found, text = opened.candidates, f"round {number}"
+    opened, trials = _led_on(
+        stand, opened, stand.refitted(found, _field(search, found, opened.screen.shots), text), number
+    )
+    given = as_given(opened.before)
+    if not search.spent and all_far(opened.before, trials, near=TOLERANCE):
+        # Bends are missed between two sizes, and gains that make up for an effect may leave no trace of it.
+        opened = replace(opened, candidates=tuple(map(_denser, opened.candidates)))
+        found = opened.candidates
+        for point, where in ((None, "once more"), (given, "from the given values")):
+            if where == "once more" or point is not None:
+                screen = stand.screen(found, f"{text}: {where}", point=point)
+                more = stand.refitted(found, _field(search, found, screen.shots), f"{text}: {where}", trials)
+                trials = best_each([*trials, *more])
+        opened, trials = _led_on(stand, opened, trials, number)
+    elif given is not None and not search.spent:
+        # Beside an effect the records may be explained by other values of the parameters too.
+        shots = [_shot_of(t.pick, given) for t in by_cost(trials)[:OF_EFFECT]]
+        more = stand.refitted(opened.candidates, shots, f"{text}: from the given values", trials)
+        opened, trials = _led_on(stand, opened, best_each([*trials, *more]), number)
+    if not search.spent:
+        opened, trials = met(stand, opened, trials, number, far=all_far(opened.before, trials))
+    if number == 1 and search.options.fallback and not search.spent and _tells(opened, trials):
+        best = next(iter(by_cost(trials)), None)
+        if best is not None and not is_noise(best.refit, search.seed):
+            opened = _outside(search, opened, trials)
+            opened, trials = _in_its_stead(stand, opened, trials)
+    return opened, trials
+
+
+def _shot_of(pick: Pick, theta: Array) -> Shot:
+    """Return what was refitted as a shot, to be begun with these unknowns."""
+    return Shot(pick.candidate, pick.probe, pick.fall, theta, pick.factor)
+
+
+def _field(search: SearchContext, found: Sequence[CandidateEffect], shots: Sequence[Shot]) -> list[Shot]:
+    """Return the shots that are refitted: of each effect the best candidates, in the larger forms too that theirs is a part of."""
+    count: Counter[str] = Counter()
+    several, most = 0, OF_EFFECT * (THOROUGH if search.options.thorough else 1)
+    taken: dict[int, list[Shot]] = {}
+    for s in shots:
+        c = found[s.candidate]
+        if s.candidate in taken or count[c.effect] >= most or (len(c.at) > 1 and several >= TOGETHER):
+            continue
+        count[c.effect] += 1
+        several += len(c.at) > 1
+        taken[s.candidate] = [s, *(replace(s, probe=n, factor=1.0) for n in larger(c, s.probe))]
+    return [s for own in taken.values() for s in own]
+
+
+def _led_on(
+    stand: Stand, opened: Round, trials: Sequence[CandidateFit], number: int
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the trials with what is found from the gains of the best, again while something comes nearer."""
+    trials = best_each(trials)
+    asked: set[tuple[int, tuple[float, ...]]] = set()
+    for _ in range(TURNS):
+        leaders = [t for t in _leaders(opened, trials) if (t.pick.candidate, tuple(t.refit.theta)) not in asked]
+        if not leaders or stand.search.spent:
+            break
+        asked |= {(t.pick.candidate, tuple(t.refit.theta)) for t in leaders}
+        before = by_cost(trials)[0]
+        more: list[CandidateFit] = []
+        for t in leaders:
+            opened, shots = _beside(stand, opened, t, number)
+            more += stand.refitted(opened.candidates, shots, f"round {number}: neighbours", trials)
+        trials = best_each([*trials, *more])
+        if by_cost(trials)[0] is before:
+            break
+    return opened, trials
+
+
+def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit]:
+    """Return the best refit of each of the best effects."""
+    sound = by_cost(trials)
+    if not sound:
+        return []
+    least = LEVEL * (opened.before.chi2 - sound[0].refit.chi2)
+    each: dict[str, CandidateFit] = {}
+    for t in sound:
+        if opened.before.chi2 - t.refit.chi2 >= least:
+            each.setdefault(opened.candidates[t.pick.candidate].effect, t)
+    return list(each.values())[:BEAM]
+
+
+def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tuple[Round, list[Shot]]:
+    """Return the round and the shots of what is at the leader's place or is its effect, from the gains that the leader came to.
+
+    Its effect elsewhere is tried in the leader's size too, and another kind of delay there with a delay as long.
+    """
+    own = opened.candidates[lead.pick.candidate]
+    sizes = lead.refit.sizes(lead.refit.placed[-1])
+    found = list(opened.candidates)
+    like = [k for k in opened.screen.best() if found[k].effect == own.effect and len(found[k].at) == len(own.at)]
+    here = [k for k, c in enumerate(found) if c.at == own.at and not c.still]
+    which = [k for k in dict.fromkeys((*here, *like[: 2 * OF_EFFECT])) if k != lead.pick.candidate]
+    late = effects()[own.effect].delay_with(sizes)
+    for k in which:
+        if found[k].effect == own.effect:
+            found[k] = _with_sizes(found[k], [sizes])
+        elif late:
+            found[k] = _with_sizes(found[k], _delaying(found[k], late))
+    theta = gains_of(opened.before, lead.refit)
+    screen = stand.screen(found, f"round {number}: beside {own.label}", which, theta)
+    least = Race().reach * (opened.before.chi2 - lead.refit.chi2)
+    near = [s for s in screen.shots if s.fall >= least]
+    return replace(opened, candidates=tuple(found)), _field(stand.search, found, near)
+
+
+def _denser(candidate: CandidateEffect) -> CandidateEffect:
+    """Return a candidate with three times as many sizes, where it has one size and bends what it acts on."""
+    values = [p.values[n] for p in candidate.probes for n in p.free if len(p.free) == 1]
+    if len(values) < max(2, len(candidate.probes)) or min(values) <= 0.0 or in_proportion(candidate, 0):
+        return candidate
+    (name,) = candidate.probes[0].free
+    ends = sorted(values)
+    between = [a * (b / a) ** share for a, b in pairwise(ends) for share in (1 / 3, 2 / 3)]
+    return _with_sizes(candidate, [{**candidate.probes[0].values, name: v} for v in between])
+
+
+def _delaying(candidate: CandidateEffect, late: float) -> list[dict[str, float]]:
+    """Return the sizes at which a candidate delays so long, from its probe that delays most alike; none of what is no delay."""
+    delays = [effects()[candidate.effect].delay_with(p.values) for p in candidate.probes]
+    near = {n: abs(math.log(d / late)) for n, d in enumerate(delays) if d is not None and d * late > 0.0}
+    if not near:
+        return []
+    n = min(near, key=lambda k: near[k])
+    return [moved(candidate, n, late / (delays[n] or late))]
+
+
+def _with_sizes(candidate: CandidateEffect, sizes: Sequence[dict[str, float]]) -> CandidateEffect:
+    """Return the candidate with further probes at these sizes, each within bounds."""
+    known = {tuple(sorted(p.values.items())) for p in candidate.probes}
+    probes = list(candidate.probes)
+    for values in sizes:
+        like = next((p for p in candidate.probes if set(p.free) <= set(values)), None)
+        if like is None:
+            continue
+        moved = {n: values.get(n, v) for n, v in like.values.items()}
+        free = {n: (min(low, moved[n]), max(high, moved[n])) for n, (low, high) in like.free.items()}
+        if tuple(sorted(moved.items())) not in known:
+            probes.append(Probe(like.effect, FrozenMap(moved), FrozenMap(free)))
+    return replace(candidate, probes=tuple(probes))
+
+
+def _outside(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> Round:
+    """The round with a filter, or where nothing explains the gap a formula, from outside the catalogue, if one does."""
+    best = by_cost(trials)[0].refit
+    tried = filters(search, opened)
+    opened = replace(opened, filters=tried)
+    found = filtered(search, opened, tried, best)
+    if found is None and _unexplained(search, opened, trials):
+        found = law(search, opened, best)
+        return replace(opened, laws=() if found is None else (found,))
+    return opened if found is None else replace(opened, laws=(found,))
+
+
+def _in_its_stead(stand: Stand, opened: Round, trials: list[CandidateFit]) -> tuple[Round, list[CandidateFit]]:
+    """The trials with every effect at the place of a form from outside the catalogue, begun with the gains that it came to.
+
+    A form with many parameters finds the place and the gains where an effect, beside biased gains, did not: a filter whose
+    poles and zeros meet is a gain. Where an effect comes near the noise there too, the catalogue lacks nothing.
+    """
+    form = opened.law
+    if form is None or stand.search.spent:
+        return opened, trials
+    found, at = opened.candidates, form.refit.placed[-1].candidate.at
+    which = [k for k, c in enumerate(found) if c.at == at and not c.still]
+    screen = stand.screen(found, "round 1: in the stead of a form", which, gains_of(opened.before, form.refit))
+    shots = list(screen.best().values())[:FIELD]
+    trials = best_each([*trials, *stand.refitted(found, shots, "round 1: in the stead of a form", trials)])
     if all_far(opened.before, trials):
-        trials = once_more(search, opened, trials, "round 1: once more")
-    return closed(search, replace(opened, significant=True, why=""), trials, 1)
+        return opened, trials
+    return replace(opened, laws=(replace(form, near=False),)), trials
+
+
+def _unexplained(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> bool:
+    """Return True where no refit comes near the noise, and the best leaves more of the gap than a verdict passes over."""
+    far = all_far(opened.before, trials)
+    return far and not any(is_small(search, opened.before, t.refit) for t in by_cost(trials)[:BEAM])
+
+
+def _tells(opened: Round, trials: Sequence[CandidateFit]) -> bool:
+    """Return True where a refit takes away a share of what is beyond noise: where none does, the noise is louder than stated."""
+    least = opened.before.chi2 - telling(opened.before)
+    return any(not t.refit.failure and t.refit.chi2 < least for t in trials)
 
 
 def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit], number: int) -> Round:
-    """The round with its refits ranked and its winner, or what speaks against the best.
+    """The round with its refits ranked and its winner, put into the model; or what speaks against the best.
 
     Ranked by what the fitted and the held-out data say together. Of those that are as good the likeliest wins: an effect's
     probability before any data is shared by all its places and sources, so an offset goes before one of many couplings. Of those
@@ -106,6 +306,17 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
     if winner is not None:
         tied = [t for t in likeliest if unlikely[id(t)] <= unlikely[id(winner)] + TIED]
         winner = nearest(winner, tied, lambda t: implied(t.refit), lambda t: off_given(t.refit))
+        placed = in_place(before, winner.refit)
+        if placed.failure:
+            return replace(
+                opened,
+                trials=tuple(ranked),
+                failed=failed,
+                ruler=ruler,
+                why=f"{found[winner.pick.candidate].label}: {placed.failure}",
+            )
+        new = gained(replace(winner, refit=placed), before, ruler)
+        ranked, winner = [new if t is winner else t for t in ranked], new
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
 
@@ -118,11 +329,6 @@ def gained(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
 
 
 def against(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:
-    """Objection to naming a trial's effect, in words; empty where there is none. opened: the round whose scores it has.
-
-    A refit may end at another size than it began at, so the candidate's best score counts; one whose answer no expansion
-    gave is scored by its refit. Where a refit brings many times what scores do at the sizes tried, these were the wrong ones.
-    """
-    best, fall = max(trial.pick.score, opened.score_p(trial.pick.candidate)[0]), before.chi2 - trial.refit.chi2
-    score = max(best, SCORED * fall)
-    return objections(before, trial, opened.scores.p(score), search.options, search.tolerance, first=first)
+    """Objection to naming a trial's effect, in words; empty where there is none. opened: the round that tells what noise does."""
+    p = opened.screen.p(before.chi2 - trial.refit.chi2)
+    return objections(before, trial, p, search.options, search.tolerance, first=first)

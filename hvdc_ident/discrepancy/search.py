@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.clocks import clocks, on_their_clocks
 from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, clear, evidence_between
@@ -15,12 +16,11 @@ from hvdc_ident.discrepancy.options import BEAM, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, judged
-from hvdc_ident.discrepancy.refit_jobs import as_given, job_of, refit_again
-from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by, once_more
+from hvdc_ident.discrepancy.refit_jobs import as_given, job_of, moved_far, refit_again
+from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by
 from hvdc_ident.discrepancy.released import held_again, released
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.rounds import against, closed, gained, one_round
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,13 @@ def from_either_side(search: SearchContext, first: Refit) -> SearchOutcome:
     outcome = forward(search, first)
     theta = as_given(first)
     last = outcome.refit
-    if theta is None or not is_far(first, last) or is_small(search, first, last) or search.spent:
+    if (
+        theta is None
+        or not moved_far(first)
+        or not is_far(first, last)
+        or is_small(search, first, last)
+        or search.spent
+    ):
         return outcome
     search.tell(0, 1, "once more, from the given values")
     try:
@@ -107,11 +113,9 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
         if kept and search.spent:
             notes += ("The budget ended: no further effect was looked for.",)
             break
-        if kept:
-            rounds[-1], kept[-1] = rounds[-1].light(), kept[-1].light()
         try:
             if kept or not rounds:
-                rounds.append(one_round(search, here, len(rounds) + 1))
+                rounds.append(one_round(search, here, len(rounds) + 1, little=little))
         except FAILURES as error:
             if not kept:
                 raise
@@ -221,14 +225,13 @@ def settled(
             here = without
             del kept[k]
             continue
-        if _beside_these(kept[k], others, last=k == len(kept) - 1) and not _closed_to(first, kept[k]):
-            kept[k] = kept[k].light()
-        elif near:
+        searched = _beside_these(kept[k], others, last=k == len(kept) - 1) and not _closed_to(first, kept[k])
+        if near and not searched:
             try:
                 again, winner = _looked_again(
                     search, first, here, kept[k], k, without, number + k + 1 if len(kept) > 1 else 1
                 )
-                kept[k] = again.light()
+                kept[k] = again
                 here = _in_place(winner.refit, k)
             except FAILURES as error:  # refitted it runs, as far as a refit needs it to
                 notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")
@@ -271,8 +274,6 @@ def _looked_again(
     sound += [CandidateFit(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
     mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
     sound.append(mine_again[0] if mine_again else CandidateFit(_pick(again, mine), _last(here, k), 0.0))
-    # A size that has to be met was met beside a misfit that the others have since explained.
-    sound = once_more(search, again, sound, f"again with the others: {own.label}")
     ranked = closed(search, again, [*sound, *again.failed], number)
     winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
     return replace(ranked, winner=winner), winner
@@ -287,9 +288,9 @@ def _with(found: Round, candidate: CandidateEffect) -> tuple[Round, int]:
 
 
 def _pick(found: Round, candidate: int) -> Pick:
-    """The size of a candidate that the scores like best, or its first."""
-    score, _, column = found.score_p(candidate)
-    return Pick(candidate, found.scores.columns[column].probe if column >= 0 else 0, 1.0, score)
+    """The size of a candidate that the screen likes best, or its first."""
+    shot = found.screen.best().get(candidate)
+    return Pick(candidate, 0, 1.0, 0.0) if shot is None else Pick(candidate, shot.probe, shot.factor, shot.fall)
 
 
 def _last(refit: Refit, k: int) -> Refit:

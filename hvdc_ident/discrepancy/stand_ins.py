@@ -12,15 +12,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.context import Round, SearchContext
-from hvdc_ident.discrepancy.evidence import Pick, Ruler, at_edge, clear, evidence_between
+from hvdc_ident.discrepancy.evidence import Ruler, at_edge, clear, evidence_between
 from hvdc_ident.discrepancy.explain import sentence
 from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.race import done
 from hvdc_ident.discrepancy.refit import Refit, RefitJob
 from hvdc_ident.discrepancy.refit_jobs import job
 from hvdc_ident.discrepancy.result import StandIn
-from hvdc_ident.discrepancy.scores import SEEN
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.immutable import FrozenMap
 
@@ -29,13 +29,11 @@ def stand_ins(search: SearchContext, last: Refit, opened: Round, moved: Sequence
     """Return the effects that explain the records as well as other values of the parameters, with these as given, the best first.
 
     Only one in place of all of them: beside values that are off, an effect in place of another such value explains nothing more.
-    last: the model without effects, refitted; opened: the first round of the search, whose scores tell which effects the
+    last: the model without effects, refitted; opened: the first round of the search, whose screen tells which effects the
     parameters take up; moved: the parameters whose values are off the given ones.
     """
     found = opened.candidates
-    scores = opened.scores
-    seen = scores.sound & (scores.size >= SEEN) & ~scores.usable
-    taken_up = sorted({scores.columns[k].candidate for k in np.flatnonzero(seen)})
+    taken_up = opened.screen.absorbed()
     if not taken_up or search.spent:
         return ()
     # One that brings another signal in has many likes: those that do not are asked first.
@@ -43,7 +41,7 @@ def stand_ins(search: SearchContext, last: Refit, opened: Round, moved: Sequence
     jobs = []
     for k in first:
         with suppress(HvdcIdentError):  # it cannot sit there
-            jobs.append(_with_given(job(last, found, [Pick(k, 0, 1.0, 0.0)]), moved))
+            jobs.append(_with_given(_job(last, found[k]), moved))
     told: list[StandIn] = []
     ruler = Ruler.of(last)
     values = FrozenMap({f.name: f.given for f in last.problem.free if f.name in moved})
@@ -55,6 +53,15 @@ def stand_ins(search: SearchContext, last: Refit, opened: Round, moved: Sequence
             c, sizes = refit.placed[-1].candidate, FrozenMap(refit.sizes(refit.placed[-1]))
             told.append(StandIn(c.effect, c.at, max(-evidence, 0.0), sizes, values, sentence(c, sizes), c.source))
     return tuple(sorted(told, key=lambda s: round(s.delta_bic, 1)))  # as good is as good: then as asked
+
+
+def _job(last: Refit, candidate: CandidateEffect) -> RefitJob:
+    """Return the refit with a candidate, begun at its first size, and at the others where that does not run."""
+    begun = job(last, candidate, 0, 1.0, last.theta)
+    placed, k = begun.placed[-1], len(last.problem.free)
+    alike = [p.values for p in candidate.probes[1:] if set(p.free) == set(placed.bounds)]
+    sizes = [[v[n] for n in placed.bounds] for v in alike if all(b[0] < v[n] < b[1] for n, b in placed.bounds.items())]
+    return replace(begun, spare=tuple(np.concatenate([last.theta[:k], s, last.theta[k:]]) for s in sizes))
 
 
 def _with_given(begun: RefitJob, names: Sequence[str]) -> RefitJob:

@@ -322,14 +322,13 @@ def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: 
         text = f"Something is missing, and nothing of the catalogue can be named: {found.why}."
         return Judgement("unnameable", text, tests, instead=found.law)
     refused = any(b.p <= options.significance and b.excess > STRONG * last.rows for b in tests)
-    strong = found.significant and float(found.scores.t.max(initial=0.0)) > STRONG * last.rows
+    strong = found.significant and found.screen.shots[0].fall > STRONG * last.rows
     if (strong or refused) and leaves_a_gap(search, last):
         why = found.why or "the residuals are not noise"
         return Judgement(
             "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
         )
-    usable = found.scores.usable
-    if not usable.any():
+    if not any(found.screen.usable(column) for column in found.screen.size):
         still = list(dict.fromkeys(c.effect for c in found.candidates))
         text = "None of the effects looked for is excited by these experiments."
         advice = {"text": ". ".join(f"{e}: {effects()[e].excited_by}" for e in still)}

@@ -1,7 +1,7 @@
 """The catalogue of effects, one file each, and what inserts them into a model and sizes them for a search."""
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.effects.placement import EffectUse, apply_effects, effects, joined_sources, split_sources
+from hvdc_ident.effects.placement import EffectUse, apply_effects, effects, joined_sources, leads_back, split_sources
 from hvdc_ident.effects.probing import (
     SMALLEST,
     Probe,
@@ -28,6 +28,7 @@ __all__ = [
     "effect_model",
     "effects",
     "joined_sources",
+    "leads_back",
     "probes",
     "resistance_parameters",
     "size_grid",

@@ -118,8 +118,11 @@ class Additions:
     def rest(self, x: sp.Expr, derivative: sp.Expr, held: Callable[[sp.Expr], sp.Expr] | None = None) -> None:
         """Let the model's state x rest where it would with this derivative, which the effect's own hides.
 
-        held: from the way that x has to go to that rest to the way it goes, for an effect that moves the rest.
+        held: from the way that x has to go to that rest to the way it goes, for an effect that moves the rest. Of a state that
+        is chosen at run time the rest stays that of its derivative.
         """
+        if str(x) not in self.model.states:
+            return
         state = self.model.states[str(x)]
         way = derivative if state.rest is None else state.rest - x
         if held is not None:
@@ -186,7 +189,7 @@ class Effect:
     confusable: other effects that may explain the same data, each with what separates them.
     needs_source: True where it brings in another signal (`from`). needs_expression: True where its form is given with it,
     with coefficients of the user's own names. of_derivative: True where it changes the equation of the state at its place: u
-    is the derivative that the state had, y the one that it has. A diagnosis does not try such an effect.
+    is the derivative that the state had, y the one that it has.
     tried_by_default: False for a form that is tried only where it is named, such as a general one that stands for many others.
     resistance: the parameter that a resistance of the model replaces.
     self_exciting: True where it moves the model by itself, so that a record of it does not begin in steady state.

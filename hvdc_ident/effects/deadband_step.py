@@ -49,7 +49,6 @@ EFFECT = Effect(
     sentence="{at} is 0 within +-{width} and acts in full beyond",
     excited_by="slow ramps both ways through 0 and well beyond the band",
     example=FrozenMap({"width": 0.45}),
-    tried_by_default=False,
     confusable=FrozenMap(
         {
             "deadband": "a ramp well beyond the band: with the step the signal comes back in full, without it smaller by the width",

@@ -73,7 +73,6 @@ EFFECT = Effect(
     example=FrozenMap({"low": -0.45, "high": 0.45}),
     insertion_kinds=("state",),
     of_derivative=True,
-    tried_by_default=False,
     confusable=FrozenMap(
         {
             "limit": "a long step, then its reversal: behind a limit of the output the state winds up and comes back late",

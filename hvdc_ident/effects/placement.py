@@ -223,7 +223,7 @@ def _at_one(
     """Return the model with the effect at one of its places. source: the signal brought in there."""
     kind, name = insertion_point(model, place)
     added: dict[str, sp.Expr] = {}
-    circular = kind in ("signal", "algebraic") and _leads_back(model, name)
+    circular = kind in ("signal", "algebraic") and leads_back(model, name)
 
     def rewrite(m: Model, u: sp.Expr) -> tuple[Model, sp.Expr]:
         p = dict(symbols)
@@ -250,7 +250,7 @@ def _at_one(
     return replace(made, origin=replace(made.origin, neutral=made.origin.neutral | added))
 
 
-def _leads_back(model: Model, name: str) -> bool:
+def leads_back(model: Model, name: str) -> bool:
     """Return True where a signal or unknown is computed from itself, through other signals and unknowns alone."""
     equations = {n: s.value for n, s in model.signals.items()} | {n: a.equation for n, a in model.algebraic.items()}
     seen: set[str] = set()

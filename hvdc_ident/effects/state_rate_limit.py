@@ -54,7 +54,6 @@ EFFECT = Effect(
     example=FrozenMap({"up": 0.4, "down": 0.2}),
     insertion_kinds=("state",),
     of_derivative=True,
-    tried_by_default=False,
     confusable=FrozenMap(
         {
             "lag": "two steps of different size: the lag scales with them, the rate does not",

@@ -76,11 +76,11 @@ def test_before_is_at_the_given_gains_and_not_where_the_search_begins(lagged: Di
 def test_the_json_has_what_the_contract_names(lagged: Diagnosis) -> None:
     told = json.loads(json.dumps(lagged.to_dict(), allow_nan=False))
     for key in (
-        "verdict", "effects", "ambiguity", "separating_experiment", "candidates", "location", "detectable", "gap",
+        "verdict", "effects", "ambiguity", "separating_experiment", "candidates", "location", "gap",
         "remaining", "parameters_before", "parameters_after", "augmented_model",
     ):  # fmt: skip
         assert key in told
-    assert {"outputs", "blocks", "time_window", "band_hz", "region"} <= set(told["location"])
+    assert {"outputs", "time_window", "band_hz", "region"} <= set(told["location"])
     assert {"nominal", "refitted", "augmented", "noise_floor", "shrink_holdout"} <= set(told["gap"])
     assert {"adequate", "explained_share", "band_hz", "block", "material"} <= set(told["remaining"])
     assert {"effect", "at", "score", "p", "delta_bic", "holdout_rmse", "status"} <= set(told["candidates"][0])
@@ -110,7 +110,6 @@ def test_clean_records_name_nothing(noise: str) -> None:
         assert found.verdict == "no-evidence"
         assert not found.effects and found.augmented is None
         assert found.files == {}
-        assert any(size is not None for size in found.detectable.values())
 
 
 def test_a_form_outside_the_catalogue_is_not_given_a_name() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations, pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +14,12 @@ from refits import plain
 
 from hvdc_ident import Experiment, simulate
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, explore
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, refit_jobs, rounds
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.formula import hats
 from hvdc_ident.discrepancy.outside.law import Regression, _levels, law
+from hvdc_ident.discrepancy.refit import Refit, RefitJob
 from hvdc_ident.discrepancy.rounds import one_round
 from hvdc_ident.expression import parse, symbol
 from hvdc_ident.immutable import FrozenMap
@@ -99,7 +102,7 @@ def test_what_no_effect_of_the_catalogue_explains_is_told_as_a_law(
     assert low < size < high
     assert told["coefficients"]["k1"]["value"] == pytest.approx(size, rel=0.1)
     assert found.remaining["adequate"] and (found.gap.shrink_holdout or 0.0) > 0.5
-    assert not [text for text in looks if text.startswith(("round 2", "round 1: from every size"))]
+    assert not [text for text in looks if text.startswith("round 2")]
     assert found.augmented is not None
     run = simulate(found.augmented, metered(output, meter)[0].with_(measured=None), outputs=[output])
     assert np.isfinite(run[output]).all()
@@ -165,19 +168,29 @@ def rough(seen: dict[str, Array]) -> Array:
 
 
 def test_more_is_refitted_where_a_thorough_search_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(explore, "FIELD", 4)
+    monkeypatch.setattr(rounds, "OF_EFFECT", 1)
+    begun: list[str] = []
+    plain = refit_jobs.job
+
+    def counted(before: Refit, candidate: CandidateEffect, *given: Any) -> RefitJob:
+        begun.append(candidate.label)
+        return plain(before, candidate, *given)
+
+    monkeypatch.setattr("hvdc_ident.discrepancy.stand.job", counted)
     records, names, done = metered("torque", rough), ["lag", "gain", "limit", "deadband"], dict[bool, Diagnosis]()
+    count: dict[bool, int] = {}
     for thorough in (False, True):
         options = DiagnosisOptions(bootstraps=100, thorough=thorough)
+        begun.clear()
         done[thorough] = diagnose(model(), records, FREE, effects=names, options=options)
-    tried = {k: [c for c in d.candidates if c.delta_bic is not None] for k, d in done.items()}
-    assert len(tried[True]) > len(tried[False])
+        count[thorough] = len(set(begun))
+    assert count[True] > 2 * count[False]
     assert any("thorough" in note for note in done[False].notes)
     assert not any("thorough" in note for note in done[True].notes)
 
 
 def test_a_budget_ends_the_search_and_what_was_not_tried_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(explore, "FIELD", 4)
+    monkeypatch.setattr(rounds, "OF_EFFECT", 1)
     options = DiagnosisOptions(bootstraps=100, budget=1e-6)
     found = diagnose(
         model(), metered("torque", rough), FREE, effects=["lag", "gain", "limit", "deadband"], options=options

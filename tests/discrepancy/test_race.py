@@ -10,17 +10,14 @@ import pytest
 from cases import FREE, experiments, model
 from refits import beside, plain
 
-from hvdc_ident import Model
-from hvdc_ident.discrepancy import diagnose, placed, proposals, refit
+from hvdc_ident.discrepancy import diagnose, refit, refit_jobs
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.context import Course, SearchContext
 from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.size_profile import resized
-from hvdc_ident.effects import Probe, effects
+from hvdc_ident.discrepancy.screen import _Runner
 from hvdc_ident.errors import ComputationError, InputError
-from hvdc_ident.fit import Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
@@ -43,14 +40,14 @@ def test_where_none_is_better_than_nothing_yet_all_come_to_their_ends(
 ) -> None:
     jobs = [job(before, "lag", "wm", 0.2), job(before, "lag", "drag", 0.2)]
     alone = [run(j) for j in jobs]
-    for found, expected in zip(Race(sprint=4, second=0).run(SEARCH, before.chi2, jobs, ["a", "b"]), alone, strict=True):
+    for found, expected in zip(Race(laps=(4,)).run(SEARCH, before, jobs, ["a", "b"]), alone, strict=True):
         assert found.ended
         assert found.chi2 == pytest.approx(expected.chi2, rel=1e-5)
         assert found.theta == pytest.approx(expected.theta, rel=1e-2)
 
 
 def test_nothing_goes_on_that_is_out_of_reach_of_what_is_known(before: Refit) -> None:
-    (left,) = Race(sprint=2).run(SEARCH, before.chi2, [job(before, "lag", "wm", 0.2)], ["a"], best=-1e9)
+    (left,) = Race(laps=(2,), least=0).run(SEARCH, before, [job(before, "lag", "wm", 0.2)], ["a"], best=-1e9)
     assert not left.ended
     assert left.chi2 > run(job(before, "lag", "wm", 0.2)).chi2
 
@@ -110,50 +107,42 @@ def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on
 
         with monkeypatch.context() as patched:
             patched.setattr(refit, place, fails)
-            told, lost = Race().run(SEARCH, before.chi2, [sound, broken], ["a", "b"])
+            told, lost = Race(reach=-1e6, near=-1e6).run(SEARCH, before, [sound, broken], ["a", "b"])
         assert str(error) in lost.failure
         assert not told.failure and told.chi2 == pytest.approx(alone.chi2, rel=1e-5)
 
 
 def test_a_diagnosis_outlives_a_candidate_that_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gain raises where its refit is made; the lag that is missing is named all the same."""
-    plain = placed.added
+    plain = refit_jobs.job
 
-    def fails(model: Model, problem: Problem, candidate: CandidateEffect, *given: object) -> object:
+    def fails(before: Refit, candidate: CandidateEffect, *given: object) -> object:
         if candidate.effect == "gain":
             raise ValueError("no such gain")
-        return plain(model, problem, candidate, *given)  # type: ignore[arg-type]
+        return plain(before, candidate, *given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("hvdc_ident.discrepancy.refit_jobs.added", fails)
+    monkeypatch.setattr("hvdc_ident.discrepancy.stand.job", fails)
     found = diagnose(model(), experiments(lag=0.03), FREE, effects=["lag", "gain"], places=["wm"])
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text
     statuses = {c.effect: c.status for c in found.candidates if c.round == 1}
     assert statuses == {"lag": "refitted", "gain": "failed: no such gain"}
 
 
-def test_a_place_whose_sizes_cannot_be_worked_out_is_told_and_the_others_are_looked_at(
+def test_a_candidate_that_cannot_be_screened_is_told_and_the_others_are_looked_at(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    plain = proposals._sizes_at_place
+    plain = _Runner.__call__
 
-    def fails(of: proposals._PlaceJob) -> object:
-        if of.found[0].candidate.at == ("err",):
+    def fails(of: _Runner, column: tuple[int, int]) -> object:
+        candidate = of.parcel.candidates[column[0]]
+        if (candidate.effect, candidate.at) == ("quantisation", ("err",)):
             raise np.linalg.LinAlgError("SVD did not converge")
-        return plain(of)
+        return plain(of, column)
 
-    monkeypatch.setattr(proposals, "_sizes_at_place", fails)
+    monkeypatch.setattr(_Runner, "__call__", fails)
     quick, looked_for = DiagnosisOptions(fallback=False), ["lag", "quantisation"]
     found = diagnose(model(), experiments(lag=0.03), FREE, effects=looked_for, places=["wm", "err"], options=quick)
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text
     lines = {(c.effect, c.at): c.status for c in found.candidates if c.round == 1}
     assert lines["quantisation", ("err",)] == "failed: SVD did not converge", lines
     assert "failed" not in lines["lag", ("wm",)]
-
-
-def test_sizes_are_within_what_an_effect_may_have() -> None:
-    """A neighbour's size is taken over, of an effect with other bounds or another sign."""
-    lead = Probe("lead-lag", FrozenMap({"T1": 0.1, "T2": 0.2}), FrozenMap({"T1": (0.01, 1.0), "T2": (0.01, 1.0)}))
-    low = resized(lead, "T2", 0.0)
-    assert low.values["T2"] == effects()["lead-lag"].parameters["T2"].min == low.free["T2"][0]
-    below = resized(Probe("offset", FrozenMap({"c": 0.1}), FrozenMap({"c": (0.0, 0.5)})), "c", -2.0)
-    assert below.free["c"][0] < below.values["c"] == -2.0 < below.free["c"][1]

@@ -10,13 +10,13 @@ from cases import experiments
 from refits import beside, plain
 
 from hvdc_ident.discrepancy import search as searching
-from hvdc_ident.discrepancy.context import Round, SearchContext
+from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, clear
 from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.pushes import pushed
 from hvdc_ident.discrepancy.refit import Refit, run
 from hvdc_ident.discrepancy.refit_jobs import job_of
 from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.scores import runs
 from hvdc_ident.discrepancy.search import _last, forward, settled
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
@@ -121,13 +121,13 @@ def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Ref
     assert not {*inner} & {p for c in found.candidates for p in (*c.at, c.source)}
 
 
-def test_rounds_that_are_over_let_go_of_the_answers_and_have_them_again() -> None:
+def test_rounds_that_are_over_have_the_answers_of_their_model() -> None:
     recorded = experiments(lag=0.03, offset=0.3)
     first = plain(recorded)
     search = SearchContext(("lag", "offset"), ("wm", "drag"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     outcome = forward(search, first)
-    assert len(outcome.kept) == 2 and not any(r.paths for r in outcome.kept)
-    again, anew = outcome.rounds[0].answers(), runs(first.model, first.nominal())
+    assert len(outcome.kept) == 2
+    again, anew = outcome.rounds[0].answers(), pushed(first, slot_signals(first))
     assert again.keys() == anew.keys() == {"fit-1", "fit-2"}
     for name, path in anew.items():
         np.testing.assert_array_equal(again[name].signal("wm"), path.signal("wm"))

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.signatures.candidates import own_sources
+from hvdc_ident.discrepancy.candidates import own_sources
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card

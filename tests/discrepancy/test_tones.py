@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hvdc_ident.discrepancy.scores import tones
+from hvdc_ident.discrepancy.residual_checks import tones
 
 
 @pytest.mark.parametrize("missing", [(), (50,), (50, 120, 121)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -16,19 +15,16 @@ from scipy.integrate import solve_ivp
 from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.context import Course, SearchContext
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, clear
-from hvdc_ident.discrepancy.neighbours import _neighbours
+from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.evidence import clear
+from hvdc_ident.discrepancy.movable import Form, movable
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
 from hvdc_ident.discrepancy.refit_jobs import as_given, job
-from hvdc_ident.discrepancy.refitted import best_each, once_more, refitted
 from hvdc_ident.discrepancy.residual_checks import loud_after_breaks
 from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.size_profile import _polished, hopped
 from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel
 
 PERIOD = 0.033
 WINDOW = 0.05
@@ -64,13 +60,20 @@ def sampled(inputs: dict[str, InputSignal]) -> Array:
     return rows
 
 
+def searched(before: Refit, effects: tuple[str, ...], places: tuple[str, ...]) -> list[Refit]:
+    """The refits of one round that looks for some effects at some places, the best first."""
+    search = SearchContext(effects, places, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
+    found = one_round(search, before, 1)
+    assert found.trials, found.why
+    return sorted((t.refit for t in found.trials), key=lambda r: r.chi2)
+
+
 def test_a_period_is_met_that_no_slope_leads_to() -> None:
-    job = beginning(plain(records(sampled)), "sample-hold", "wm", {"Ts": 0.039, "compute": 0.0})
-    name = job.placed[0].names["Ts"]
-    search = SearchContext("all", None, FrozenMap(), DiagnosisOptions(), seed=0)
-    stuck, (refit,) = run(job), hopped(search, [job], [""])
-    assert abs(stuck.values[name] / PERIOD - 1.0) > 0.1
-    assert refit.values[name] == pytest.approx(PERIOD, rel=2e-3)
+    first = plain(records(sampled))
+    job = beginning(first, "sample-hold", "wm", {"Ts": 0.039, "compute": 0.0})
+    stuck, refit = run(job), searched(first, ("sample-hold",), ("wm",))[0]
+    assert abs(stuck.values[job.placed[0].names["Ts"]] / PERIOD - 1.0) > 0.1
+    assert refit.sizes(refit.placed[-1])["Ts"] == pytest.approx(PERIOD, rel=2e-3)
     assert refit.chi2 == pytest.approx(refit.rows, rel=0.1)
 
 
@@ -83,21 +86,25 @@ def test_a_level_that_stands_right_may_be_another_number_of_steps_from_nothing()
         noise = e.measured.values - clean.values
         stepped = np.column_stack([0.01 * np.round(clean["w"] / 0.01), clean["torque"]])
         rounded.append(replace(e, measured=replace(e.measured, values=stepped + 0.3 * noise), noise=FrozenMap()))
-    job = beside(plain(rounded), "quantisation", "outputs.w", {"step": 1.0 / 99.0}, {"step": (1e-3, 0.1)})
-    search = SearchContext("all", None, FrozenMap(), DiagnosisOptions(), seed=0)
-    (refit,) = hopped(search, [job], [""])
+    first = plain(rounded)
+    job = beside(first, "quantisation", "outputs.w", {"step": 1.0 / 99.0}, {"step": (1e-3, 0.1)})
+    refit = searched(first, ("quantisation",), ("outputs.w",))[0]
     assert refit.sizes(refit.placed[-1])["step"] == pytest.approx(0.01, rel=1e-4)
     assert refit.chi2 < 0.2 * run(job).chi2
 
 
-def test_sizes_of_one_form_share_a_model() -> None:
+def test_places_and_sizes_of_one_form_share_a_model() -> None:
+    """And where the effect is moved there, or put in, a refit comes to the same end."""
     before = plain(experiments(lag=0.03))
     sizes = [Probe("lag", FrozenMap({"T": t}), FrozenMap({"T": (1e-3, 0.3)})) for t in (0.01, 0.05)]
-    made: dict[Hashable, AnyModel] = {}
-    jobs = [job(before, [CandidateEffect("lag", ("wm",), tuple(sizes))], [Pick(0, k, 1.0, 1.0)], made) for k in (0, 1)]
-    assert jobs[0].model is jobs[1].model and len(made) == 1
-    ends = [run(j) for j in jobs]
-    assert ends[0].chi2 == pytest.approx(ends[1].chi2, rel=1e-6)
+    lags = {p: CandidateEffect("lag", (p,), tuple(sizes)) for p in ("wm", "drag")}
+    moving = movable(model(), Form("lag", ("T",)), tuple(lags), ())
+    jobs = {(p, k): job(before, c, k, 1.0, before.theta, moving) for p, c in lags.items() for k in (0, 1)}
+    assert {id(j.model) for j in jobs.values()} == {id(moving.model)}
+    for (place, size), moved in jobs.items():
+        end, put_in = run(moved), run(job(before, lags[place], size, 1.0, before.theta))
+        assert end.chi2 == pytest.approx(put_in.chi2, rel=1e-6)
+    assert run(jobs["wm", 0]).chi2 == pytest.approx(run(jobs["wm", 1]).chi2, rel=1e-6)
 
 
 def test_what_answers_within_a_few_rows_is_louder_after_breaks() -> None:
@@ -114,13 +121,13 @@ def test_what_answers_within_a_few_rows_is_louder_after_breaks() -> None:
     assert not any(loud_after_breaks(n) for n in louder)
 
 
-def test_gains_that_moved_far_are_given_back_as_another_start() -> None:
+def test_gains_that_moved_are_given_back_as_another_start() -> None:
     before = plain(experiments(lag=0.03))
     moved = replace(before, theta=np.array([0.7, 11.0]))
     given = as_given(moved)
     assert given is not None and given.tolist() == [f.start for f in FREE]
-    near = replace(before, theta=np.array([2.3, 11.0]))
-    assert as_given(near) is None
+    there = replace(before, theta=np.array([f.start for f in FREE]))
+    assert as_given(there) is None
 
 
 def test_parameters_that_are_vague_one_by_one_are_clear_together() -> None:
@@ -171,24 +178,14 @@ def test_of_two_that_explain_the_fitted_steps_alike_the_held_out_one_decides() -
     assert best.parameters["T"].value == pytest.approx(WINDOW, rel=0.03)
 
 
-def test_a_kind_of_delay_is_begun_where_it_is_as_late_as_the_best() -> None:
-    """A window, whose scores at the sizes probed lead nowhere near, beside a delay that is right to first order."""
-    records_of = records(ramped)
-    first = plain(records_of)
-    search = SearchContext(
-        ("delay", "window-mean", "lag"), ("ref",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0
-    )
-    opened = replace(one_round(search, first, 1), trials=())
-    names = {c.effect: k for k, c in enumerate(opened.candidates)}
+def test_a_kind_of_delay_is_refitted_beside_one_that_is_right_to_first_order() -> None:
+    """A window, of which a delay, or a lag, explains most; the one that explains less is left on its way."""
+    first = plain(records(ramped))
+    ends = searched(first, ("delay", "window-mean", "lag"), ("ref",))
+    assert ends[0].placed[-1].candidate.effect == "window-mean" and len(ends) == 2
+    assert ends[0].sizes(ends[0].placed[-1])["T"] == pytest.approx(WINDOW, rel=0.02)
     late = run(beside(first, "delay", "ref", {"T": WINDOW / 2}, {"T": (1e-3, 0.3)}))
-    trial = CandidateFit(Pick(names["delay"], 0, 1.0, 0.0), late, 0.0)
-    opened, picks = _neighbours(opened, [trial], [trial], [], set(), set())
-    begun = refitted(search, opened, picks, "neighbours")
-    assert {opened.candidates[t.pick.candidate].effect for t in begun} == {"window-mean", "lag"}
-    best = min(begun, key=lambda t: t.refit.chi2)
-    assert opened.candidates[best.pick.candidate].effect == "window-mean"
-    assert best.refit.values["window_mean_ref_T"] == pytest.approx(WINDOW, rel=0.02)
-    assert best.refit.chi2 < late.chi2
+    assert ends[0].chi2 < late.chi2
 
 
 def test_the_same_effect_elsewhere_is_refitted_where_the_best_is_on_a_bound() -> None:
@@ -197,16 +194,10 @@ def test_the_same_effect_elsewhere_is_refitted_where_the_best_is_on_a_bound() ->
         model(),
         [{"effect": "coupling", "at": ["err"], "parameters": {"k": -0.9}, "from": "ref"}],
     )
-    recorded = answered(deaf, experiments(), seed=0)
-    search = SearchContext(("coupling",), ("wm", "err"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    opened = one_round(search, plain(recorded), 1)
-    places = {(c.at, c.source): k for k, c in enumerate(opened.candidates)}
-    seen, told = places[("wm",), "w"], places[("err",), "ref"]
-    trials = refitted(search, opened, [Pick(seen, 0, 1.0, 1.0)], "the feedback")
-    opened, picks = _neighbours(opened, trials, trials, [], set(), set())
-    assert told in {p.candidate for p in picks}
-    (more,) = refitted(search, opened, [p for p in picks if p.candidate == told][:1], "the set-point")
-    assert more.refit.chi2 < 1.2 * more.refit.rows < trials[0].refit.chi2
+    ends = searched(plain(answered(deaf, experiments(), seed=0)), ("coupling",), ("wm", "err"))
+    there = {(r.placed[-1].candidate.at, r.placed[-1].candidate.source): r for r in ends}
+    told, seen = there[("err",), "ref"], there[("wm",), "w"]
+    assert told.chi2 < 1.2 * told.rows < seen.chi2
 
 
 def test_of_parameters_that_only_a_combination_is_told_of_that_is_judged() -> None:
@@ -223,58 +214,38 @@ def test_of_parameters_that_only_a_combination_is_told_of_that_is_judged() -> No
     assert three.apart[0] == pytest.approx(one.apart[0], rel=0.05)
 
 
-def test_a_size_that_was_met_is_carried_to_the_other_places() -> None:
-    """A sampler of the speed, found at the error: there it samples the set-point too, which its scores hardly tell."""
+def test_a_size_that_has_to_be_met_is_met_at_its_place_among_several() -> None:
+    """A sampler of the speed; at the error it samples the set-point too, and explains less."""
     period = PERIOD * 1.0001  # no sample falls on a break of the inputs
     there = apply_effects(model(), [{"effect": "sample-hold", "at": ["wm"], "parameters": {"Ts": period}}])
     first = plain(answered(there, experiments(), seed=0))
-    search = SearchContext(
-        ("sample-hold",), ("wm", "err", "ref"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0
-    )
-    opened = replace(one_round(search, first, 1), trials=())
-    at = {c.at: k for k, c in enumerate(opened.candidates)}
     near = run(beginning(first, "sample-hold", "err", {"Ts": period, "compute": 0.0}))
-    near = replace(near, theta=np.array([TRUE["Kp"], TRUE["Ki"], period]))
-    lead = CandidateFit(Pick(at[("err",)], 0, 1.0, 0.0), near, 0.0)
-    opened, picks = _neighbours(opened, [lead], [lead], [], set(), set())
-    moved = refitted(search, opened, picks, "neighbours")
-    best = {opened.candidates[t.pick.candidate].at: t.refit for t in best_each(moved)}
-    assert set(best) == {("wm",), ("ref",)}
-    assert best[("wm",)].chi2 < 1.2 * best[("wm",)].rows < near.chi2
+    best = searched(first, ("sample-hold",), ("wm", "err", "ref"))[0]
+    assert best.placed[-1].candidate.at == ("wm",)
+    assert best.chi2 < 1.2 * best.rows < near.chi2
+    assert best.sizes(best.placed[-1])["Ts"] == pytest.approx(period, rel=1e-4)
 
 
-@pytest.mark.parametrize(("least", "places"), [(1e-3, ["wm"]), (0.3, ["wm", "err"])])
-def test_of_one_effect_the_best_is_looked_for_again_first(least: float, places: list[str]) -> None:
-    """And the others only where it comes to nothing: within its bounds is no period that fits."""
-    looks: list[str] = []
-    search = SearchContext(
-        ("sample-hold",), ("wm", "err"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0,
-        course=Course(lambda _done, _total, text: looks.append(text.partition(";")[0])),
-    )  # fmt: skip
-    first = plain(records(sampled))
-    opened = replace(one_round(search, first, 1), trials=())
-    at = {c.at[0]: k for k, c in enumerate(opened.candidates)}
-    begun = [
-        run(beside(first, "sample-hold", p, {"Ts": 0.4, "compute": 0.0}, {"Ts": (least, 1.0)})) for p in ("wm", "err")
-    ]
-    # Both are worth it, that at the speed more: what they came to is said here, for it is the order that is tested.
-    fall = first.chi2 - first.rows
-    said = [replace(r, chi2=first.chi2 - share * fall) for r, share in zip(begun, (0.8, 0.7), strict=True)]
-    trials = [CandidateFit(Pick(at[r.placed[0].use.at[0]], 0, 1.0, 0.0), r, 0.0) for r in said]
-    looks.clear()
-    again = once_more(search, opened, trials, "once more")[0].refit
-    assert list(dict.fromkeys(text.partition(" at ")[2] for text in looks)) == places
-    assert (again.chi2 < 1.2 * again.rows) == (places == ["wm"])
-
-
-def test_a_refit_of_levels_is_polished_without_slopes() -> None:
+def test_a_size_of_levels_is_met_that_no_slope_leads_to() -> None:
     """Where a gain moves rows go over an edge, and no slope tells of it: begun a little off, a refit is stuck at once."""
     there = apply_effects(model(), [{"effect": "quantisation", "at": ["wm"], "parameters": {"step": 0.03}}])
     first = plain(answered(there, experiments(), seed=0))
     stuck = run(beside(first, "quantisation", "wm", {"step": 0.0302}, {"step": (1e-3, 0.3)}))
     assert stuck.chi2 > 5.0 * stuck.rows
-    free = _polished(stuck)
+    free = searched(first, ("quantisation",), ("wm",))[0]
     assert free.chi2 < 1.2 * free.rows
-    values = dict(zip(stuck.problem.names, free.theta, strict=True))
-    assert values["quantisation_wm_step"] == pytest.approx(0.03, rel=1e-4)
-    assert values["Ki"] == pytest.approx(TRUE["Ki"], rel=0.005)
+    assert free.sizes(free.placed[-1])["step"] == pytest.approx(0.03, rel=1e-4)
+    assert free.values["Ki"] == pytest.approx(TRUE["Ki"], rel=0.005)
+
+
+def test_a_level_that_a_signal_never_reaches_is_left_for_one_that_it_does() -> None:
+    """Above what the torque comes to, no slope leads to the level of its meter."""
+    level, bounds = 0.9, (0.1, 6.0)
+    first = plain(experiments(meter=lambda torque: np.clip(torque, -level, level)))
+    job = beside(first, "limit", "outputs.torque", {"level": 3.0}, {"level": bounds})
+    stuck, found = run(job), searched(first, ("limit",), ("outputs.torque",))[0]
+    assert stuck.values[job.placed[-1].names["level"]] == pytest.approx(3.0)
+    assert stuck.chi2 == pytest.approx(first.chi2, rel=1e-6)
+    assert found.sizes(found.placed[-1])["level"] == pytest.approx(level, rel=2e-3)
+    assert found.values["Kp"] == pytest.approx(TRUE["Kp"], rel=2e-3)
+    assert found.chi2 / found.rows == pytest.approx(1.0, abs=0.1)

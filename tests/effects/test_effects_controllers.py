@@ -9,9 +9,9 @@ import pytest
 from scipy import integrate
 
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.discrepancy.candidates import candidates
 from hvdc_ident.effects import apply_effects, effects
-from hvdc_ident.errors import InputError, ModelError
+from hvdc_ident.errors import ModelError
 from hvdc_ident.linearize import find_operating_point, linearize
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
@@ -244,9 +244,11 @@ def test_limits_of_one_state_work_together_and_on_the_state_that_an_effect_adds(
 
 
 @pytest.mark.parametrize("effect", ["state-rate-limit", "non-windup-limit"])
-def test_what_changes_a_state_s_equation_sits_at_states_and_is_not_tried(effect):
+def test_what_changes_a_state_s_equation_sits_at_states_and_is_tried_there(effect):
     with pytest.raises(ModelError, match=r"cannot sit at the input 'load'; expected state"):
         at(GOVERNOR, (effect, "load", dict(effects()[effect].example)))
-    record = experiment("e", TIME, {"load": 0.0})
-    with pytest.raises(InputError, match=rf"does not try the effect '{effect}'.*\[\[model.effect\]\]"):
-        diagnose(GOVERNOR, [record], [], effects=[effect])
+    moved = experiment("e", TIME, {"load": InputSignal.step(1.0, 0.0, 0.1)})
+    slots = [p for p in GOVERNOR.insertion_points if not p.startswith("outputs.")]
+    run = simulate(GOVERNOR, moved, outputs=slots)
+    tried = candidates(GOVERNOR, {p: (np.asarray(run[p]),) for p in slots}, [TIME], [effect], None)
+    assert {p for c in tried for p in c.at} == set(GOVERNOR.states)

@@ -10,7 +10,7 @@ from c_models import DECAY, FAULTY, TWIN, spring
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.discrepancy.signatures.candidates import candidates
+from hvdc_ident.discrepancy.candidates import candidates
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import ModelError, UnknownNameError
 from hvdc_ident.fit import FitParameter

@@ -13,9 +13,11 @@ from typer.testing import CliRunner, Result
 
 from hvdc_ident.cli import app
 from hvdc_ident.discrepancy.context import slot_signals
-from hvdc_ident.discrepancy.signatures.response import along
+from hvdc_ident.discrepancy.nominal import nominal
+from hvdc_ident.discrepancy.refit import Refit, judged
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.fit.noise_model import autoregression
-from hvdc_ident.simulate import simulate
+from hvdc_ident.simulate import ModelSimulator, simulate
 from hvdc_ident.study.study import load_study
 
 LAG = """schema = 1
@@ -158,6 +160,9 @@ def test_an_infinite_slope_at_rest_does_not_end_a_diagnosis(tmp_path: Path) -> N
 def test_nothing_is_looked_for_inside_an_instrument(tmp_path: Path) -> None:
     text = MOVED + "instrument = {y = {window-mean = 0.05, delay = 0.001}}\n"
     loaded = load_study(study(tmp_path, LAG, RECORD, text))
-    path = along(loaded.model, loaded.experiments[0], loaded.model.values)
-    assert {*slot_signals(loaded.model, {"e": path})} == {"u", "x", "ramp", "y"}
-    assert len(path.slots) > 4
+    free = (FitParameter("T", 0.1, 0.01, 1.0),)
+    start, _ = nominal(
+        ModelSimulator(loaded.model), loaded.experiments, free, {}, None, starts=1, seed=0, executor=None
+    )
+    first = judged(Refit(loaded.model, (), start.problem, start.noise, start.theta))
+    assert {*slot_signals(first)} == {"u", "x", "ramp", "y"}

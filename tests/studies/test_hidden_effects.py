@@ -13,13 +13,12 @@ import pytest
 from hvdc_ident import simulate as package
 from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import DiagnosisOptions
+from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.placed import added
 from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
 from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect
-from hvdc_ident.discrepancy.size_profile import hopped
 from hvdc_ident.effects import EffectUse, Probe, apply_effects, effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
@@ -30,6 +29,7 @@ sys.path.insert(0, str(STUDIES / "hidden_effects"))
 
 from hidden import campaigns, cases, judging, noise, sizes
 from hidden.diagnosing import diagnosed, experiments_of, free_of, model_of
+from hidden.kinds import OF_STATES
 from hidden.operators import CATALOGUE, OUTSIDE
 from hidden.plants import DRIVE, STATION
 from hidden.reporting import report
@@ -75,7 +75,9 @@ def test_what_hides_the_effects_does_not_know_the_package():
 
 
 def test_every_effect_of_the_catalogue_can_be_hidden():
-    assert set(CATALOGUE) == {n for n, e in effects().items() if e.tried_by_default and not e.needs_expression}
+    """By one simulator or the other: what acts on a state's equation by the second. A dead band with a step is hidden by neither."""
+    tried = {n for n, e in effects().items() if e.tried_by_default and not e.needs_expression}
+    assert set(CATALOGUE) | set(OF_STATES) == tried - {"deadband-step"}
     # A loop that rests on an edge, and a start that is no rest: there the two start otherwise, for reasons.
     assert set(CATALOGUE) - set(TOGETHER) == {"quantisation", "disturbance"}
 
@@ -400,8 +402,9 @@ def test_levels_are_met_that_a_loop_slides_between(large):
         model, before.problem, CandidateEffect("quantisation", ("Iline",), (probe,)), 0, 1.0
     )
     job = RefitJob(wider, (placed,), problem, (np.concatenate([before.theta, begin]),), before.noise)
-    found = hopped(SearchContext("all", None, FrozenMap(), DiagnosisOptions(), 0), [job], [""])[0]
-    assert found.sizes(placed)["step"] == pytest.approx(0.0638, rel=1e-3)
+    search = SearchContext(("quantisation",), ("Iline",), FrozenMap(), DiagnosisOptions(), 0)
+    found = min((t.refit for t in one_round(search, before, 1).trials), key=lambda r: r.chi2)
+    assert found.sizes(found.placed[-1])["step"] == pytest.approx(0.0638, rel=1e-3)
     assert found.chi2 < 0.05 * run(job).chi2
 
 

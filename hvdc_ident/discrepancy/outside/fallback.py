@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
+from hvdc_ident.discrepancy.candidates import kind_of, source_signals
+from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.formula import Law, filled, labelled
 from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.outside.filtered import shape, transfer_function
 from hvdc_ident.discrepancy.outside.law import STABLE, Regression, law, over_signal, over_time, regression
+from hvdc_ident.discrepancy.pushes import Pushed
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.scores import Path
-from hvdc_ident.discrepancy.signatures.candidates import kind_of, source_signals
 from hvdc_ident.effects import effects
 from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
@@ -60,20 +60,12 @@ def fallback(search: SearchContext, opened: Round) -> Fallback:
 def _places(search: SearchContext, opened: Round) -> list[str]:
     """Slots inside the model that are heard at the outputs."""
     paths = opened.answers()
-    inner = [
-        p
-        for p in slot_signals(opened.before.model, paths)
-        if kind_of(opened.before.model, p) in ("signal", "algebraic")
-    ]
+    inner = [p for p in opened.signals if kind_of(opened.before.model, p) in ("signal", "algebraic")]
     inner = [p for p in inner if search.looks_at(p)]
     path = next(iter(paths.values()))
-    heard = []
-    for p in inner:
-        push = np.zeros((1, path.time.size, 1))
-        push[0, path.time.size // 8 :, 0] = 1.0
-        if np.any(np.abs(path.answer([p], push)[1]) > 1e-12):
-            heard.append(p)
-    return heard
+    push = np.zeros((path.time.size, 1))
+    push[path.time.size // 8 :] = 1.0
+    return [p for p in inner if np.any(np.abs(path.answer(p, push)) > 1e-9)]
 
 
 def law_found(found: Law) -> Fallback:
@@ -158,10 +150,10 @@ def _curve(search: SearchContext, opened: Round) -> Fallback:
     """The hidden input over time or over a signal, whichever explains more for its number of knots."""
     paths, nominal = opened.answers(), opened.before.nominal()
     begin, end = min(a.time[0] for a in paths.values()), max(a.time[-1] for a in paths.values())
-    signals = source_signals(opened.before.model, slot_signals(opened.before.model, paths))
+    signals = source_signals(opened.before.model, opened.signals)
     hats = over_time(paths)
 
-    def shape(place: str, over: str, at: Array, functions: Sequence[Callable[[str, Path], Array]]) -> _Shape:
+    def shape(place: str, over: str, at: Array, functions: Sequence[Callable[[str, Pushed], Array]]) -> _Shape:
         found = regression(nominal, paths, place, functions)
         values, gain = found.solved(range(len(functions)))
         return _Shape(gain - len(functions) * float(np.log(nominal.residual.size)), place, over, at, values, found)

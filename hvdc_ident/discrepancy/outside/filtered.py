@@ -13,16 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
-from hvdc_ident.discrepancy.evidence import CandidateFit, best_of
+from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
+from hvdc_ident.discrepancy.context import Round, SearchContext
+from hvdc_ident.discrepancy.evidence import CandidateFit
 from hvdc_ident.discrepancy.formula import Law
-from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import SHORTLIST
 from hvdc_ident.discrepancy.outside.law import standing
 from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.refitted import refitted
-from hvdc_ident.discrepancy.scores import scored
-from hvdc_ident.discrepancy.signatures.candidates import CandidateEffect, candidates
+from hvdc_ident.discrepancy.stand import Stand
 from hvdc_ident.immutable import FrozenMap
 
 BESIDES = ("low", "high")
@@ -39,18 +37,17 @@ def filtered(search: SearchContext, found: Round, trials: Sequence[CandidateFit]
     return standing(search, found, refits, [None] * len(refits), best)[1]
 
 
-def filters(search: SearchContext, found: Round, nominal: Nominal) -> tuple[CandidateFit, ...]:
-    """Filters refitted where they score best, those that no chain of the catalogue's effects is: first a band alone, then one
-    that is off below and above it too. nominal: the model before the round, projected."""
-    paths, before = found.answers(), found.before
-    signals, times = slot_signals(before.model, paths, before.placed), [path.time for path in paths.values()]
-    everywhere = candidates(before.model, signals, times, ("filter",), search.places)
-    whole = tuple(c for c in everywhere if found.reaches(c))
-    scores = scored(nominal, whole, paths, bootstraps=0, seed=search.seed, executor=search.executor)
-    picks = best_of(scores, whole)[:SHORTLIST]
-    both = replace(found, candidates=(*map(_band, whole), *whole), scores=scores)
-    wider = [replace(p, candidate=p.candidate + len(whole)) for p in picks]
-    trials = refitted(search, both, [*picks, *wider], "outside the catalogue")
+def filters(search: SearchContext, found: Round) -> tuple[CandidateFit, ...]:
+    """Filters refitted where they promise most, those that no chain of the catalogue's effects is: first a band alone, then one
+    that is off below and above it too."""
+    before, times = found.before, [e.time for e in found.before.problem.fitted_experiments]
+    whole = candidates(before.model, found.signals, times, ("filter",), search.places)
+    stand = Stand.of(search, before, whole, 1)
+    both = (*map(_band, whole), *whole)
+    screen = stand.screen(both, "outside the catalogue", range(len(whole)))
+    picks = list(screen.best().values())[:SHORTLIST]
+    wider = [replace(s, candidate=s.candidate + len(whole)) for s in picks]
+    trials = stand.refitted(both, [*picks, *wider], "outside the catalogue")
     return tuple(t for t in trials if not t.refit.failure and _rings(t.refit))
 
 

@@ -14,19 +14,18 @@ from functools import cache, cached_property
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
+from hvdc_ident.discrepancy.candidates import source_signals
+from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler
 from hvdc_ident.discrepancy.formula import Law, Term, at_run, formula_job, hats, terms
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import BEAM, REFUTED, SHORTLIST
+from hvdc_ident.discrepancy.pushes import Pushed, Whitening
 from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.record_noise import draws
 from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.refitted import is_far
 from hvdc_ident.discrepancy.residual_checks import residual_tests
-from hvdc_ident.discrepancy.scores import Path, Whitening
-from hvdc_ident.discrepancy.signatures.candidates import source_signals
-from hvdc_ident.discrepancy.signatures.response import Along
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.executor import mapped
 
@@ -102,35 +101,35 @@ class Regression:
 
 
 def regression(
-    nominal: Nominal, paths: Mapping[str, Path], place: str, functions: Sequence[Callable[[str, Path], Array]]
+    nominal: Nominal, paths: Mapping[str, Pushed], place: str, functions: Sequence[Callable[[str, Pushed], Array]]
 ) -> Regression:
     """The regression of the residual on functions of time put on a slot; each gives (K,) for an experiment and its run."""
     parts = []
     for e in nominal.problem.fitted_experiments:
         path = paths[e.name]
-        d = np.array([f(e.name, path) for f in functions]).T[None]
+        d = np.array([f(e.name, path) for f in functions]).T
         whitening = Whitening.of([b for b in nominal.blocks if b.experiment == e.name], e, nominal)
-        parts.append(whitening(path.answer([place], d)[1]))
+        parts.append(whitening(path.answer(place, d)))
     columns = nominal.projected(np.vstack(parts))
     return Regression(np.where(np.isfinite(columns), columns, 0.0), nominal.projected(nominal.residual[:, None])[:, 0])
 
 
-def over_time(paths: Mapping[str, Path]) -> list[Callable[[str, Path], Array]]:
+def over_time(paths: Mapping[str, Pushed]) -> list[Callable[[str, Pushed], Array]]:
     """Hats over time, the same in every experiment."""
     begin, end = min(a.time[0] for a in paths.values()), max(a.time[-1] for a in paths.values())
     return [_hat(np.linspace(begin, end, TIME_KNOTS), k, lambda _, a: a.time) for k in range(TIME_KNOTS)]
 
 
 def over_signal(
-    paths: Mapping[str, Path], signal: str, knots: int = 9
-) -> tuple[Array, list[Callable[[str, Path], Array]]]:
+    paths: Mapping[str, Pushed], signal: str, knots: int = 9
+) -> tuple[Array, list[Callable[[str, Pushed], Array]]]:
     """Knots over the levels of a signal, and hats over them."""
     whole = np.concatenate([a.signal(signal) for a in paths.values()])
     at = np.linspace(float(whole.min()), float(whole.max()), knots)
     return at, [_hat(at, k, lambda _, a: a.signal(signal)) for k in range(knots)]
 
 
-def _hat(at: Array, k: int, of: Callable[[str, Path], Array]) -> Callable[[str, Path], Array]:
+def _hat(at: Array, k: int, of: Callable[[str, Pushed], Array]) -> Callable[[str, Pushed], Array]:
     unit = np.eye(at.size)[k]
     return lambda name, path: np.asarray(np.interp(of(name, path), at, unit))
 
@@ -146,6 +145,8 @@ KNOTS = 11
 """Of a curve: a tenth of what its signal travels from one to the next."""
 MOSTLY = 0.75
 """Share of what is beyond noise that a form has to explain to first order to be tried by full simulation."""
+LOOKED_AT = 12
+"""Slots that forms are looked for at."""
 OVER = 6
 """Signals that a curve at a slot may be over."""
 
@@ -158,7 +159,7 @@ class _SlotLibrary:
     """
 
     nominal: Nominal
-    paths: Mapping[str, Along]
+    paths: Mapping[str, Pushed]
     place: str
     library: tuple[Term, ...]
     curves: tuple[tuple[Term, ...], ...]
@@ -200,11 +201,11 @@ class _Form:
 def law(search: SearchContext, found: Round, best: Refit | None = None) -> Law | None:
     """The formula that explains most of what the model before a round lacks; None where none stands every test.
 
-    Looked for within reach, as the round has it. None, too, for a model that is closed inside. best: of the refits of the
+    None, too, for a model that is closed inside. best: of the refits of the
     catalogue, which a formula has to beat to be near the noise where they are not.
     """
-    before, paths = found.before, {n: p for n, p in found.answers().items() if isinstance(p, Along)}
-    if len(paths) < len(before.problem.fitted_experiments):
+    before, paths = found.before, found.answers()
+    if not paths:
         return None
     gap = before.chi2 - before.rows
     forms = [f for f in _forms(search, found, paths) if f.fall > MOSTLY * gap]
@@ -225,7 +226,7 @@ def _best(search: SearchContext, found: Round, forms: Sequence[_Form], best: Ref
             jobs.append(formula_job(before, form.place, form.terms, form.coefficients))
             of.append(form)
     texts = [f"outside the catalogue: {form.label}" for form in of]
-    refits = Race().run(search, before.chi2, jobs, texts)
+    refits = Race().run(search, before, jobs, texts)
     k, one = standing(search, found, refits, [form.stability for form in of], best)
     return one and replace(one, terms=of[k].terms)
 
@@ -248,10 +249,10 @@ def _price(search: SearchContext, found: Round) -> float:
     return search.options.named_bic + float(np.log(found.before.rows))
 
 
-def _forms(search: SearchContext, found: Round, paths: Mapping[str, Along]) -> list[_Form]:
+def _forms(search: SearchContext, found: Round, paths: Mapping[str, Pushed]) -> list[_Form]:
     """Of every slot the terms that are chosen there; what brings most first."""
     before, nominal = found.before, found.before.nominal()
-    signals = slot_signals(before.model, paths, before.placed)
+    signals = found.signals
     sources = source_signals(before.model, signals)
     drawn = draws(before.problem, nominal.blocks, before.noise, nominal.fitted(), AGAIN, search.seed + 77)
     noise, price = nominal.projected(np.vstack(drawn)), _price(search, found)
@@ -261,22 +262,23 @@ def _forms(search: SearchContext, found: Round, paths: Mapping[str, Along]) -> l
         return hats(signal, _levels([p.values[signal] for p in paths.values()]))
 
     jobs = []
-    for place in signals:
-        if search.looks_at(place) and (found.reach is None or place in found.reach.enough):
+    for place in _promising(found):
+        if search.looks_at(place):
             own = [n for n in (place.removeprefix("outputs."),) if all(n in p.values for p in paths.values())]
             near = list(dict.fromkeys([*own, *sources]))
             library, curves = terms(near), tuple(curve(n) for n in near[:OVER])
-            used = {n for t in (*library, *(t for c in curves for t in c)) for n in t.signals}
-            slim = {
-                n: replace(p.only(place), values={s: v for s, v in p.values.items() if s in used})
-                for n, p in paths.items()
-            }
-            jobs.append(_SlotLibrary(nominal, slim, place, library, curves, noise, price))
+            jobs.append(_SlotLibrary(nominal, paths, place, library, curves, noise, price))
     forms = []
     for k, own_forms in enumerate(mapped(search.executor, _at_slot, jobs)):
         search.tell(k + 1, len(jobs), f"hidden input at {jobs[k].place}")
         forms += own_forms
     return sorted(forms, key=lambda f: -f.worth(price))
+
+
+def _promising(found: Round) -> list[str]:
+    """Return the slots at which an effect of the catalogue, whichever, makes chi2 fall most."""
+    order = [found.candidates[k].at for k in found.screen.best()]
+    return list(dict.fromkeys(at[0] for at in order if len(at) == 1))[:LOOKED_AT]
 
 
 def _levels(signals: Sequence[Array]) -> Array:

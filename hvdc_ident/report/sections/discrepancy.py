@@ -220,9 +220,6 @@ def _where(found: dict[str, Any]) -> str:
         parts.append(
             f"It is densest where {text(region['signal'])} lies between {span(region['from'], region['to'], '', 3)}."
         )
-    if slots := place.get("slots"):
-        listed = ", ".join(f"{text(n)} {percentage(min(v, 1.0))}" for n, v in slots.items())
-        parts.append(f"An effect at one insertion point could explain at most: {listed}.")
     explained = left.get("explained_share")
     rest = "not all noise" if beyond_noise(found) else "noise" if left.get("adequate") else "no louder than noise"
     if explained is not None:

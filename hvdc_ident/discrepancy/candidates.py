@@ -22,7 +22,7 @@ from hvdc_ident.effects import (
     resistance_parameters,
     split_sources,
 )
-from hvdc_ident.errors import InputError, unknown_name
+from hvdc_ident.errors import unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, insertion_point
 
@@ -73,12 +73,6 @@ def entries(names: Iterable[str] | Literal["all"]) -> tuple[Effect, ...]:
     for name in ["all"] if names == "all" else names:
         if name != "all" and name not in catalogue:
             raise unknown_name("effect", name, catalogue)
-        if name != "all" and catalogue[name].of_derivative:
-            raise InputError(
-                f"a diagnosis does not try the effect '{name}', which changes a state's own equation",
-                expected="an effect on the signal that readers of a place see",
-                hint="put it into the model, as [[model.effect]] in a study, fit its parameters, and compare the misfit",
-            )
         chosen |= dict.fromkeys(sought if name == "all" else [name])
     return tuple(catalogue[n] for n in chosen if not catalogue[n].needs_expression)
 

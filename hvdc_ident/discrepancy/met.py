@@ -1,0 +1,188 @@
+"""Sizes that have to be met: levels of a quantiser and periods of a sampler, to which no slope leads.
+
+Each is run in all its sizes from the gains as they are; the best are refitted, and run again ever closer beside the size that they came
+to, from the gains that they came to.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.context import Round
+from hvdc_ident.discrepancy.evidence import CandidateFit
+from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.refit_jobs import as_given
+from hvdc_ident.discrepancy.refitted import best_each, by_cost
+from hvdc_ident.discrepancy.screen import Shot
+from hvdc_ident.discrepancy.stand import Stand, gains_of
+from hvdc_ident.effects import Probe, SignalScales, effects, size_grid
+from hvdc_ident.immutable import FrozenMap
+
+PLACES = 4
+"""Places at which a quantiser is tried in all its sizes, some thousand."""
+STRIDE = 3
+"""Of levels, which stand a tenth of one apart in the grid, the first look takes every third; then those between the best."""
+CLOSER = 4
+"""Times closer that the sizes stand at each further look."""
+TURNS = 4
+"""Further looks: after the last the sizes stand CLOSER ** TURNS times closer than in the grid, a part in 100 000 of the size."""
+ABOUT = 0.3
+"""Difference of the logarithms of two delays within which one may stand for the other."""
+
+
+def met(
+    stand: Stand, opened: Round, trials: list[CandidateFit], number: int, *, far: bool
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the round and its trials with effects whose size has to be met. far: whether nothing explains the records so far.
+
+    A quantiser is looked for at the places that promise most, where nothing else explains the records. A sampler is a delay to first
+    order: it is looked for in periods that delay as long as what was refitted, or as a quantiser is where no other delay is tried.
+    """
+    grids = _grids(opened, trials, far=far)
+    if not grids:
+        return opened, trials
+    text = f"round {number}: sizes to be met"
+    mostly = [gains_of(opened.before, t.refit) for t in by_cost(trials)[:1] if t.refit.chi2 < 0.5 * opened.before.chi2]
+    given = as_given(opened.before)
+    late = {k: g for k, g in grids.items() if effects()[opened.candidates[k].effect].equivalent_delay is not None}
+    levels = {k: g for k, g in grids.items() if k not in late}
+    # A sampler that is missing biases the gains as a delay does; levels hardly do.
+    best = _looked_at(stand, opened, late, text, [None, *mostly, *([] if given is None else [given])], most=SHORTLIST)
+    rough = _looked_at(
+        stand, opened, {k: g[::STRIDE] for k, g in levels.items()}, text, [None, *mostly], most=SHORTLIST
+    )
+    beside = {k: _beside(grids[k], [size for size, _ in own]) for k, own in rough.items()}
+    best |= _looked_at(stand, opened, beside, text, [None, *mostly])
+    opened, trials = _refitted(stand, opened, trials, best, text)
+    for turn in range(1, TURNS + 1):
+        for t in [t for t in by_cost(trials) if t.pick.candidate in grids][:BEAM]:
+            if stand.search.spent:
+                break
+            k, size = t.pick.candidate, _size(t.refit)
+            away = np.delete(np.arange(-CLOSER, CLOSER + 1), CLOSER) * _spacing(grids[k], size) / CLOSER**turn
+            near = _looked_at(stand, opened, {k: size + away}, text, [gains_of(opened.before, t.refit)])
+            opened, trials = _refitted(stand, opened, trials, near, text)
+    return opened, trials
+
+
+def _grids(opened: Round, trials: Sequence[CandidateFit], *, far: bool) -> dict[int, Array]:
+    """Return by candidate the sizes to be looked at, (m,), rising."""
+    found, entries = opened.candidates, effects()
+    told = [t for t in by_cost(trials) if t.refit.chi2 < opened.before.chi2][: None if far else BEAM]
+    late = {found[t.pick.candidate].at: d for t in reversed(told) if (d := _late(t.refit)) is not None}
+    delays = any(entries[c.effect].equivalent_delay is not None and not entries[c.effect].needs_grid for c in found)
+    times = [e.time for e in opened.before.problem.fitted_experiments]
+    count: Counter[str] = Counter()
+    grids: dict[int, Array] = {}
+    for k in opened.screen.best():
+        c = found[k]
+        entry = entries[c.effect]
+        if not entry.needs_grid or len(c.at) > 1:
+            continue
+        count[c.effect] += 1
+        probe, sizes = size_grid(entry, SignalScales.of(times, opened.signals[c.at[0]]))
+        sizes = np.unique(sizes)
+        if entry.equivalent_delay is not None and delays:
+            own = [entry.delay_with({**probe.values, _named(c): float(s)}) or 0.0 for s in sizes]
+            sizes = sizes[[_alike(d, late.get(c.at, 0.0)) for d in own]]
+        elif not (far and count[c.effect] <= PLACES):
+            continue
+        if sizes.size:
+            grids[k] = sizes
+    return grids
+
+
+def _late(refit: Refit) -> float | None:
+    """Return how long the effect that was added last delays a slow signal, s; None for one that has to be met itself, or no delay."""
+    placed = refit.placed[-1]
+    entry = effects()[placed.candidate.effect]
+    return None if entry.needs_grid else entry.delay_with(refit.sizes(placed))
+
+
+def _alike(one: float, other: float) -> bool:
+    return one > 0.0 and other > 0.0 and abs(math.log(one / other)) < ABOUT
+
+
+def _named(candidate: CandidateEffect) -> str:
+    """Return the name of the size that has to be met."""
+    return next(n for n, q in effects()[candidate.effect].parameters.items() if q.grid is not None)
+
+
+def _size(refit: Refit) -> float:
+    placed = refit.placed[-1]
+    return refit.sizes(placed)[_named(placed.candidate)]
+
+
+def _spacing(grid: Array, size: float) -> float:
+    """Return how far apart the sizes of a grid stand where one lies."""
+    if grid.size < 2:
+        return size / CLOSER
+    at = min(max(int(np.searchsorted(grid, size)), 1), grid.size - 1)
+    return float(grid[at] - grid[at - 1])
+
+
+def _beside(grid: Array, sizes: Sequence[float]) -> Array:
+    """Return the sizes of a grid next to some of them."""
+    at = [np.arange(max(k - STRIDE + 1, 0), min(k + STRIDE, grid.size)) for k in np.searchsorted(grid, sizes)]
+    return grid[np.unique(np.concatenate(at))]
+
+
+def _with_probes(candidate: CandidateEffect, sizes: Sequence[float]) -> CandidateEffect:
+    """Return the candidate with probes at these sizes alone."""
+    like, name = candidate.probes[0], _named(candidate)
+    low, high = like.free[name]
+    each = [
+        Probe(
+            like.effect,
+            like.values | {name: float(s)},
+            FrozenMap(like.free | {name: (min(low, 0.9 * float(s)), max(high, 1.1 * float(s)))}),
+        )
+        for s in sizes
+    ]
+    return replace(candidate, probes=tuple(each))
+
+
+def _looked_at(
+    stand: Stand,
+    opened: Round,
+    sizes: Mapping[int, Array],
+    text: str,
+    points: Sequence[Array | None],
+    most: int = BEAM,
+) -> dict[int, list[tuple[float, Shot]]]:
+    """Return by candidate the best of some sizes, none of them neighbours, with what the screen says of them."""
+    if not sizes:
+        return {}
+    found = [_with_probes(c, sizes[k].tolist()) if k in sizes else c for k, c in enumerate(opened.candidates)]
+    shots = [s for point in points for s in stand.screen(found, text, list(sizes), point, held=True).shots]
+    best: dict[int, list[Shot]] = {}
+    for s in sorted(shots, key=lambda s: -s.fall):
+        own = best.setdefault(s.candidate, [])
+        if len(own) < most and all(abs(s.probe - other.probe) > 1 for other in own):
+            own.append(s)
+    return {k: [(float(sizes[k][s.probe]), s) for s in own] for k, own in best.items()}
+
+
+def _refitted(
+    stand: Stand,
+    opened: Round,
+    trials: Sequence[CandidateFit],
+    best: Mapping[int, Sequence[tuple[float, Shot]]],
+    text: str,
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the round, whose candidates have these sizes too, and the trials with the refits begun there."""
+    found, shots = list(opened.candidates), []
+    for k, own in best.items():
+        more = _with_probes(found[k], [size for size, _ in own]).probes
+        shots += [replace(s, probe=len(found[k].probes) + n, factor=1.0) for n, (_, s) in enumerate(own)]
+        found[k] = replace(found[k], probes=(*found[k].probes, *more))
+    opened = replace(opened, candidates=tuple(found))
+    return opened, best_each([*trials, *stand.refitted(found, shots, text, trials)])

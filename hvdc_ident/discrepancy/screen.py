@@ -1,0 +1,403 @@
+"""The screen: every effect at every place, from every source, in a few sizes, simulated beside the parameters' answer.
+
+A candidate is a run of the model with the movable effect at its place, and a bounded Gauss-Newton step of the size and the unknowns
+from some point (the optimum of the model without effects, the given values, the end of a refit), with the answers that the unknowns
+have there without an effect. What noise alone makes of the best of all these candidates is had
+from records of noise (the largest of several statistics; Westfall and Young, 1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.optimize import lsq_linear
+
+from hvdc_ident.data import Array, Experiment
+from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.movable import Form, Movable, is_proportional, movable, on_loop
+from hvdc_ident.discrepancy.nominal import Nominal
+from hvdc_ident.discrepancy.placed import PATIENCE
+from hvdc_ident.effects import apply_effects, distance_from_neutral, effects
+from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.executor import Executor, mapped
+from hvdc_ident.fit import Problem
+from hvdc_ident.fit.problem import stacked
+from hvdc_ident.fit.residual import unknown_initial_states, with_steady_start
+from hvdc_ident.model import AnyModel, Model, insertion_point
+from hvdc_ident.simulate import ModelSimulator, Tolerance, simulate
+
+HASTE = Tolerance(rtol=1e-5, atol=1e-8, max_steps=PATIENCE.max_steps, search=False)
+"""Of a first look. Its runs are exact to a hundredth of the noise; one that has no steady state at once begins elsewhere."""
+STEPS = 100
+"""Times the steps of the model without an effect: a run that takes more, chattering in a loop, is passed over."""
+ANY, CHORD, HELD = (-np.inf, np.inf), (0.0, 1.0), (1.0, 1.0 + 1e-9)
+"""Factors on the size of an effect in proportion to it; of another, between nothing and the size that was run; of one that is held."""
+SEEN = 1.0
+"""Sum of squares of an answer, in noise units, below which no experiment excites it."""
+LEFT = 1e-3
+"""Share of the square of an answer that the parameters have to leave: runs of a search are exact to a few of its hundredths."""
+PARCEL = 150
+"""Candidates in one piece of work: some tenths of a second."""
+FAILURES = (HvdcIdentError, ValueError, ArithmeticError)
+"""Errors of the work on one candidate that cannot be done: the others are looked at all the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One candidate at one size.
+
+    candidate, probe: its places in the lists. fall: by how much chi2 falls, beside the model without effects at its
+    optimum. theta: the unknowns of that model after the step. factor: the size asked for, in units of the probe's distance from
+    neutral.
+    """
+
+    candidate: int
+    probe: int
+    fall: float
+    theta: Array
+    factor: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """What a screen of all candidates found.
+
+    shots: those that run, the best first. size, left: by candidate and probe the square of the answer in noise units, and what
+    of it the parameters leave. largest: (B,) the largest score of all in each record of noise. failures: by candidate why none
+    of its sizes runs.
+    """
+
+    shots: tuple[Shot, ...]
+    size: Mapping[tuple[int, int], float]
+    left: Mapping[tuple[int, int], float]
+    largest: Array
+    failures: Mapping[int, str]
+
+    def p(self, fall: float) -> float:
+        """Return the chance that noise alone makes chi2 fall as much anywhere."""
+        return float((1 + np.count_nonzero(self.largest >= fall)) / (1 + self.largest.size))
+
+    def threshold(self, significance: float) -> float:
+        """Return the fall that noise alone exceeds with this chance."""
+        return float(np.quantile(self.largest, 1.0 - significance)) if self.largest.size else 0.0
+
+    def best(self) -> dict[int, Shot]:
+        """Return the best shot of each candidate, the best first."""
+        found: dict[int, Shot] = {}
+        for s in self.shots:
+            found.setdefault(s.candidate, s)
+        return found
+
+    def usable(self, column: tuple[int, int]) -> bool:
+        """Return True for a size that the experiments excite and the parameters cannot make good."""
+        return self.size[column] >= SEEN and self.left[column] > LEFT * self.size[column]
+
+    def absorbed(self) -> list[int]:
+        """Return the candidates that the experiments excite and the parameters make good altogether."""
+        own: dict[int, list[bool]] = {}
+        for column, size in self.size.items():
+            if size >= SEEN:
+                own.setdefault(column[0], []).append(self.usable(column))
+        return [c for c, usable in own.items() if not any(usable)]
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What candidates are compared on: the model without them, its optimum, and noise.
+
+    places, sources: where movable effects may sit, and what they may bring in: the same for all, so that an effect is compiled
+    once. point: unknowns that candidates are looked at from. noise: (N, B) records, without what the parameters make good. held: whether
+    sizes are as they are.
+    """
+
+    model: AnyModel
+    nominal: Nominal
+    places: tuple[str, ...]
+    sources: tuple[str, ...]
+    point: Array
+    noise: NDArray[np.float32]
+    held: bool = False
+
+    @cached_property
+    def without(self) -> tuple[Array, Array]:
+        """(N,) the residual of the model without effects, and (N, p) its derivatives."""
+        own = self.nominal
+        return stacked(own.blocks if np.array_equal(self.point, own.theta) else own.problem.blocks(self.point))
+
+    @cached_property
+    def at_rest(self) -> tuple[Experiment, ...]:
+        """The experiments, those fitted begun at the steady state of the model without effects."""
+        return tuple(_at_rest(self.nominal.problem, e, self.point) for e in self.nominal.problem.experiments)
+
+    @cached_property
+    def haste(self) -> Tolerance:
+        """Return the tolerance of runs of a first look, which take no more than some times the steps of those without an effect."""
+        own = self.nominal.problem
+        runs = [
+            simulate(self.model, e.with_(measured=None), own.values(self.point), tolerance=HASTE)
+            for e in own.fitted_experiments
+        ]
+        most = max(r.statistics.accepted + r.statistics.rejected for r in runs)
+        return replace(HASTE, max_steps=min(STEPS * most, HASTE.max_steps))
+
+    def movable(self, form: Form) -> Movable:
+        """Return the model with an effect of this form, at one place, to be moved. It has to be one with equations."""
+        assert isinstance(self.model, Model)
+        model, kinds = self.model, effects()[form.effect].insertion_kinds
+        places = tuple(
+            p for p in self.places if insertion_point(model, p)[0] in kinds and on_loop(model, p) == form.loop
+        )
+        return movable(model, replace(form, copies=1), places, self.sources)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the unknowns."""
+        own = self.nominal.problem.unknowns
+        return np.array([u.min for u in own]), np.array([u.max for u in own])
+
+
+def _at_rest(problem: Problem, experiment: Experiment, theta: Array) -> Experiment:
+    """Return the experiment with the states that begin at rest begun where the problem's own model rests."""
+    states = unknown_initial_states(problem.simulator, experiment)
+    if experiment.role != "fit" or experiment.domain != "time" or not states:
+        return experiment
+    nuisance = problem.nuisances(experiment, theta)
+    return with_steady_start(problem.simulator, experiment, problem.values(theta), states, nuisance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Parcel:
+    """Columns (candidate, probe) of one form, and the candidates. movable: the models that they run on, by whether their place
+    is on a loop; none of a model that is closed inside."""
+
+    bench: Bench
+    movable: Mapping[bool, Movable]
+    columns: Sequence[tuple[int, int]]
+    candidates: Mapping[int, CandidateEffect]
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Of a parcel."""
+
+    shots: list[Shot]
+    size: dict[tuple[int, int], float]
+    left: dict[tuple[int, int], float]
+    largest: Array
+    failures: dict[int, str]
+
+
+def screened(
+    bench: Bench,
+    candidates: Sequence[CandidateEffect],
+    *,
+    executor: Executor | None = None,
+    tell: Callable[[int, int], None] = lambda done, total: None,
+    columns: Iterable[tuple[int, int]] | None = None,
+) -> Screen:
+    """Return the screen of candidates; one at several places is told by its parts.
+
+    columns: candidates and probes, by their places in the lists, instead of all that move.
+    """
+    every = ((k, n) for k, c in enumerate(candidates) if not c.still for n in range(len(c.probes)))
+    parcels = list(_parcels(bench, candidates, every if columns is None else columns))
+    shots: list[Shot] = []
+    size: dict[tuple[int, int], float] = {}
+    left: dict[tuple[int, int], float] = {}
+    failures: dict[int, str] = {}
+    largest = np.zeros(bench.noise.shape[1])
+    for done, found in enumerate(mapped(executor, _shot, parcels), start=1):
+        shots += found.shots
+        size |= found.size
+        left |= found.left
+        failures |= found.failures
+        largest = np.maximum(largest, found.largest)
+        tell(done, len(parcels))
+    ran = {s.candidate for s in shots}
+    return Screen(
+        ranked(shots, candidates), size, left, largest, {k: why for k, why in failures.items() if k not in ran}
+    )
+
+
+def ranked(shots: Iterable[Shot], candidates: Sequence[CandidateEffect]) -> tuple[Shot, ...]:
+    """Return shots, the best first; of equal falls the simpler: fewer places first, as listed."""
+    return tuple(
+        sorted(shots, key=lambda s: (-round(s.fall, 6), len(candidates[s.candidate].at), s.candidate, s.probe))
+    )
+
+
+def _parcels(
+    bench: Bench, candidates: Sequence[CandidateEffect], asked: Iterable[tuple[int, int]]
+) -> Iterator[_Parcel]:
+    """The columns by form; of a model that is closed inside each candidate by itself."""
+    model = bench.model
+    groups: dict[Form | int, list[tuple[int, int]]] = {}
+    for k, n in asked:
+        form = Form.of(model, candidates[k], candidates[k].probes[n].values) if isinstance(model, Model) else None
+        groups.setdefault(k if form is None else replace(form, copies=1, loop=False), []).append((k, n))
+    for key, columns in groups.items():
+        own = sorted(columns, key=lambda c: len(candidates[c[0]].at))
+        moved: dict[bool, Movable] = {}
+        if isinstance(key, Form) and isinstance(model, Model):
+            moved = {
+                x: bench.movable(replace(key, loop=x)) for x in {on_loop(model, candidates[k].at[0]) for k, _ in own}
+            }
+        # Those at several places are told by the answers at single ones, and stay with them.
+        alone = sum(len(candidates[k].at) == 1 for k, _ in own)
+        cut = [own] if alone < len(own) else [own[n : n + PARCEL] for n in range(0, len(own), PARCEL)]
+        for part in cut:
+            yield _Parcel(bench, moved, part, {k: candidates[k] for k, _ in part})
+
+
+def _shot(parcel: _Parcel) -> _Found:
+    """The columns of a parcel, simulated."""
+    bench, nominal, runner = parcel.bench, parcel.bench.nominal, _Runner(parcel)
+    low, high = (bound - bench.point for bound in bench.bounds)
+    was, jacobian = bench.without
+    chi2 = float(nominal.residual @ nominal.residual)
+    found = _Found([], {}, {}, np.zeros(bench.noise.shape[1]), {})
+    answers: dict[tuple[int, int], Array] = {}
+    units: list[Array] = []
+    several = any(len(parcel.candidates[k].at) > 1 for k, _ in parcel.columns)
+    for column in parcel.columns:
+        if len(parcel.candidates[column[0]].at) > 1 and parcel.movable:
+            continue
+        try:
+            r = runner(column)
+        except FAILURES as error:
+            found.failures[column[0]] = str(error) or type(error).__name__
+            continue
+        step, fell, factor = _stepped(was, jacobian, r - was, low, high, runner.reach)
+        found.shots.append(Shot(*column, chi2 - fell, bench.point + step, factor))
+        left = nominal.projected((was - r)[:, None])[:, 0]
+        found.size[column], found.left[column] = float(np.sum((was - r) ** 2)), float(left @ left)
+        if several:
+            answers[column] = was - r
+        if found.size[column] >= SEEN and found.left[column] > LEFT * found.size[column]:
+            units.append((left / np.sqrt(found.left[column])).astype(np.float32))
+        if len(units) == 64:
+            _raise(found.largest, units, bench.noise)
+    _raise(found.largest, units, bench.noise)
+    if several and parcel.movable:
+        _at_several(parcel, answers, found, chi2)
+    return found
+
+
+def _raise(largest: Array, units: list[Array], noise: NDArray[np.float32]) -> None:
+    """Raise the largest scores in records of noise to those of some answers, (N,) of length 1 each, which are then forgotten."""
+    if units:
+        scores = np.max(np.abs(np.array(units) @ noise), axis=0).astype(float) ** 2
+        np.maximum(largest, scores, out=largest)
+        units.clear()
+
+
+def _at_several(parcel: _Parcel, answers: Mapping[tuple[int, int], Array], found: _Found, chi2: float) -> None:
+    """Add what an effect at several places does, to first order: the sum of what it does at each, in proportion to its size."""
+    bench, candidates = parcel.bench, parcel.candidates
+    nominal = bench.nominal
+    low, high = (bound - bench.point for bound in bench.bounds)
+    was, jacobian = bench.without
+    single: dict[tuple[str, str], list[tuple[float, tuple[int, int]]]] = {}
+    for k, n in answers:
+        c = candidates[k]
+        single.setdefault((c.at[0], c.source), []).append((_distance(c, n), (k, n)))
+    for k, n in parcel.columns:
+        c = candidates[k]
+        if len(c.at) == 1:
+            continue
+        size, parts = _distance(c, n), []
+        for place, source in zip(c.at, c.sources or ("",) * len(c.at), strict=True):
+            own = single.get((place, source))
+            if not own or not size:
+                break
+            near, column = min(own, key=lambda s: abs(np.log(s[0] / size)) if s[0] > 0 else np.inf)
+            parts.append(answers[column] * (size / near if near else 1.0))
+        if len(parts) < len(c.at):
+            continue
+        answer = np.sum(parts, axis=0, dtype=float)
+        step, fell, factor = _stepped(was, jacobian, -answer, low, high, CHORD)
+        left = nominal.projected(answer[:, None])[:, 0]
+        found.size[k, n], found.left[k, n] = float(answer @ answer), float(left @ left)
+        found.shots.append(Shot(k, n, chi2 - fell, bench.point + step, factor))
+
+
+def _distance(candidate: CandidateEffect, probe: int) -> float:
+    """How far a probe is from doing nothing."""
+    away = distance_from_neutral(effects()[candidate.effect], candidate.probes[probe].values)
+    return max((abs(v) for v in away.values()), default=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Runner:
+    """Runs of the columns of a parcel."""
+
+    parcel: _Parcel
+
+    @cached_property
+    def reach(self) -> tuple[float, float]:
+        """Factors on the size that a step may ask for."""
+        if self.parcel.bench.held:
+            return HELD
+        return ANY if any(is_proportional(m.form) for m in self.parcel.movable.values()) else CHORD
+
+    @cached_property
+    def _problems(self) -> Mapping[bool, Problem]:
+        own = self.parcel.bench.nominal.problem
+        return {
+            x: replace(own, simulator=ModelSimulator(m.model, self.parcel.bench.haste, "rosenbrock"))
+            for x, m in self.parcel.movable.items()
+        }
+
+    @cached_property
+    def _from_rest(self) -> Mapping[bool, Problem]:
+        """The problems with runs that begin where the model without an effect rests."""
+        return {x: replace(p, experiments=self.parcel.bench.at_rest) for x, p in self._problems.items()}
+
+    def __call__(self, column: tuple[int, int]) -> Array:
+        """Return (N,) the whitened residual with a candidate in the size of a probe."""
+        bench, candidate = self.parcel.bench, self.parcel.candidates[column[0]]
+        own, theta, probe = bench.nominal.problem, bench.point, candidate.probes[column[1]]
+        if not self.parcel.movable or not isinstance(bench.model, Model):
+            larger = apply_effects(bench.model, [candidate.use(probe)])
+            return _residual(replace(own, simulator=ModelSimulator(larger, PATIENCE)), theta, {})
+        loop = on_loop(bench.model, candidate.at[0])
+        moved = self.parcel.movable[loop]
+        known = {n: q.value for n, q in own.simulator.parameters.items()} | own.values(theta)
+        named = {n: known[str(p)] for n, p in candidate.named.items()}
+        values = moved.placed(candidate) | moved.sized({**probe.values, **named})
+        try:
+            return _residual(self._problems[loop], theta, values)
+        except FAILURES:  # it leaves no steady state, as levels in a loop do not, or none near
+            return _residual(self._from_rest[loop], theta, values)
+
+
+def _residual(problem: Problem, theta: Array, values: Mapping[str, float]) -> Array:
+    return np.concatenate([b.residual for b in problem.blocks(theta, also=values, derivatives=False)])
+
+
+def _stepped(
+    residual: Array, jacobian: Array, added: Array, low: Array, high: Array, reach: tuple[float, float]
+) -> tuple[Array, float, float]:
+    """Return the bounded step that lowers chi2 most to first order, chi2 after it, and the factor on the size.
+
+    residual: without the effect; added: what the effect adds to it in the size that was run. reach: bounds of the factor.
+    """
+    columns = np.column_stack([jacobian, added])
+    scale = np.linalg.norm(columns, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    square, asked = (columns / scale).T @ (columns / scale), (columns / scale).T @ residual
+    least, most = scale * np.append(low, reach[0]), scale * np.append(high, reach[1])
+    # Of columns of length 1; what is made of the others is told by rounding alone.
+    half = np.linalg.cholesky(square + 1e-10 * np.eye(scale.size)).T
+    target = -solve_triangular(half, asked, trans="T")
+    step = solve_triangular(half, target)
+    if ((step < least) | (step > most)).any():
+        step = np.clip(lsq_linear(half, target, (least, most), method="bvls").x, least, most)
+    chi2 = float(residual @ residual + 2.0 * asked @ step + step @ square @ step)
+    found = step / scale
+    return found[:-1], max(chi2, 0.0), float(found[-1])

@@ -1,0 +1,178 @@
+"""The screen of candidates: its step against scipy's, its scores against a direct computation, and what it says of a hidden lag."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cases import experiments, model
+from refits import plain
+from scipy.optimize import lsq_linear
+from scipy.stats import chi2, kstest
+
+from hvdc_ident import InputSignal, simulate
+from hvdc_ident.data import Array, Experiment
+from hvdc_ident.discrepancy import DiagnosisOptions
+from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
+from hvdc_ident.discrepancy.context import SearchContext, slot_signals
+from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
+from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.refit_jobs import as_given
+from hvdc_ident.discrepancy.screen import ANY, CHORD, _stepped, screened
+from hvdc_ident.discrepancy.stand import Stand
+from hvdc_ident.effects import apply_effects, effects
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.simulate import ModelSimulator, Tolerance
+
+
+def test_what_runs_away_is_none_of_it() -> None:
+    """An unstable candidate's answer is 1e30 times the residual: none of it explains anything."""
+    residual, jacobian, low, high = problems(3)
+    away = 1e30 * np.exp(np.linspace(0.0, 5.0, 40))
+    step, left, factor = _stepped(residual, jacobian, away, low, high, CHORD)
+    without = lsq_linear(jacobian, -residual, (low, high), tol=1e-14)
+    assert left <= 2.0 * without.cost * (1.0 + 1e-9) and abs(factor) * 1e30 < 10.0 * np.abs(residual).max()
+    assert left > 0.5 * without.cost and np.all(step >= low) and np.all(step <= high)
+
+
+def stand(before: Refit, found: tuple[CandidateEffect, ...], bootstraps: int = 200) -> Stand:
+    """Return what the candidates of a first round are compared on."""
+    search = SearchContext("all", None, FrozenMap(), DiagnosisOptions(bootstraps=bootstraps), seed=0)
+    return Stand.of(search, before, found, 1)
+
+
+def listed(before: Refit, names: tuple[str, ...], places: tuple[str, ...] | None = None) -> tuple[CandidateEffect, ...]:
+    """Return the candidates of some effects."""
+    times = [e.time for e in before.problem.fitted_experiments]
+    return candidates(before.model, slot_signals(before), times, names, places)
+
+
+def problems(seed: int) -> tuple[Array, Array, Array, Array]:
+    """Return a residual, its derivatives of very different sizes, and bounds on a step about as long as the best without any."""
+    random = np.random.default_rng(seed)
+    count = int(random.integers(1, 7))
+    jacobian = random.standard_normal((40, count)) * np.geomspace(1.0, 1e4, count)
+    residual = 3.0 * random.standard_normal(40)
+    length = np.abs(np.linalg.lstsq(jacobian, residual)[0])
+    return residual, jacobian, -length * random.uniform(0.0, 2.0, count), length * random.uniform(0.0, 2.0, count)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_step_without_bounds_is_that_of_least_squares(seed: int) -> None:
+    residual, jacobian, low, high = problems(seed)
+    slope = np.random.default_rng(1000 + seed).standard_normal(40)
+    step, left, factor = _stepped(residual, jacobian, slope, 1e9 * low - 1e9, 1e9 * high + 1e9, ANY)
+    columns = np.column_stack([jacobian, slope])
+    best = np.linalg.lstsq(columns, -residual)[0]
+    assert np.append(step, factor) == pytest.approx(best, rel=1e-6)
+    assert left == pytest.approx(float(np.sum((residual + columns @ best) ** 2)), rel=1e-9)
+
+
+@pytest.mark.parametrize("reach", [ANY, CHORD])
+def test_a_step_within_bounds_is_the_best_there_is(reach: tuple[float, float]) -> None:
+    """The bounds of most of these problems are reached."""
+    reached = 0
+    for seed in range(60):
+        residual, jacobian, low, high = problems(seed)
+        slope = np.random.default_rng(1000 + seed).standard_normal(40)
+        step, left, factor = _stepped(residual, jacobian, slope, low, high, reach)
+        columns = np.column_stack([jacobian, slope])
+        best = lsq_linear(columns, -residual, (np.append(low, reach[0]), np.append(high, reach[1])), tol=1e-14)
+        assert np.all(step >= low * (1.0 + 1e-12)) and np.all(step <= high * (1.0 + 1e-12))
+        assert reach[0] <= factor <= reach[1]
+        told = np.append(step, factor)
+        assert left == pytest.approx(float(np.sum((residual + columns @ told) ** 2)), rel=1e-8)
+        reached += bool(np.any(best.active_mask))
+        assert left == pytest.approx(2.0 * best.cost, rel=1e-6), f"problem {seed}"
+    assert reached > 30
+
+
+@pytest.fixture(scope="module")
+def lagged() -> Refit:
+    """The drive without the lag of 30 ms at the speed's meter that its records have."""
+    return plain(experiments(lag=0.03))
+
+
+def test_a_hidden_lag_is_best_at_its_place(lagged: Refit) -> None:
+    found = listed(lagged, ("lag", "gain", "limit", "offset"), ("wm", "err", "torque", "drag"))
+    told = stand(lagged, found).screen(found, "screen")
+    best = told.shots[0]
+    assert found[best.candidate].label == "lag at wm"
+    assert found[best.candidate].probes[best.probe].values["T"] == pytest.approx(0.03, rel=0.7)
+    falls = {found[k].label: s.fall for k, s in told.best().items()}
+    # The refit leaves noise alone: no fall is larger than what is left before.
+    most = lagged.chi2 - 0.8 * lagged.rows
+    assert 0.5 * most < falls["lag at wm"] < lagged.chi2
+    assert falls["lag at wm"] > 1.2 * max(v for n, v in falls.items() if n != "lag at wm")
+    assert told.p(best.fall) == pytest.approx(1.0 / 201.0) and told.threshold(0.01) < best.fall
+
+
+def test_gains_that_hide_an_effect_are_left_for_those_given() -> None:
+    """A lag of half the loop's period: the gains fall to a fifth, and with them others answer more like the records."""
+    first = plain(experiments(lag=0.1))
+    found = listed(first, ("lag", "gain", "limit", "offset", "delay", "second-order", "deadband"))
+    given = as_given(first)
+    assert given is not None
+    ranks = [found[k].label for k in stand(first, found).screen(found, "given", point=given).best()]
+    assert ranks.index("lag at wm") < 5
+
+
+def test_the_largest_score_under_noise_is_that_of_a_direct_computation(lagged: Refit) -> None:
+    """Of one size of one effect, whose score under white noise is chi2 with one degree of freedom."""
+    (lag,) = listed(lagged, ("lag",), ("wm",))
+    only = replace(lag, probes=lag.probes[:1])
+    bench = stand(lagged, (lag,), bootstraps=3000).bench
+    told = screened(bench, [only])
+    nominal = bench.nominal
+    placed = apply_effects(model(), [only.use(only.probes[0])])
+    exact = ModelSimulator(placed, Tolerance(rtol=1e-9, atol=1e-11))
+    there = replace(nominal.problem, simulator=exact).blocks(nominal.theta, derivatives=False)
+    answer = nominal.residual - np.concatenate([b.residual for b in there])
+    left = nominal.projected(answer[:, None])[:, 0]
+    direct = (left @ bench.noise) ** 2 / (left @ left)
+    assert told.largest == pytest.approx(direct, rel=0.03, abs=3e-3)  # runs of a first look are exact to 1e-5
+    assert told.size[0, 0] == pytest.approx(float(answer @ answer), rel=1e-3)
+    assert told.left[0, 0] == pytest.approx(float(left @ left), rel=1e-3)
+    assert kstest(told.largest, chi2(1).cdf).pvalue > 0.01
+    for chance in (0.1, 0.01):
+        assert told.threshold(chance) == pytest.approx(chi2(1).ppf(1.0 - chance), rel=0.12)
+
+
+def test_of_many_candidates_the_largest_score_is_that_of_any(lagged: Refit) -> None:
+    found = listed(lagged, ("lag", "gain"), ("wm", "err", "drag"))
+    bench = stand(lagged, found).bench
+    alone = [screened(bench, [c]).largest for c in found]
+    assert screened(bench, found).largest == pytest.approx(np.max(alone, axis=0), rel=0.01)
+
+
+def course(effect: str, values: dict[str, float]) -> Array:
+    """Return what an effect in a model by itself adds to a large signal that turns, beside another."""
+    time = np.linspace(0.0, 1.0, 401)
+    u, source = 1.3 * np.sin(9.0 * time) + 0.3 + 0.4 * time, 1.0 + 0.8 * np.cos(5.0 * time)
+    alone = equations(effect, tuple(values)).with_values(values)
+    driven = {
+        "u": InputSignal.corners(list(zip(time, u, strict=True))),
+        "source": InputSignal.corners(list(zip(time, source, strict=True))),
+        "x": InputSignal.corners(list(zip(time, u, strict=True))),
+    }
+    run = simulate(alone, Experiment(time, "course", inputs=FrozenMap(driven)), outputs=["y"])
+    return np.asarray(run["y"]) - u
+
+
+@pytest.mark.parametrize("effect", [e.name for e in effects().values() if not e.needs_expression])
+def test_what_is_said_to_be_in_proportion_to_a_size_is_so(effect: str) -> None:
+    """And what is so is said to be: twice the distance of the size from nothing adds twice as much, and none of it nothing."""
+    entry = effects()[effect]
+    sizes = dict(entry.example)
+    once = course(effect, sizes)
+    assert np.abs(once).max() > 1e-4
+
+    def is_so(name: str) -> bool:
+        neutral = entry.parameters[name].neutral
+        if entry.parameters[name].fixed or not isinstance(neutral, float) or not np.isfinite(neutral):
+            return False
+        twice = course(effect, {**sizes, name: neutral + 2.0 * (sizes[name] - neutral)})
+        return bool(np.abs(twice - 2.0 * once).max() < 1e-6 * np.abs(once).max())
+
+    assert is_proportional(Form(effect, tuple(sizes))) == any(is_so(n) for n in sizes)
