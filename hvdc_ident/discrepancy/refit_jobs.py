@@ -52,7 +52,7 @@ def job(
             anywhere = begins_anywhere(apply_effects(before.model, [use]), before.model, [use])
         problem = replace(
             before.problem,
-            simulator=ModelSimulator(model, PATIENCE, "rosenbrock"),
+            simulator=movable.simulator(PATIENCE),
             free=(*before.problem.free, *free),
             held=before.problem.held | held,
             free_initial_states=anywhere,

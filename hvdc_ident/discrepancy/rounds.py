@@ -1,6 +1,6 @@
 """One round of the search: screen everything on the model as it stands, refit the best, judge the winner.
 
-What is refitted leads on: with the gains of the best refits the candidates at their places, and their effects at all places, are
+From the gains of the best refits the candidates at their places, and their effects at all places, are
 screened again, until nothing comes nearer. The gains that the misfit has moved, and the given ones, are where a round begins.
 """
 
@@ -101,11 +101,10 @@ def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -
         # Bends are missed between two sizes, and gains that make up for an effect may leave no trace of it.
         opened = replace(opened, candidates=tuple(map(_denser, opened.candidates)))
         found = opened.candidates
-        for point, where in ((None, "once more"), (given, "from the given values")):
-            if where == "once more" or point is not None:
-                screen = stand.screen(found, f"{text}: {where}", point=point)
-                more = stand.refitted(found, _field(search, found, screen.shots), f"{text}: {where}", trials)
-                trials = best_each([*trials, *more])
+        for point in (None,) if given is None else (None, given):
+            where = f"{text}: {'once more' if point is None else 'from the given values'}"
+            shots = _field(search, found, stand.screen(found, where, point=point).shots)
+            trials = best_each([*trials, *stand.refitted(found, shots, where, trials)])
         opened, trials = _led_on(stand, opened, trials, number)
     elif given is not None and not search.spent:
         # Beside an effect the records may be explained by other values of the parameters too.

@@ -22,8 +22,8 @@ from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.movable import Form, Movable, is_proportional, movable, on_loop
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.placed import PATIENCE
+from hvdc_ident.discrepancy.refit import FAILURES
 from hvdc_ident.effects import apply_effects, distance_from_neutral, effects
-from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.problem import stacked
@@ -43,8 +43,6 @@ LEFT = 1e-3
 """Share of the square of an answer that the parameters have to leave: runs of a search are exact to a few of its hundredths."""
 PARCEL = 150
 """Candidates in one piece of work: some tenths of a second."""
-FAILURES = (HvdcIdentError, ValueError, ArithmeticError)
-"""Errors of the work on one candidate that cannot be done: the others are looked at all the same."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +63,7 @@ class Shot:
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """What a screen of all candidates found.
+    """Result of a screen of all candidates.
 
     shots: those that run, the best first. size, left: by candidate and probe the square of the answer in noise units, and what
     of it the parameters leave. largest: (B,) the largest score of all in each record of noise. failures: by candidate why none
@@ -327,7 +325,7 @@ def _at_several(parcel: _Parcel, answers: Mapping[tuple[int, int], Array], found
 
 
 def _distance(candidate: CandidateEffect, probe: int) -> float:
-    """How far a probe is from doing nothing."""
+    """Return how far a probe is from doing nothing."""
     away = distance_from_neutral(effects()[candidate.effect], candidate.probes[probe].values)
     return max((abs(v) for v in away.values()), default=0.0)
 
@@ -348,10 +346,7 @@ class _Runner:
     @cached_property
     def _problems(self) -> Mapping[bool, Problem]:
         own = self.parcel.bench.nominal.problem
-        return {
-            x: replace(own, simulator=ModelSimulator(m.model, self.parcel.bench.haste, "rosenbrock"))
-            for x, m in self.parcel.movable.items()
-        }
+        return {x: replace(own, simulator=m.simulator(self.parcel.bench.haste)) for x, m in self.parcel.movable.items()}
 
     @cached_property
     def _from_rest(self) -> Mapping[bool, Problem]:
@@ -367,8 +362,8 @@ class _Runner:
             return _residual(replace(own, simulator=ModelSimulator(larger, PATIENCE)), theta, {})
         loop = on_loop(bench.model, candidate.at[0])
         moved = self.parcel.movable[loop]
-        known = {n: q.value for n, q in own.simulator.parameters.items()} | own.values(theta)
-        named = {n: known[str(p)] for n, p in candidate.named.items()}
+        known = own.values(theta) if candidate.named else {}
+        named = {n: known.get(str(p), bench.model.parameters[str(p)].value) for n, p in candidate.named.items()}
         values = moved.placed(candidate) | moved.sized({**probe.values, **named})
         try:
             return _residual(self._problems[loop], theta, values)

@@ -28,7 +28,6 @@ class Stand:
     search: SearchContext
     before: Refit
     bench: Bench
-    number: int
 
     @classmethod
     def of(cls, search: SearchContext, before: Refit, found: Sequence[CandidateEffect], number: int) -> Stand:
@@ -39,7 +38,7 @@ class Stand:
         places, sources = {p for c in found for p in c.at}, {s for c in found for s in c.sources}
         slots = before.model.insertion_points
         ends = tuple(p for p in slots if p in places), tuple(s for s in slots if s in sources)
-        return cls(search, before, Bench(before.model, fewer, *ends, before.theta, noise), number)
+        return cls(search, before, Bench(before.model, fewer, *ends, before.theta, noise))
 
     def screen(
         self,
@@ -56,7 +55,7 @@ class Stand:
         """
         asked = [k for k in (range(len(found)) if which is None else which) if not found[k].still]
         columns = [(k, n) for k in asked for n in _simplest(found[k])]
-        bench = replace(self.bench, held=held)
+        bench = replace(self.bench, held=True) if held else self.bench  # it keeps what it has worked out
         if point is not None:
             bench = replace(bench, point=point, noise=bench.noise[:, :0])
         tell = self.search.tell
