@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, behinds, evidence_between, objections
 from hvdc_ident.discrepancy.implied import TIED, implied, nearest, off_given
 from hvdc_ident.discrepancy.met import met
-from hvdc_ident.discrepancy.movable import in_proportion
+from hvdc_ident.discrepancy.movable import in_proportion, present_in
 from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.outside.filtered import filtered, filters
 from hvdc_ident.discrepancy.outside.law import law
@@ -179,14 +179,18 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
 def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tuple[Round, list[Shot]]:
     """Return the round and the shots of what is at the leader's place or is its effect, from the gains that the leader came to.
 
-    Its effect elsewhere is tried in the leader's size too, and another kind of delay there with a delay as long.
+    Its effect elsewhere, and at several places of which one is the leader's, is tried in the leader's size too, and another kind
+    of delay there with a delay as long.
     """
     own = opened.candidates[lead.pick.candidate]
     sizes = lead.refit.sizes(lead.refit.placed[-1])
     found = list(opened.candidates)
-    like = [k for k in opened.screen.best() if found[k].effect == own.effect and len(found[k].at) == len(own.at)]
+    same = [k for k in opened.screen.best() if found[k].effect == own.effect]
+    like = [k for k in same if len(found[k].at) == len(own.at)]
+    around = [k for k in same if set(found[k].at) > set(own.at)]
+    parts = [k for k in same if len(found[k].at) == 1 and any(found[k].at[0] in found[f].at for f in around)]
     here = [k for k, c in enumerate(found) if c.at == own.at and not c.still]
-    which = [k for k in dict.fromkeys((*here, *like[: 2 * OF_EFFECT])) if k != lead.pick.candidate]
+    which = list(dict.fromkeys((*here, *like[: 2 * OF_EFFECT], *parts, *around)))
     late = effects()[own.effect].delay_with(sizes)
     for k in which:
         if found[k].effect == own.effect:
@@ -196,7 +200,7 @@ def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tup
     theta = gains_of(opened.before, lead.refit)
     screen = stand.screen(found, f"round {number}: beside {own.label}", which, theta)
     least = Race().reach * (opened.before.chi2 - lead.refit.chi2)
-    near = [s for s in screen.shots if s.fall >= least]
+    near = [s for s in screen.shots if s.fall >= least and s.candidate != lead.pick.candidate]
     return replace(opened, candidates=tuple(found)), _field(stand.search, found, near)
 
 
@@ -224,12 +228,13 @@ def _delaying(candidate: CandidateEffect, late: float) -> list[dict[str, float]]
 def _with_sizes(candidate: CandidateEffect, sizes: Sequence[dict[str, float]]) -> CandidateEffect:
     """Return the candidate with further probes at these sizes, each within bounds."""
     known = {tuple(sorted(p.values.items())) for p in candidate.probes}
-    probes = list(candidate.probes)
+    probes, entry = list(candidate.probes), effects()[candidate.effect]
     for values in sizes:
-        like = next((p for p in candidate.probes if set(p.free) <= set(values)), None)
+        moved = {n: values.get(n, v) for n, v in candidate.probes[0].values.items()}
+        present = present_in(entry, moved)
+        like = next((p for p in candidate.probes if present_in(entry, p.values) == present), None)
         if like is None:
             continue
-        moved = {n: values.get(n, v) for n, v in like.values.items()}
         free = {n: (min(low, moved[n]), max(high, moved[n])) for n, (low, high) in like.free.items()}
         if tuple(sorted(moved.items())) not in known:
             probes.append(Probe(like.effect, FrozenMap(moved), FrozenMap(free)))

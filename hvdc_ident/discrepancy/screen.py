@@ -109,8 +109,8 @@ class Bench:
     """What candidates are compared on: the model without them, its optimum, and noise.
 
     places, sources: where movable effects may sit, and what they may bring in: the same for all, so that an effect is compiled
-    once. point: unknowns that candidates are looked at from. noise: (N, B) records, without what the parameters make good. held: whether
-    sizes are as they are.
+    once. point: unknowns that candidates are looked at from. noise: (N, B) records, without what the parameters make good. still:
+    places whose signal never moves. held: whether sizes are as they are.
     """
 
     model: AnyModel
@@ -119,6 +119,7 @@ class Bench:
     sources: tuple[str, ...]
     point: Array
     noise: NDArray[np.float32]
+    still: frozenset[str] = frozenset()
     held: bool = False
 
     @cached_property
@@ -309,14 +310,14 @@ def _at_several(parcel: _Parcel, answers: Mapping[tuple[int, int], Array], found
         if len(c.at) == 1:
             continue
         size, parts = _distance(c, n), []
-        for place, source in zip(c.at, c.sources or ("",) * len(c.at), strict=True):
-            own = single.get((place, source))
-            if not own or not size:
-                break
-            near, column = min(own, key=lambda s: abs(np.log(s[0] / size)) if s[0] > 0 else np.inf)
-            parts.append(answers[column] * (size / near if near else 1.0))
-        if len(parts) < len(c.at):
+        own = {s: single.get(s) for s in zip(c.at, c.sources or ("",) * len(c.at), strict=True)}
+        # Where nothing moves the effect does nothing, and was not run.
+        moving = [near for (place, _), near in own.items() if near or place not in bench.still]
+        if not size or not moving or not all(moving):
             continue
+        for nearby in filter(None, moving):
+            near, column = min(nearby, key=lambda s: abs(np.log(s[0] / size)) if s[0] > 0 else np.inf)
+            parts.append(answers[column] * (size / near if near else 1.0))
         answer = np.sum(parts, axis=0, dtype=float)
         step, fell, factor = _stepped(was, jacobian, -answer, low, high, CHORD)
         left = nominal.projected(answer[:, None])[:, 0]

@@ -38,7 +38,8 @@ class Stand:
         places, sources = {p for c in found for p in c.at}, {s for c in found for s in c.sources}
         slots = before.model.insertion_points
         ends = tuple(p for p in slots if p in places), tuple(s for s in slots if s in sources)
-        return cls(search, before, Bench(before.model, fewer, *ends, before.theta, noise))
+        still = frozenset(c.at[0] for c in found if c.still and len(c.at) == 1)
+        return cls(search, before, Bench(before.model, fewer, *ends, before.theta, noise, still))
 
     def screen(
         self,
