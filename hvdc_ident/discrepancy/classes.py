@@ -13,6 +13,7 @@ import numpy as np
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, at_edge, behinds, best_gain, evidence_between
+from hvdc_ident.discrepancy.forms import expression
 from hvdc_ident.discrepancy.implied import TIED, apart, implied, nearest, off_given
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
@@ -142,9 +143,9 @@ def _rival(trial: CandidateFit, behind: float) -> Rival:
     placed = trial.refit.placed[-1]
     c, sizes = placed.candidate, FrozenMap(trial.refit.sizes(placed))
     values, off = implied(trial.refit), off_given(trial.refit)
-    return Rival(
-        c.effect, c.at, behind, sizes, c.source, expression=placed.use.expression, values=values, off_given=off
-    )
+    kind = effects()[c.effect].outside
+    formula = expression(trial.refit) if kind == "term" else ""
+    return Rival(kind, c.at, behind, sizes, c.source, expression=formula, values=values, off_given=off)
 
 
 def _unfitted(found: Round, best: float, options: DiagnosisOptions) -> list[Rival]:

@@ -13,7 +13,6 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler
-from hvdc_ident.discrepancy.formula import Law
 from hvdc_ident.discrepancy.options import DiagnosisOptions
 from hvdc_ident.discrepancy.pushes import Pushed, pushed
 from hvdc_ident.discrepancy.refit import Refit, signal
@@ -106,12 +105,23 @@ class SearchContext:
 
 
 @dataclass(frozen=True, eq=False)
+class Form:
+    """A form outside the catalogue, refitted. before: the model without it; gain: delta BIC over that. others: refits of other
+    forms, or of the same elsewhere, that explain as much."""
+
+    before: Refit
+    refit: Refit
+    gain: float
+    others: tuple[Refit, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class Round:
     """Result of one round. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
 
     signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: every refit,
-    the best first. ruler: what BIC counts by. laws: the formula outside the catalogue that explains most, or nothing; None
-    where none was looked for. filters: the refits of linear filters; None where there are none.
+    the best first. ruler: what BIC counts by. forms: the refits of forms outside the catalogue; None where none was looked for.
+    form: the one that leaves next to nothing but noise, where no effect that was refitted does.
     """
 
     before: Refit
@@ -124,13 +134,8 @@ class Round:
     why: str = ""
     significant: bool = False
     ruler: Ruler | None = None
-    laws: tuple[Law, ...] | None = None
-    filters: tuple[CandidateFit, ...] | None = None
-
-    @property
-    def law(self) -> Law | None:
-        """The formula that leaves next to nothing but noise, where no effect that was refitted does."""
-        return next((one for one in self.laws or () if one.near), None)
+    forms: tuple[CandidateFit, ...] | None = None
+    form: Form | None = None
 
     def answers(self) -> Mapping[str, Pushed]:
         """Return the model's runs with their answers to pushes, by experiment; none of a model that is closed inside."""

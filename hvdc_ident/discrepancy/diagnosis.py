@@ -20,10 +20,10 @@ from hvdc_ident.discrepancy.context import Course, Round, SearchContext
 from hvdc_ident.discrepancy.evidence import louder_than_noise
 from hvdc_ident.discrepancy.explain import at_given, beside_stand_ins, found_of, gap, off_given
 from hvdc_ident.discrepancy.findings import separating
+from hvdc_ident.discrepancy.forms import Told, course, described, standing, tried
 from hvdc_ident.discrepancy.localise import localise
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import DiagnosisOptions
-from hvdc_ident.discrepancy.outside.fallback import Fallback, fallback, law_found
 from hvdc_ident.discrepancy.race import UNTRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.record_noise import LOUDER, QUIETER, OutputNoise
 from hvdc_ident.discrepancy.refit import Refit, judged
@@ -115,9 +115,9 @@ def diagnose(
     inside = isinstance(model, Model)
     other = None
     if judgement.instead is not None:
-        other = law_found(judgement.instead)
+        other = described(judgement.instead)
     elif judgement.verdict == "unnameable" and chosen.fallback and inside:
-        other = fallback(search, outcome.rounds[0])
+        other = _outside(search, outcome.rounds[0])
     if not inside:
         notes = (*notes, CLOSED)
     if left := 0 if chosen.thorough else _left_out(first, outcome.rounds[0]):
@@ -125,6 +125,13 @@ def diagnose(
     if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.rounds for t in r.failed):
         notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
+
+
+def _outside(search: SearchContext, opened: Round) -> Told:
+    """Return the form outside the catalogue that explains most of the gap, or what is missing over time where none stands."""
+    forms = tried(search, opened) if opened.forms is None else opened.forms
+    form = standing(search, opened, forms)
+    return course(search, opened) if form is None else described(form)
 
 
 def _left_out(first: Refit, found: Round) -> int:
@@ -166,7 +173,7 @@ def _assembled(
     first: Refit,
     outcome: SearchOutcome,
     judgement: Judgement,
-    other: Fallback | None,
+    other: Told | None,
     free: tuple[FitParameter, ...],
     notes: tuple[str, ...],
 ) -> Diagnosis:

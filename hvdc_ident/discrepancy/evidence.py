@@ -197,6 +197,13 @@ def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> fl
     return fitted + share * (was**2 - now**2) * unseen_rows(after)
 
 
+def gained(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
+    """Return the trial with what it gains in BIC over the model before, and what the held-out data add to that."""
+    more = len(trial.refit.problem.free) - len(before.problem.free)
+    gain = ruler.gain(before.chi2, trial.refit.chi2, more)
+    return CandidateFit(trial.pick, trial.refit, gain, evidence_between(before, trial.refit, ruler, more))
+
+
 def alike(one: Refit, other: Refit, before: Refit) -> bool:
     """Return True for two hypotheses whose answers differ, in the fitted records, by less than the tolerance: that share of the
     square of what the effects do beside the model without them."""

@@ -59,6 +59,8 @@ def sentence(of: CandidateEffect | Rival, sizes: Mapping[str, float], expression
     words |= {"at": f"each of {listed(at)}" if len(at) > 1 else at[0], "from": brought, "expression": expression}
     if (late := entry.delay_with(sizes)) is not None:
         words["equivalent_delay"] = quantity(late, "s")
+    if entry.words is not None:
+        words |= entry.words(sizes)
     absent = {n for n, q in entry.parameters.items() if q.optional and sizes.get(n, q.neutral) == q.neutral}
     absent |= {n for n, q in entry.parameters.items() if q.fixed and sizes.get(n) == 0.0}
     text = _without(entry.sentence, absent)

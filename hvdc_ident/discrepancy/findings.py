@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, credible
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.explain import advice, sentence
-from hvdc_ident.discrepancy.formula import filled
+from hvdc_ident.discrepancy.forms import with_values
 from hvdc_ident.discrepancy.implied import apart
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival, ValueAt
@@ -73,7 +73,9 @@ def finding(
         latest = FrozenMap(values) if values and not apart(best.values, values) else best.values
         shown[0] = replace(shown[0], parameters=own.parameters, values=latest)
     places = tuple(shown)
-    does = own.text if own is not None else sentence(best, best.parameters, filled(best.expression, best.parameters))
+    does = (
+        own.text if own is not None else sentence(best, best.parameters, with_values(best.expression, best.parameters))
+    )
     sizes = _sizes(parameters) if with_intervals else ""
     text = f"{does}{sizes}{_others(one, best)}{_apart(best, places)}."
     return Finding(best.effect, _names(one, best.effect), one.probability, FrozenMap(parameters), places, text, delay)

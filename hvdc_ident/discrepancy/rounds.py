@@ -17,19 +17,17 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
 from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, behinds, evidence_between, objections
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, behinds, gained, objections
+from hvdc_ident.discrepancy.forms import standing, tried
 from hvdc_ident.discrepancy.implied import TIED, implied, nearest, off_given
 from hvdc_ident.discrepancy.met import met
 from hvdc_ident.discrepancy.movable import in_proportion, present_in
 from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE
-from hvdc_ident.discrepancy.outside.filtered import filtered, filters
-from hvdc_ident.discrepancy.outside.law import law
 from hvdc_ident.discrepancy.placed import moved
 from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.refit_jobs import as_given, in_place
 from hvdc_ident.discrepancy.refitted import all_far, best_each, by_cost, excess, is_noise, like_noise, telling
-from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.residual_checks import tones
 from hvdc_ident.discrepancy.screen import Shot
 from hvdc_ident.discrepancy.stand import Stand, gains_of, larger
@@ -116,8 +114,7 @@ def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -
     if number == 1 and search.options.fallback and not search.spent and _tells(opened, trials):
         best = next(iter(by_cost(trials)), None)
         if best is not None and not is_noise(best.refit, search.seed):
-            opened = _outside(search, opened, trials)
-            opened, trials = _in_its_stead(stand, opened, trials)
+            opened, trials = _outside(search, stand, opened, trials)
     return opened, trials
 
 
@@ -241,41 +238,26 @@ def _with_sizes(candidate: CandidateEffect, sizes: Sequence[dict[str, float]]) -
     return replace(candidate, probes=tuple(probes))
 
 
-def _outside(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> Round:
-    """The round with a filter, or where nothing explains the gap a formula, from outside the catalogue, if one does."""
-    best = by_cost(trials)[0].refit
-    tried = filters(search, opened)
-    opened = replace(opened, filters=tried)
-    found = filtered(search, opened, tried, best)
-    if found is None and _unexplained(search, opened, trials):
-        found = law(search, opened, best)
-        return replace(opened, laws=() if found is None else (found,))
-    return opened if found is None else replace(opened, laws=(found,))
+def _outside(
+    search: SearchContext, stand: Stand, opened: Round, trials: list[CandidateFit]
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the round with the refits of forms outside the catalogue, and the form that comes nearer than any effect, if one does.
 
-
-def _in_its_stead(stand: Stand, opened: Round, trials: list[CandidateFit]) -> tuple[Round, list[CandidateFit]]:
-    """The trials with every effect at the place of a form from outside the catalogue, begun with the gains that it came to.
-
-    A form with many parameters finds the place and the gains where an effect, beside biased gains, did not: a filter whose
-    poles and zeros meet is a gain. Where an effect comes near the noise there too, the catalogue lacks nothing.
+    A form with many values finds the place and the gains where an effect, beside biased gains, did not: a filter whose poles and zeros
+    meet is a gain. So every effect is tried there, begun with the gains that the form came to. Where one of them comes near the
+    noise too, the catalogue lacks nothing.
     """
-    form = opened.law
-    if form is None or stand.search.spent:
+    opened = replace(opened, forms=tried(search, opened))
+    form = standing(search, opened, opened.forms or (), by_cost(trials)[0].refit)
+    if form is None or search.spent:
         return opened, trials
-    found, at = opened.candidates, form.refit.placed[-1].candidate.at
-    which = [k for k, c in enumerate(found) if c.at == at and not c.still]
-    screen = stand.screen(found, "round 1: in the stead of a form", which, gains_of(opened.before, form.refit))
+    at = form.refit.placed[-1].candidate.at
+    which = [k for k, c in enumerate(opened.candidates) if c.at == at and not c.still]
+    text = "round 1: in the stead of a form"
+    screen = stand.screen(opened.candidates, text, which, gains_of(opened.before, form.refit))
     shots = list(screen.best().values())[:FIELD]
-    trials = best_each([*trials, *stand.refitted(found, shots, "round 1: in the stead of a form", trials)])
-    if all_far(opened.before, trials):
-        return opened, trials
-    return replace(opened, laws=(replace(form, near=False),)), trials
-
-
-def _unexplained(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> bool:
-    """Return True where no refit comes near the noise, and the best leaves more of the gap than a verdict passes over."""
-    far = all_far(opened.before, trials)
-    return far and not any(is_small(search, opened.before, t.refit) for t in by_cost(trials)[:BEAM])
+    trials = best_each([*trials, *stand.refitted(opened.candidates, shots, text, trials)])
+    return replace(opened, form=form if all_far(opened.before, trials) else None), trials
 
 
 def _tells(opened: Round, trials: Sequence[CandidateFit]) -> bool:
@@ -299,7 +281,7 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
     before, found = opened.before, opened.candidates
     ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
     ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
-    if opened.law is not None:
+    if opened.form is not None:
         return replace(opened, trials=tuple(ranked), failed=failed, ruler=ruler, why=BEYOND)
     level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
     refused = {id(t): against(search, before, t, opened, first=number == 1) for t in level}
@@ -323,13 +305,6 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
         ranked, winner = [new if t is winner else t for t in ranked], new
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
-
-
-def gained(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
-    """The trial with what it gains in BIC over the model before, and what the held-out data add to that."""
-    more = len(trial.refit.problem.free) - len(before.problem.free)
-    gain = ruler.gain(before.chi2, trial.refit.chi2, more)
-    return CandidateFit(trial.pick, trial.refit, gain, evidence_between(before, trial.refit, ruler, more))
 
 
 def against(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:

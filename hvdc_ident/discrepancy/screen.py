@@ -35,8 +35,8 @@ HASTE = Tolerance(rtol=1e-5, atol=1e-8, max_steps=PATIENCE.max_steps, search=Fal
 """Of a first look. Its runs are exact to a hundredth of the noise; one that has no steady state at once begins elsewhere."""
 STEPS = 100
 """Times the steps of the model without an effect: a run that takes more, chattering in a loop, is passed over."""
-ANY, CHORD, HELD = (-np.inf, np.inf), (0.0, 1.0), (1.0, 1.0 + 1e-9)
-"""Factors on the size of an effect in proportion to it; of another, between nothing and the size that was run; of one that is held."""
+ANY, CHORD = (-np.inf, np.inf), (0.0, 1.0)
+"""Factors on the size of an effect in proportion to it; of another, between nothing and the size that was run."""
 SEEN = 1.0
 """Sum of squares of an answer, in noise units, below which no experiment excites it."""
 LEFT = 1e-3
@@ -105,6 +105,46 @@ class Screen:
 
 
 @dataclass(frozen=True, eq=False)
+class Linearised:
+    """A residual (N,), its derivatives (N, p) by some unknowns, and bounds (p,) on a step of them."""
+
+    residual: Array
+    jacobian: Array
+    low: Array
+    high: Array
+
+    @cached_property
+    def _normal(self) -> tuple[Array, Array, Array, Array]:
+        """The derivatives in columns of length 1, these lengths, their products with each other, and with the residual."""
+        scale = np.linalg.norm(self.jacobian, axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        unit = self.jacobian / scale
+        return unit, scale, unit.T @ unit, unit.T @ self.residual
+
+    def stepped(self, added: Array, reach: tuple[float, float], *, held: bool = False) -> tuple[Array, float, float]:
+        """Return the bounded step that lowers chi2 most to first order, chi2 after it, and the factor on the size.
+
+        added: (N,) what an effect adds to the residual in the size that was run. reach: bounds of the factor. held: whether it is 1.
+        """
+        unit, scale, square, asked = self._normal
+        low, high = self.low * scale, self.high * scale
+        chi2, own, factor = float(self.residual @ self.residual), float(added @ self.residual), 1.0
+        if held:
+            chi2 += 2.0 * own + float(added @ added)
+            asked = asked + unit.T @ added
+            step = _bounded(square, asked, low, high)
+        else:
+            size = float(np.linalg.norm(added)) or 1.0
+            beside = (unit.T @ added / size)[:, None]
+            square = np.block([[square, beside], [beside.T, np.ones((1, 1))]])
+            asked = np.append(asked, own / size)
+            step = _bounded(square, asked, np.append(low, reach[0] * size), np.append(high, reach[1] * size))
+            factor = float(step[-1]) / size
+        chi2 += float(2.0 * asked @ step + step @ square @ step)
+        return step[: scale.size] / scale, max(chi2, 0.0), factor
+
+
+@dataclass(frozen=True, eq=False)
 class Bench:
     """What candidates are compared on: the model without them, its optimum, and noise.
 
@@ -123,10 +163,12 @@ class Bench:
     held: bool = False
 
     @cached_property
-    def without(self) -> tuple[Array, Array]:
-        """(N,) the residual of the model without effects, and (N, p) its derivatives."""
-        own = self.nominal
-        return stacked(own.blocks if np.array_equal(self.point, own.theta) else own.problem.blocks(self.point))
+    def without(self) -> Linearised:
+        """The residual of the model without effects, linear in the unknowns."""
+        own, unknowns = self.nominal, self.nominal.problem.unknowns
+        found = stacked(own.blocks if np.array_equal(self.point, own.theta) else own.problem.blocks(self.point))
+        low, high = np.array([u.min for u in unknowns]), np.array([u.max for u in unknowns])
+        return Linearised(*found, low - self.point, high - self.point)
 
     @cached_property
     def at_rest(self) -> tuple[Experiment, ...]:
@@ -152,12 +194,6 @@ class Bench:
             p for p in self.places if insertion_point(model, p)[0] in kinds and on_loop(model, p) == form.loop
         )
         return movable(model, replace(form, copies=1), places, self.sources)
-
-    @property
-    def bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of the unknowns."""
-        own = self.nominal.problem.unknowns
-        return np.array([u.min for u in own]), np.array([u.max for u in own])
 
 
 def _at_rest(problem: Problem, experiment: Experiment, theta: Array) -> Experiment:
@@ -256,8 +292,7 @@ def _parcels(
 def _shot(parcel: _Parcel) -> _Found:
     """The columns of a parcel, simulated."""
     bench, nominal, runner = parcel.bench, parcel.bench.nominal, _Runner(parcel)
-    low, high = (bound - bench.point for bound in bench.bounds)
-    was, jacobian = bench.without
+    was = bench.without.residual
     chi2 = float(nominal.residual @ nominal.residual)
     found = _Found([], {}, {}, np.zeros(bench.noise.shape[1]), {})
     answers: dict[tuple[int, int], Array] = {}
@@ -271,7 +306,7 @@ def _shot(parcel: _Parcel) -> _Found:
         except FAILURES as error:
             found.failures[column[0]] = str(error) or type(error).__name__
             continue
-        step, fell, factor = _stepped(was, jacobian, r - was, low, high, runner.reach)
+        step, fell, factor = bench.without.stepped(r - was, runner.reach, held=bench.held)
         found.shots.append(Shot(*column, chi2 - fell, bench.point + step, factor))
         left = nominal.projected((was - r)[:, None])[:, 0]
         found.size[column], found.left[column] = float(np.sum((was - r) ** 2)), float(left @ left)
@@ -299,8 +334,6 @@ def _at_several(parcel: _Parcel, answers: Mapping[tuple[int, int], Array], found
     """Add what an effect at several places does, to first order: the sum of what it does at each, in proportion to its size."""
     bench, candidates = parcel.bench, parcel.candidates
     nominal = bench.nominal
-    low, high = (bound - bench.point for bound in bench.bounds)
-    was, jacobian = bench.without
     single: dict[tuple[str, str], list[tuple[float, tuple[int, int]]]] = {}
     for k, n in answers:
         c = candidates[k]
@@ -319,7 +352,7 @@ def _at_several(parcel: _Parcel, answers: Mapping[tuple[int, int], Array], found
             near, column = min(nearby, key=lambda s: abs(np.log(s[0] / size)) if s[0] > 0 else np.inf)
             parts.append(answers[column] * (size / near if near else 1.0))
         answer = np.sum(parts, axis=0, dtype=float)
-        step, fell, factor = _stepped(was, jacobian, -answer, low, high, CHORD)
+        step, fell, factor = bench.without.stepped(-answer, CHORD)
         left = nominal.projected(answer[:, None])[:, 0]
         found.size[k, n], found.left[k, n] = float(answer @ answer), float(left @ left)
         found.shots.append(Shot(k, n, chi2 - fell, bench.point + step, factor))
@@ -340,8 +373,6 @@ class _Runner:
     @cached_property
     def reach(self) -> tuple[float, float]:
         """Factors on the size that a step may ask for."""
-        if self.parcel.bench.held:
-            return HELD
         return ANY if any(is_proportional(m.form) for m in self.parcel.movable.values()) else CHORD
 
     @cached_property
@@ -376,24 +407,12 @@ def _residual(problem: Problem, theta: Array, values: Mapping[str, float]) -> Ar
     return np.concatenate([b.residual for b in problem.blocks(theta, also=values, derivatives=False)])
 
 
-def _stepped(
-    residual: Array, jacobian: Array, added: Array, low: Array, high: Array, reach: tuple[float, float]
-) -> tuple[Array, float, float]:
-    """Return the bounded step that lowers chi2 most to first order, chi2 after it, and the factor on the size.
-
-    residual: without the effect; added: what the effect adds to it in the size that was run. reach: bounds of the factor.
-    """
-    columns = np.column_stack([jacobian, added])
-    scale = np.linalg.norm(columns, axis=0)
-    scale = np.where(scale > 0, scale, 1.0)
-    square, asked = (columns / scale).T @ (columns / scale), (columns / scale).T @ residual
-    least, most = scale * np.append(low, reach[0]), scale * np.append(high, reach[1])
-    # Of columns of length 1; what is made of the others is told by rounding alone.
-    half = np.linalg.cholesky(square + 1e-10 * np.eye(scale.size)).T
+def _bounded(square: Array, asked: Array, least: Array, most: Array) -> Array:
+    """Return the x between bounds at which x' square x + 2 asked' x is least; square: of columns of length 1."""
+    # What is made of the other columns is told by rounding alone.
+    half = np.linalg.cholesky(square + 1e-10 * np.eye(asked.size)).T
     target = -solve_triangular(half, asked, trans="T")
     step = solve_triangular(half, target)
     if ((step < least) | (step > most)).any():
         step = np.clip(lsq_linear(half, target, (least, most), method="bvls").x, least, most)
-    chi2 = float(residual @ residual + 2.0 * asked @ step + step @ square @ step)
-    found = step / scale
-    return found[:-1], max(chi2, 0.0), float(found[-1])
+    return np.asarray(step)

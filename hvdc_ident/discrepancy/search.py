@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.clocks import clocks, on_their_clocks
 from hvdc_ident.discrepancy.context import Round, SearchContext
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, clear, evidence_between
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, clear, evidence_between, gained
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST, TOLERANCE
 from hvdc_ident.discrepancy.placed import Placed
 from hvdc_ident.discrepancy.race import done
@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.refit_jobs import as_given, job_of, moved_far, refit
 from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by
 from hvdc_ident.discrepancy.released import held_again, released
 from hvdc_ident.discrepancy.remainder import is_small
-from hvdc_ident.discrepancy.rounds import against, closed, gained, one_round
+from hvdc_ident.discrepancy.rounds import against, closed, one_round
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +125,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
         if found.winner is None:
             hopeful = (
                 found.significant
-                and found.law is None
+                and found.form is None
                 and not little
                 and len(kept) + 1 < search.options.most
                 and not (search.spent or is_noise(here, search.seed))

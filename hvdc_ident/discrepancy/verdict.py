@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array, event_time
-from hvdc_ident.discrepancy.alternatives import beyond
 from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, formula_rivals, likely, rivals
-from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.context import Form, SearchContext
 from hvdc_ident.discrepancy.evidence import louder_than_noise, material_gap, worst
 from hvdc_ident.discrepancy.explain import moved_parameters
 from hvdc_ident.discrepancy.findings import finding, values_by_place
-from hvdc_ident.discrepancy.formula import Law
+from hvdc_ident.discrepancy.forms import instead_of
 from hvdc_ident.discrepancy.implied import implied
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE
@@ -57,7 +56,7 @@ class Judgement:
     tests: tuple[Binned, ...]
     sets: tuple[tuple[Rival, ...], ...] = ()
     experiment: Mapping[str, Any] = field(default_factory=dict)
-    instead: Law | None = None
+    instead: Form | None = None
     doubt: str = ""
     caveat: str = ""
     remainder: Remainder | None = None
@@ -235,7 +234,7 @@ def tests_of(search: SearchContext, last: Refit) -> tuple[Binned, ...]:
 
 def _with_formulas(
     search: SearchContext, outcome: SearchOutcome, sets: tuple[tuple[Rival, ...], ...]
-) -> tuple[tuple[tuple[Rival, ...], ...], Law | None]:
+) -> tuple[tuple[tuple[Rival, ...], ...], Form | None]:
     """The sets with formulas from outside the catalogue that explain as much, and a formula that explains more than an effect does.
 
     They are tried in the stead of an effect that would be named by the catalogue alone, unless no form outside it is asked for.
@@ -245,15 +244,15 @@ def _with_formulas(
         if not search.options.fallback or classes(group)[0].probability < CERTAIN:
             wider.append(group)
             continue
-        formulas = beyond(search, found)
+        formulas = instead_of(search, found)
         behind, near = formula_rivals(found, formulas, search.options)
         best = max((t for t, _ in formulas), key=lambda t: t.told, default=None)
         if best is not None and np.isinf(behind):
-            return (), Law(best.refit, best.gain)
+            return (), Form(found.before, best.refit, best.gain)
         wide = (*(replace(r, delta_bic=r.delta_bic + behind) for r in group), *near)
         likeliest = classes(wide)[0]
         if best is not None and likeliest.names[0] in OUTSIDE and likeliest.probability >= CERTAIN:
-            return (), Law(best.refit, best.gain)
+            return (), Form(found.before, best.refit, best.gain)
         wider.append(wide)
     return tuple(wider), None
 
@@ -318,9 +317,9 @@ def leaves_a_gap(search: SearchContext, last: Refit) -> bool:
 def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Judgement:
     found = outcome.rounds[-1]
     options = search.options
-    if found.law is not None:
+    if found.form is not None:
         text = f"Something is missing, and nothing of the catalogue can be named: {found.why}."
-        return Judgement("unnameable", text, tests, instead=found.law)
+        return Judgement("unnameable", text, tests, instead=found.form)
     refused = any(b.p <= options.significance and b.excess > STRONG * last.rows for b in tests)
     strong = found.significant and found.screen.shots[0].fall > STRONG * last.rows
     if (strong or refused) and leaves_a_gap(search, last):

@@ -35,6 +35,14 @@ Measure = Literal[
     "range/time",
     "range/source",
     "range/source2",
+    "range/record",
+    "one/record",
+    "one/source",
+    "source peak",
+    "source low",
+    "source high",
+    "bend 2",
+    "bend 3",
     "of T2",
     "of up",
     "above low",
@@ -191,6 +199,10 @@ class Effect:
     with coefficients of the user's own names. of_derivative: True where it changes the equation of the state at its place: u
     is the derivative that the state had, y the one that it has.
     tried_by_default: False for a form that is tried only where it is named, such as a general one that stands for many others.
+    outside: kind of such a form that is tried, too, where no effect of the catalogue explains the records: "term", "filter" or
+    "curve"; empty for the others. is_own: whether it is none of the catalogue's effects with these values (None: always).
+    curve: of one whose values are a curve, its knots and what is added there, from its values. words: further words for the
+    sentence, from its values.
     resistance: the parameter that a resistance of the model replaces.
     self_exciting: True where it moves the model by itself, so that a record of it does not begin in steady state.
     holds: True where it passes no small change on, so that what integrates its signal may rest at any level.
@@ -215,6 +227,10 @@ class Effect:
     needs_expression: bool = False
     of_derivative: bool = False
     tried_by_default: bool = True
+    outside: Literal["", "term", "filter", "curve"] = ""
+    is_own: Callable[[Mapping[str, float]], bool] | None = None
+    curve: Callable[[Mapping[str, float]], tuple[Array, Array]] | None = None
+    words: Callable[[Mapping[str, float]], Mapping[str, str]] | None = None
     resistance: str = ""
     self_exciting: bool = False
     holds: bool = False

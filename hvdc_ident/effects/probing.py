@@ -107,6 +107,14 @@ _SIZES: dict[Measure, Size] = {
     "range/time": lambda x, u, source, p: u.range / u.time(x),
     "range/source": lambda x, u, source, p: x * u.range / source.range,
     "range/source2": lambda x, u, source, p: x * u.range / source.peak**2,
+    "range/record": lambda x, u, source, p: x * u.range / (5.0 * u.slow),
+    "one/record": lambda x, u, source, p: x / (5.0 * u.slow),
+    "one/source": lambda x, u, source, p: x / source.peak,
+    "source peak": lambda x, u, source, p: x * source.peak,
+    "source low": lambda x, u, source, p: x * source.low,
+    "source high": lambda x, u, source, p: x * source.high,
+    "bend 2": lambda x, u, source, p: x * u.range / u.peak**2,
+    "bend 3": lambda x, u, source, p: x * u.range / u.peak**3,
     "of T2": lambda x, u, source, p: x * p["T2"],
     "of up": lambda x, u, source, p: x * p["up"],
     "above low": lambda x, u, source, p: u.low + x * u.range,
@@ -125,6 +133,14 @@ _SEARCH: dict[Measure, tuple[float, float]] = {
     "range/time": (1.3, -0.5),
     "range/source": (-2.0, 2.0),
     "range/source2": (-2.0, 2.0),
+    "range/record": (-2.0, 2.0),
+    "one/record": (-2.0, 2.0),
+    "one/source": (-2.0, 2.0),
+    "source peak": (1e-3, 1.0),
+    "source low": (1.0, 1.0),
+    "source high": (1.0, 1.0),
+    "bend 2": (-2.0, 2.0),
+    "bend 3": (-2.0, 2.0),
     "of T2": (0.02, 50.0),
     "of up": (0.02, 50.0),
     "above low": (1e-3, 0.98),
@@ -171,7 +187,7 @@ def probes(
     switched = {n: q for n, q in effect.parameters.items() if not q.optional}
     absent = {n: float(q.neutral or 0.0) for n, q in effect.parameters.items() if q.optional}
     groups: list[list[str]] = [[]]
-    if not switched:
+    if all(q.neutral is None for q in switched.values()):
         parts = [n for n in absent if effect.parameters[n].probes]
         groups = [*([n] for n in parts if not effect.parameters[n].companion), parts]
     combinations = []

@@ -213,9 +213,11 @@ class Equilibria:
         search: whether more ways than the straight one are tried.
         """
         ways = _ways(anchor, p, u, time)
-        path = self._follow_first(ways if search else ways[:1], anchor.v, anchor.sign)
+        if not search:
+            return self._along(ways[0], anchor.v, anchor.sign, judged=False)
+        path = self._follow_first(ways, anchor.v, anchor.sign)
         root = model.origin.root if model.origin else model
-        if path.ends == "arrived" or not search or not _has_effects(model):
+        if path.ends == "arrived" or not _has_effects(model):
             return path
         known = self._of_root(model, root)
         assert known is not None and model.origin is not None
@@ -252,8 +254,11 @@ class Equilibria:
             paths.append(path)
         return paths[0]
 
-    def _along(self, way: list[_Values], v: Array, sign: float) -> Path:
-        """From v, a steady state at the way's first values with that sign of the determinant, from values to values."""
+    def _along(self, way: list[_Values], v: Array, sign: float, *, judged: bool = True) -> Path:
+        """From v, a steady state at the way's first values with that sign of the determinant, from values to values.
+
+        judged: whether a path that ends on its way is told as one that ends in a fold, where it does.
+        """
         v, legs = v.copy(), len(way) - 1
         for k, (a, b) in enumerate(pairwise(way)):
             ends_p, ends_w = np.array([a[0], b[0]]), np.array([[a[2], *a[1]], [b[2], *b[1]]])
@@ -262,7 +267,7 @@ class Equilibria:
             if reached[0] < 1.0:
                 w, p = equations[3], equations[5]
                 at = (p, w[1 : ends_w.shape[1]].copy(), float(w[0]))
-                turned = self._turns(v, at, ends_p, ends_w)
+                turned = judged and self._turns(v, at, ends_p, ends_w)
                 return Path(v, (k + float(reached[0])) / legs, "fold" if turned else "jump", at)
         return Path(v, 1.0, "arrived")
 

@@ -19,7 +19,7 @@ from hvdc_ident.discrepancy.context import SearchContext, slot_signals
 from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.refit_jobs import as_given
-from hvdc_ident.discrepancy.screen import ANY, CHORD, _stepped, screened
+from hvdc_ident.discrepancy.screen import ANY, CHORD, Linearised, screened
 from hvdc_ident.discrepancy.stand import Stand
 from hvdc_ident.effects import apply_effects, effects
 from hvdc_ident.immutable import FrozenMap
@@ -30,7 +30,7 @@ def test_what_runs_away_is_none_of_it() -> None:
     """An unstable candidate's answer is 1e30 times the residual: none of it explains anything."""
     residual, jacobian, low, high = problems(3)
     away = 1e30 * np.exp(np.linspace(0.0, 5.0, 40))
-    step, left, factor = _stepped(residual, jacobian, away, low, high, CHORD)
+    step, left, factor = Linearised(residual, jacobian, low, high).stepped(away, CHORD)
     without = lsq_linear(jacobian, -residual, (low, high), tol=1e-14)
     assert left <= 2.0 * without.cost * (1.0 + 1e-9) and abs(factor) * 1e30 < 10.0 * np.abs(residual).max()
     assert left > 0.5 * without.cost and np.all(step >= low) and np.all(step <= high)
@@ -62,21 +62,21 @@ def problems(seed: int) -> tuple[Array, Array, Array, Array]:
 def test_a_step_without_bounds_is_that_of_least_squares(seed: int) -> None:
     residual, jacobian, low, high = problems(seed)
     slope = np.random.default_rng(1000 + seed).standard_normal(40)
-    step, left, factor = _stepped(residual, jacobian, slope, 1e9 * low - 1e9, 1e9 * high + 1e9, ANY)
+    step, left, factor = Linearised(residual, jacobian, 1e9 * low - 1e9, 1e9 * high + 1e9).stepped(slope, ANY)
     columns = np.column_stack([jacobian, slope])
     best = np.linalg.lstsq(columns, -residual)[0]
     assert np.append(step, factor) == pytest.approx(best, rel=1e-6)
     assert left == pytest.approx(float(np.sum((residual + columns @ best) ** 2)), rel=1e-9)
 
 
-@pytest.mark.parametrize("reach", [ANY, CHORD])
+@pytest.mark.parametrize("reach", [ANY, CHORD, (1.0, 1.0 + 1e-9)])
 def test_a_step_within_bounds_is_the_best_there_is(reach: tuple[float, float]) -> None:
-    """The bounds of most of these problems are reached."""
+    """The bounds of most of these problems are reached. An effect that is held is one whose factor hardly may differ from 1."""
     reached = 0
     for seed in range(60):
         residual, jacobian, low, high = problems(seed)
         slope = np.random.default_rng(1000 + seed).standard_normal(40)
-        step, left, factor = _stepped(residual, jacobian, slope, low, high, reach)
+        step, left, factor = Linearised(residual, jacobian, low, high).stepped(slope, reach, held=reach[0] == 1.0)
         columns = np.column_stack([jacobian, slope])
         best = lsq_linear(columns, -residual, (np.append(low, reach[0]), np.append(high, reach[1])), tol=1e-14)
         assert np.all(step >= low * (1.0 + 1e-12)) and np.all(step <= high * (1.0 + 1e-12))

@@ -76,6 +76,14 @@ def test_linear_ones_are_scipys(name, values, numerator, denominator):
         ("deadband", {"width": 0.15}, np.sign(u) * np.maximum(np.abs(u) - 0.15, 0.0)),
         ("gain", {"k": -1.3}, u * -1.3),
         ("offset", {"c": -0.2}, u - 0.2),
+        ("polynomial", {"b": 0.3, "c": -0.2}, np.polyval([-0.2, 0.3, 1.0, 0.0], u)),
+        ("drift", {"c": 0.1, "g": -0.4}, u + 0.1 * T - 0.4 * T * u),
+        # Slope 1 beyond the ends, 0.5 in the first piece from -1 to -0.75, 3 in the last one, and a level of 0.1 more.
+        (
+            "lookup",
+            {"low": -1.0, "high": 1.0, "c": 0.1, "s1": 0.5, "s8": 3.0},
+            u + np.interp(u, [-1.0, -0.75, 0.75, 1.0], [0.1, -0.025, -0.025, 0.475]),
+        ),
     ],
 )
 def test_curves(name, values, expected):
@@ -88,6 +96,13 @@ def test_curves(name, values, expected):
         ("loss", {"a": 0.01, "b": 0.2, "c": 0.05}, u - np.polyval([0.05, 0.2, 0.01], np.abs(s))),
         ("loss", {"c": 0.05}, u - 0.05 * s * s),
         ("conductance", {"g": 0.1}, u - 0.1 * s),
+        ("product", {"g": -0.05, "k": 0.2}, u * (0.95 + 0.2 * s)),
+        ("dry-friction", {"F": 0.1, "v": 0.3}, u - 0.1 * (1 - 2 / (np.exp(2 * s / 0.3) + 1))),
+        (
+            "curve",
+            {"low": 0.0, "high": 2.0, "v1": -0.1, "v4": 0.2, "v9": 0.05},
+            u + np.interp(s, np.linspace(0, 2, 9), [-0.1, 0, 0, 0.2, 0, 0, 0, 0, 0.05]),
+        ),
         ("coupling", {"k": -0.3}, u - 0.3 * (s - 1.0)),
         ("droop", {"k": 0.3}, u - 0.3 * (s - 1.0)),
         ("droop", {"k": 0.3, "deadband": 0.25}, u - 0.3 * np.sign(s - 1) * np.maximum(np.abs(s - 1) - 0.25, 0.0)),
@@ -289,6 +304,8 @@ def test_a_delay_in_a_loop_is_the_method_of_steps():
         ("offset", {"c": 0.2}, lambda s: 1 + 0 * s),
         ("disturbance", {"amplitude": 0.2}, lambda s: 1 + 0 * s),
         ("term", {"k": 0.2}, lambda s: 1 + 0.2 * 3 * 0.25 + 0 * s),
+        ("polynomial", {"b": 0.3, "c": 0.2}, lambda s: 1 + 0.3 * 2 * 0.5 + 0.2 * 3 * 0.25 + 0 * s),
+        ("lookup", {"low": -0.1, "high": 1.0, "s5": 0.7}, lambda s: 0.7 + 0 * s),
     ],
 )
 def test_it_linearises(name, values, expected):
@@ -307,12 +324,39 @@ def test_it_linearises(name, values, expected):
         ("droop", {"k": 0.3, "deadband": 0.1}, 0.0),
         ("conductance", {"g": 0.3}, -0.3),
         ("loss", {"b": 0.2, "c": 0.1}, -(0.2 + 2 * 0.1 * 2.0)),
+        ("curve", {"low": 1.95, "high": 2.75, "v2": 0.3}, 3.0),
+        ("dry-friction", {"F": 0.2, "v": 4.0}, -0.2 / 4.0 / np.cosh(0.5) ** 2),
     ],
 )
 def test_those_with_another_signal_linearise(name, values, gain):
     model = effect_model(EffectUse(name, ("u",), FrozenMap(values), source="source"), source=True)
     found = linearize(model, find_operating_point(model, {"u": 0.5, "source": 2.0}))
     np.testing.assert_allclose(found.response(np.array([40.0])).ravel(), [1.0, gain], atol=1e-12)
+
+
+def test_a_filter_is_told_by_its_shape_and_a_curve_by_what_is_added():
+    notch, lookup, curve = (effects()[n] for n in ("filter", "lookup", "curve"))
+    values = {"k": -0.8, "low": 0.0, "high": 0.0, "wn": 40.0, "zeta": 0.3}
+    assert notch.words(values) == {
+        "shape": "a notch around 40 rad/s", "transfer": "(s^2 + 4.8 s + 1600)/(s^2 + 24 s + 1600)",
+    }  # fmt: skip
+    assert notch.is_own(values) and not notch.is_own(values | {"zeta": 2.0}), (
+        "two lags and two leads are in the catalogue"
+    )
+    for entry, given in ((lookup, {"c": 0.1, "s2": 0.2, "s7": 2.0}), (curve, {"v2": 0.3, "v8": -0.1})):
+        full = {n: q.value for n, q in entry.parameters.items()} | {"low": -0.4, "high": 1.2} | given
+        at, added = entry.curve(full)
+        source = entry.needs_source
+        use = EffectUse(entry.name, ("u",), FrozenMap(full), source="source" if source else "")
+        model, moved = effect_model(use, source=source), "source" if source else "u"
+        for x, y in zip(at, added, strict=True):
+            held = {"u": 0.25, moved: x}
+            assert equilibrium(model, held) == pytest.approx(held["u"] + y, abs=1e-12)
+
+
+def equilibrium(model, inputs):
+    """The output of an effect at constant inputs."""
+    return find_operating_point(model, inputs).outputs["y"]
 
 
 STUDY = """
