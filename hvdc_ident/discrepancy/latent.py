@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy.pushes import Pushed, Whitening
 
 EVEN, QUICK = 16, 8
 """Knots of a push over a record, and over each part of it behind a break of an input, ever nearer to the break."""
-MOST = 400
+MOST = 120
 """Knots of all records together, about: with many breaks the parts behind them have fewer."""
 WEAK = 1e-4
 """Of the strongest direction: weaker ones leave no trace."""

@@ -18,6 +18,7 @@ from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
+from hvdc_ident.discrepancy.race import Race
 from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.refit_jobs import as_given
 from hvdc_ident.discrepancy.refitted import best_each, by_cost
@@ -95,9 +96,31 @@ def _grids(opened: Round, trials: Sequence[CandidateFit], *, far: bool) -> dict[
             sizes = sizes[[_alike(d, late.get(c.at, 0.0)) for d in own]]
         elif not (far and count[c.effect] <= PLACES):
             continue
+        else:
+            sizes = sizes[sizes * _answer_per_size(opened, k) >= _least_answer(opened, trials)]
         if sizes.size:
             grids[k] = sizes
     return grids
+
+
+def _answer_per_size(opened: Round, candidate: int) -> float:
+    """Return the largest answer that the screen saw of a candidate, in noise units, per unit of its size."""
+    found, screen = opened.candidates[candidate], opened.screen
+    name = _named(found)
+    return max(
+        (math.sqrt(screen.size[k, n]) / found.probes[n].values[name] for k, n in screen.size if k == candidate),
+        default=0.0,
+    )
+
+
+def _least_answer(opened: Round, trials: Sequence[CandidateFit]) -> float:
+    """Return the least answer, in noise units, with which an effect may come within reach of the best fall of chi2.
+
+    With an answer a beside a residual r, chi2 = |r + a|^2 falls by no more than 2 |r| |a|.
+    """
+    chi2 = opened.before.chi2
+    best = min((t.refit.chi2 for t in trials if not t.refit.failure), default=chi2)
+    return Race().reach * (chi2 - best) / (2.0 * math.sqrt(chi2))
 
 
 def _late(refit: Refit) -> float | None:

@@ -72,8 +72,12 @@ def one_round(search: SearchContext, before: Refit, number: int, *, little: bool
     loud = excess(before) and not like_noise(before)
     if p > NEARLY and not loud:
         return replace(opened, why=nothing)
-    if little or (p > search.options.significance and not loud):
+    if little or p > search.options.significance:
         first = stand.refitted(found, _field(search, found, screen.shots)[:SHORTLIST], f"round {number}")
+        if loud and (given := as_given(before)) is not None:
+            where = f"{text}: from the given values"
+            shots = _field(search, found, stand.screen(found, where, point=given).shots)
+            first += stand.refitted(found, shots[:SHORTLIST], where, first)
         if not _significant(search, opened, first) or (little and all_far(before, first)):
             return replace(opened, failed=tuple(t for t in first if t.refit.failure), why=nothing)
     opened, trials = _explored(search, stand, opened, number)
@@ -196,8 +200,14 @@ def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tup
             found[k] = _with_sizes(found[k], _delaying(found[k], late))
     theta = gains_of(opened.before, lead.refit)
     screen = stand.screen(found, f"round {number}: beside {own.label}", which, theta)
-    least = Race().reach * (opened.before.chi2 - lead.refit.chi2)
-    near = [s for s in screen.shots if s.fall >= least and s.candidate != lead.pick.candidate]
+    best = opened.before.chi2 - lead.refit.chi2
+    near = [
+        s
+        for s in screen.shots
+        if s.candidate != lead.pick.candidate
+        # Of an effect in proportion to its size the fall is exact in that, and at the leader's gains hardly moves with them.
+        and s.fall >= (Race().near if in_proportion(found[s.candidate], s.probe) else Race().reach) * best
+    ]
     return replace(opened, candidates=tuple(found)), _field(stand.search, found, near)
 
 
