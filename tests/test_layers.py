@@ -18,9 +18,8 @@ fmu linearize sensitivity fit identifiability discrepancy report study api app c
 # Rooms with rooms inside, and the order of those.
 INSIDE = {
     "discrepancy": """
-noise_colour options result candidates movable size_curves record_noise placed nominal refit screen localise evidence pushes
-race bode implied refit_jobs explain residual_checks formula latent refitted context clocks stand_ins stand remainder released
-outside met rounds alternatives search candidate_table classes findings verdict diagnosis
+options result candidates movable nominal hypothesis screen location residual_checks implied evidence pushes stand explain
+stand_ins moves remainder forms met search candidate_table classes findings verdict diagnosis
 """
 }
 

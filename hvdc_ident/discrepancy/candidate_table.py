@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit
-from hvdc_ident.discrepancy.race import BEHIND
-from hvdc_ident.discrepancy.refit import unseen
+from hvdc_ident.discrepancy.hypothesis import unseen
 from hvdc_ident.discrepancy.result import Line
 from hvdc_ident.discrepancy.screen import Shot
 from hvdc_ident.discrepancy.search import SearchOutcome
+from hvdc_ident.discrepancy.stand import BEHIND, Round
 from hvdc_ident.immutable import FrozenMap
 
 

@@ -11,15 +11,15 @@ from typing import TypeVar
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, at_edge, behinds, best_gain, evidence_between
 from hvdc_ident.discrepancy.forms import expression
+from hvdc_ident.discrepancy.hypothesis import Refit, unseen
 from hvdc_ident.discrepancy.implied import TIED, apart, implied, nearest, off_given
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
-from hvdc_ident.discrepancy.refit import Refit, unseen
 from hvdc_ident.discrepancy.result import Hypothesis, Rival
 from hvdc_ident.discrepancy.search import SearchOutcome
+from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 

@@ -11,27 +11,23 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from hvdc_ident.data import Experiment
-from hvdc_ident.discrepancy.bode import responses
 from hvdc_ident.discrepancy.candidate_table import lines
 from hvdc_ident.discrepancy.candidates import entries
 from hvdc_ident.discrepancy.classes import compared
-from hvdc_ident.discrepancy.clocks import clocks, told
-from hvdc_ident.discrepancy.context import Course, Round, SearchContext
-from hvdc_ident.discrepancy.evidence import louder_than_noise
+from hvdc_ident.discrepancy.evidence import all_far, louder_than_noise
 from hvdc_ident.discrepancy.explain import at_given, beside_stand_ins, found_of, gap, off_given
 from hvdc_ident.discrepancy.findings import separating
 from hvdc_ident.discrepancy.forms import Told, course, described, standing, tried
-from hvdc_ident.discrepancy.localise import localise
+from hvdc_ident.discrepancy.hypothesis import Refit, judged
+from hvdc_ident.discrepancy.location import localise, responses
+from hvdc_ident.discrepancy.moves import clocks, stated, told
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
-from hvdc_ident.discrepancy.options import DiagnosisOptions
-from hvdc_ident.discrepancy.race import UNTRIED as NOT_BEGUN
-from hvdc_ident.discrepancy.record_noise import LOUDER, QUIETER, OutputNoise
-from hvdc_ident.discrepancy.refit import Refit, judged
-from hvdc_ident.discrepancy.refitted import all_far
-from hvdc_ident.discrepancy.released import stated
+from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect, StandIn
 from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
+from hvdc_ident.discrepancy.stand import UNTRIED as NOT_BEGUN
+from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.discrepancy.stand_ins import stand_ins
 from hvdc_ident.discrepancy.verdict import (
     Judgement,
@@ -47,6 +43,7 @@ from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, Simulator
+from hvdc_ident.fit.record_noise import LOUDER, QUIETER, OutputNoise
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.simulate import ModelSimulator

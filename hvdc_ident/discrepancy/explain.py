@@ -10,13 +10,12 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.options import SURE
-from hvdc_ident.discrepancy.placed import Placed
-from hvdc_ident.discrepancy.refit import Refit, held_out, unseen
+from hvdc_ident.discrepancy.hypothesis import Placed, Refit, held_out, unseen
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, StandIn, Table
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
+from hvdc_ident.fit.record_noise import SURE
 from hvdc_ident.fit.uncertainty import uncertainty
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures, listed, percentage, quantity

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, credible
-from hvdc_ident.discrepancy.context import Round
 from hvdc_ident.discrepancy.explain import advice, sentence
 from hvdc_ident.discrepancy.forms import with_values
+from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.implied import apart
-from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival, ValueAt
+from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures_of, listed, quantity

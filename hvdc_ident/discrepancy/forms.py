@@ -15,18 +15,15 @@ import numpy as np
 import sympy as sp
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.candidates import CandidateEffect, additive, candidates
-from hvdc_ident.discrepancy.context import Form, Round, SearchContext
-from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, gained
+from hvdc_ident.discrepancy.candidates import additive, candidates
+from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, best_each, gained, is_far, left_by
 from hvdc_ident.discrepancy.explain import sentence
+from hvdc_ident.discrepancy.hypothesis import Refit, in_place, unseen
 from hvdc_ident.discrepancy.movable import equations, in_proportion, present_in
-from hvdc_ident.discrepancy.options import REFUTED
+from hvdc_ident.discrepancy.options import REFUTED, SearchContext
 from hvdc_ident.discrepancy.pushes import Pushed, Whitening
-from hvdc_ident.discrepancy.refit import Refit, unseen
-from hvdc_ident.discrepancy.refit_jobs import in_place
-from hvdc_ident.discrepancy.refitted import best_each, is_far, left_by
 from hvdc_ident.discrepancy.screen import Shot
-from hvdc_ident.discrepancy.stand import Stand, larger
+from hvdc_ident.discrepancy.stand import FoundForm, Round, Stand
 from hvdc_ident.effects import effects
 from hvdc_ident.expression import parse, symbol, to_text
 from hvdc_ident.files import plain
@@ -86,8 +83,7 @@ def tried(search: SearchContext, opened: Round, at: Collection[str] | None = Non
     screen = stand.screen(found, "outside the catalogue", [k for k in range(len(found)) if k not in curves])
     shots: list[Shot] = []
     for effect in {c.effect: None for c in found}:
-        best = [s for k, s in screen.best().items() if found[k].effect == effect][:EACH]
-        shots += [each for s in best for each in (s, *_wider(s, found[s.candidate]))]
+        shots += [s for k, s in screen.best().items() if found[k].effect == effect][:EACH]
     shots += [Shot(k, 0, 0.0, before.theta) for k in curves]
     trials = best_each(stand.refitted(found, shots, "outside the catalogue"))
     return tuple(t for t in trials if not t.refit.failure and _is_own(t.refit))
@@ -99,10 +95,6 @@ def _promising(opened: Round) -> list[str]:
     return list(dict.fromkeys(at[0] for at in order if len(at) == 1))[:PLACES]
 
 
-def _wider(shot: Shot, candidate: CandidateEffect) -> list[Shot]:
-    return [replace(shot, probe=n, factor=1.0) for n in larger(candidate, shot.probe)]
-
-
 def _is_own(refit: Refit) -> bool:
     entry = effects()[refit.placed[-1].candidate.effect]
     return entry.is_own is None or entry.is_own(refit.sizes(refit.placed[-1]))
@@ -110,7 +102,7 @@ def _is_own(refit: Refit) -> bool:
 
 def standing(
     search: SearchContext, opened: Round, trials: Sequence[CandidateFit], best: Refit | None = None
-) -> Form | None:
+) -> FoundForm | None:
     """Return the form that leaves least for the price of its values, of those that stand the tests of an effect; None where none
     does.
 
@@ -123,7 +115,7 @@ def standing(
         if (gain := _gain(search, opened.before, refit, best)) is not None:
             cost = refit.chi2 + refit.count * price
             others = [r for r in order[k + 1 :] if r.chi2 + r.count * price - cost <= search.options.set_bic]
-            return Form(opened.before, refit, gain, tuple(others))
+            return FoundForm(opened.before, refit, gain, tuple(others))
     return None
 
 
@@ -180,7 +172,7 @@ def instead_of(search: SearchContext, opened: Round) -> tuple[tuple[CandidateFit
     return tuple(weighed)
 
 
-def described(form: Form) -> Told:
+def described(form: FoundForm) -> Told:
     """Return what is told of a form, which is put into its model for good: its formula, its transfer function or its curve."""
     refit = in_place(form.before, form.refit)
     placed = refit.placed[-1]

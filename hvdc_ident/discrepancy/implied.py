@@ -10,9 +10,9 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
-from hvdc_ident.discrepancy.options import SURE
-from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.result import EffectSize
+from hvdc_ident.fit.record_noise import SURE
 from hvdc_ident.immutable import FrozenMap
 
 TIED = 2.0

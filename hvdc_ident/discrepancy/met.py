@@ -15,15 +15,11 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.context import Round
-from hvdc_ident.discrepancy.evidence import CandidateFit
+from hvdc_ident.discrepancy.evidence import CandidateFit, best_each, by_cost
+from hvdc_ident.discrepancy.hypothesis import Refit, as_given
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
-from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.refit_jobs import as_given
-from hvdc_ident.discrepancy.refitted import best_each, by_cost
 from hvdc_ident.discrepancy.screen import Shot
-from hvdc_ident.discrepancy.stand import Stand, gains_of
+from hvdc_ident.discrepancy.stand import Race, Round, Stand, gains_of
 from hvdc_ident.effects import Probe, SignalScales, effects, size_grid
 from hvdc_ident.immutable import FrozenMap
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, Trajectory
-from hvdc_ident.discrepancy.record_noise import GIVEN, OutputNoise, draws, noise_of, stated_by
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit import FitParameter, Problem, Simulator
+from hvdc_ident.fit.record_noise import GIVEN, OutputNoise, draws, noise_of, stated_by
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.simulator import approximate, observe
 from hvdc_ident.identifiability.gate import gate, gated

@@ -1,13 +1,18 @@
-"""Thresholds and budgets of a diagnosis."""
+"""Thresholds and budgets of a diagnosis, and what else stays over the rounds of its search."""
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import dataclass
+from typing import Literal
 
+from hvdc_ident.data import Experiment
 from hvdc_ident.errors import StudyError
+from hvdc_ident.executor import Executor, Progress
+from hvdc_ident.fit import FitParameter
+from hvdc_ident.immutable import FrozenMap
 
-SURE = 4.0
-"""Standard errors beyond which nothing is put down to chance: one in 16 000, where a diagnosis asks some hundred such questions."""
 TOLERANCE = 0.01
 """Share of the squared gap, a tenth of its amplitude, that nobody asks about: no model leaves noise alone of real records."""
 REFUTED = 0.1
@@ -59,3 +64,83 @@ class DiagnosisOptions:
             )
         if min(self.most, self.starts) < 1:
             raise StudyError("a number of effects or starts is below 1", where="options of a diagnosis")
+
+
+STEPS_AFTER = 60
+"""Steps that the bar leaves room for behind those that are known: about what one more round of refits takes."""
+
+
+@dataclass(eq=False)
+class Course:
+    """Progress of a search as people see it: in per cent, never backwards, with the best hypothesis so far.
+
+    How many steps there will be is not known before the end, so the bar leaves room for one more round.
+    """
+
+    progress: Progress
+    finished: int = 0
+    batch: int = 0
+    done: int = 0
+    percent: int = 0
+    best: str = ""
+    left: float = math.inf
+
+    def step(self, done: int, total: int, text: str) -> None:
+        """Report that so many steps of a batch are done."""
+        if done < self.done or total != self.batch:
+            self.finished, self.batch = self.finished + self.batch, total
+        self.done = done
+        reached = 100 * (self.finished + done) // (self.finished + total + STEPS_AFTER)
+        self.percent = max(self.percent, reached)
+        best = f"; best so far: {self.best}, {self.left:.3g} times the noise is left" if self.best else ""
+        self.progress(self.percent, 100, text + best)
+
+    def lead(self, label: str, left: float) -> None:
+        """Remember a hypothesis that leaves less than those before. left: root mean square of its residual, in noise units."""
+        if left < self.left:
+            self.best, self.left = label, left
+
+
+@dataclass(frozen=True)
+class SearchContext:
+    """Settings of a search, which stay over its rounds.
+
+    deadline: instant at which its budget ends (`time.monotonic`), s. held: candidates of the fit that the nominal
+    model holds; stated: its other parameters, with bounds as near as they are known. records: the experiments, on their
+    own clocks; none where it is not asked whether these are off.
+    """
+
+    effects: tuple[str, ...] | Literal["all"]
+    places: tuple[str | tuple[str, ...], ...] | None
+    tolerance: FrozenMap[float]
+    options: DiagnosisOptions
+    seed: int
+    executor: Executor | None = None
+    course: Course | None = None
+    deadline: float = math.inf
+    held: tuple[FitParameter, ...] = ()
+    stated: tuple[FitParameter, ...] = ()
+    records: tuple[Experiment, ...] = ()
+
+    @property
+    def spent(self) -> bool:
+        """True once the budget is over, by the monotonic clock."""
+        return time.monotonic() > self.deadline
+
+    def tries(self, effect: str) -> bool:
+        """Return True for an effect that is searched for."""
+        return self.effects == "all" or effect in self.effects
+
+    def looks_at(self, slot: str) -> bool:
+        """Return True for a slot that is searched."""
+        return self.places is None or any(slot in ((g,) if isinstance(g, str) else g) for g in self.places)
+
+    def tell(self, done: int, total: int, text: str) -> None:
+        """Report progress."""
+        if self.course:
+            self.course.step(done, total, text)
+
+    def lead(self, label: str, left: float) -> None:
+        """Report the best of the hypotheses that were just refitted. left: root mean square of its residual, in noise units."""
+        if self.course:
+            self.course.lead(label, left)

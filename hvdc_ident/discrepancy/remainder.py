@@ -20,17 +20,14 @@ from scipy.special import fdtrc
 from scipy.stats import chi2
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.context import SearchContext, slot_signals
-from hvdc_ident.discrepancy.evidence import unseen_rows
-from hvdc_ident.discrepancy.latent import Inversion
+from hvdc_ident.discrepancy.evidence import left_by, unseen_rows
+from hvdc_ident.discrepancy.hypothesis import Refit, held_out_by_record, slot_signals, unseen
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
-from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE
-from hvdc_ident.discrepancy.pushes import Pushed, pushed
-from hvdc_ident.discrepancy.record_noise import draws, freedom_of
-from hvdc_ident.discrepancy.refit import Refit, held_out_by_record, unseen
-from hvdc_ident.discrepancy.refitted import left_by
+from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE, SearchContext
+from hvdc_ident.discrepancy.pushes import Inversion, Pushed, pushed
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
+from hvdc_ident.fit.record_noise import draws, freedom_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 

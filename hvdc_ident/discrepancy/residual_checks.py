@@ -10,11 +10,10 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.hypothesis import Placed, Refit
 from hvdc_ident.discrepancy.nominal import Nominal, unit_columns
-from hvdc_ident.discrepancy.options import SURE
-from hvdc_ident.discrepancy.placed import Placed
-from hvdc_ident.discrepancy.refit import Refit
 from hvdc_ident.effects import effects
+from hvdc_ident.fit.record_noise import SURE
 
 BINS = 8
 AFTER = 10

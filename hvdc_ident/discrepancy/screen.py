@@ -19,10 +19,9 @@ from scipy.optimize import lsq_linear
 
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.hypothesis import FAILURES, PATIENCE
 from hvdc_ident.discrepancy.movable import Form, Movable, is_proportional, movable, on_loop
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.placed import PATIENCE
-from hvdc_ident.discrepancy.refit import FAILURES
 from hvdc_ident.effects import apply_effects, distance_from_neutral, effects
 from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit import Problem

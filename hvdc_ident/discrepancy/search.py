@@ -1,26 +1,364 @@
-"""Forward addition of effects, pairs where one masks the other, and each looked for again beside the others."""
+"""The search: one effect after the other, each looked for again beside the others, or done without.
+
+A round screens everything on the model as it stands, refits the best, and judges the winner. From the gains of the best refits
+the candidates at their places, and their effects at all places, are screened again, until nothing comes nearer. The gains that
+the misfit has moved, and the given ones, are where a round begins.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
-from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.clocks import clocks, on_their_clocks
-from hvdc_ident.discrepancy.context import Round, SearchContext
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, at_edge, clear, evidence_between, gained
-from hvdc_ident.discrepancy.options import BEAM, SHORTLIST, TOLERANCE
-from hvdc_ident.discrepancy.placed import Placed
-from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, judged
-from hvdc_ident.discrepancy.refit_jobs import as_given, job_of, moved_far, refit_again
-from hvdc_ident.discrepancy.refitted import is_far, is_noise, left_by
-from hvdc_ident.discrepancy.released import held_again, released
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
+from hvdc_ident.discrepancy.evidence import (
+    CandidateFit,
+    Pick,
+    Ruler,
+    all_far,
+    at_edge,
+    behinds,
+    best_each,
+    by_cost,
+    clear,
+    evidence_between,
+    excess,
+    gained,
+    is_far,
+    is_noise,
+    left_by,
+    like_noise,
+    objections,
+    telling,
+)
+from hvdc_ident.discrepancy.forms import standing, tried
+from hvdc_ident.discrepancy.hypothesis import (
+    FAILURES,
+    Placed,
+    Refit,
+    RefitJob,
+    as_given,
+    in_place,
+    job_of,
+    judged,
+    moved,
+    moved_far,
+    refit_again,
+    slot_signals,
+)
+from hvdc_ident.discrepancy.implied import TIED, implied, nearest, off_given
+from hvdc_ident.discrepancy.met import met
+from hvdc_ident.discrepancy.movable import in_proportion, present_in
+from hvdc_ident.discrepancy.moves import clocks, held_again, on_their_clocks, released
+from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import is_small
-from hvdc_ident.discrepancy.rounds import against, closed, one_round
+from hvdc_ident.discrepancy.residual_checks import tones
+from hvdc_ident.discrepancy.screen import Shot
+from hvdc_ident.discrepancy.stand import Race, Round, Stand, done, gains_of
+from hvdc_ident.effects import Probe, effects
+from hvdc_ident.immutable import FrozenMap
+
+OF_EFFECT = 8
+"""Refits of one effect in a field, at least where so many come into question: places that cannot be told apart are neighbours."""
+THOROUGH = 4
+"""Times as many of a thorough search."""
+TOGETHER = 6
+"""Effects at several places in a field: each takes a compilation of its own."""
+TURNS = 3
+"""Times that a round goes on from the gains of its best refits."""
+LEVEL = 0.9
+"""Share of the best fall of chi2 from which a refit leads on."""
+NEARLY = 0.1
+"""Chance under noise of the best fall below which a closer look is taken before nothing is said to be there."""
+BEYOND = "none of it leaves noise, and what is found from the data alone does"
+
+
+def one_round(search: SearchContext, before: Refit, number: int, *, little: bool = False) -> Round:
+    """Return a round on the model as it stands. Raises SimulationError where that model cannot be run.
+
+    little: whether so little is left that only an effect that explains it is worth adding: a few refits tell whether one may.
+    """
+    nominal = before.nominal()
+    search.tell(0, 1, f"round {number}: the signals")
+    signals = slot_signals(before)
+    times = [e.time for e in before.problem.fitted_experiments]
+    found = candidates(before.model, signals, times, search.effects, search.places, tones(nominal))
+    there = {(p.candidate.effect, p.candidate.at, p.candidate.source) for p in before.placed}
+    found = tuple(c for c in found if (c.effect, c.at, c.source) not in there and c.probes)
+    stand = Stand.of(search, before, found, number)
+    text = f"round {number}: {len(found)} candidates"
+    screen = stand.screen(found, text)
+    opened = Round(before, signals, found, screen)
+    if not screen.shots:
+        return replace(opened, why="no candidate leaves a trace in these data")
+    p = screen.p(max(screen.shots[0].fall, 0.0))
+    nothing = f"the best of all is what noise gives (p = {p:.2g})"
+    loud = excess(before) and not like_noise(before)
+    if p > NEARLY and not loud:
+        return replace(opened, why=nothing)
+    if little or p > search.options.significance:
+        first = stand.refitted(found, _field(search, found, screen.shots)[:SHORTLIST], f"round {number}")
+        if loud and (given := as_given(before)) is not None:
+            where = f"{text}: from the given values"
+            shots = _field(search, found, stand.screen(found, where, point=given).shots)
+            first += stand.refitted(found, shots[:SHORTLIST], where, first)
+        gains = [_gain(before, t.refit) for t in first if not t.refit.failure]
+        named = max(gains, default=0.0) > search.options.named_bic
+        if not (named and _significant(search, opened, first)) or (little and all_far(before, first)):
+            return replace(opened, failed=tuple(t for t in first if t.refit.failure), why=nothing)
+    opened, trials = _explored(search, stand, opened, number)
+    if not _significant(search, opened, trials):
+        return replace(opened, failed=tuple(t for t in trials if t.refit.failure), why=nothing)
+    return closed(search, replace(opened, significant=True), trials, number)
+
+
+def _gain(before: Refit, after: Refit) -> float:
+    """Return what effects gain in BIC over the model before."""
+    return Ruler.of(after).gain(before.chi2, after.chi2, after.count - before.count)
+
+
+def _significant(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> bool:
+    """Return True where a refit makes chi2 fall by more than noise gives anywhere."""
+    falls = [opened.before.chi2 - t.refit.chi2 for t in trials if not t.refit.failure]
+    return opened.screen.p(max(falls, default=0.0)) <= search.options.significance
+
+
+def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -> tuple[Round, list[CandidateFit]]:
+    """Return the round with its refits."""
+    found, text = opened.candidates, f"round {number}"
+    opened, trials = _led_on(
+        stand, opened, stand.refitted(found, _field(search, found, opened.screen.shots), text), number
+    )
+    given = as_given(opened.before)
+    if not search.spent and all_far(opened.before, trials, near=TOLERANCE):
+        # Bends are missed between two sizes, and gains that make up for an effect may leave no trace of it.
+        opened = replace(opened, candidates=tuple(map(_denser, opened.candidates)))
+        found = opened.candidates
+        for point in (None,) if given is None else (None, given):
+            where = f"{text}: {'once more' if point is None else 'from the given values'}"
+            shots = _field(search, found, stand.screen(found, where, point=point).shots)
+            trials = best_each([*trials, *stand.refitted(found, shots, where, trials)])
+        opened, trials = _led_on(stand, opened, trials, number)
+    elif given is not None and not search.spent:
+        # Beside an effect the records may be explained by other values of the parameters too.
+        shots = [_shot_of(t.pick, given) for t in by_cost(trials)[:OF_EFFECT]]
+        more = stand.refitted(opened.candidates, shots, f"{text}: from the given values", trials)
+        opened, trials = _led_on(stand, opened, best_each([*trials, *more]), number)
+    if not search.spent:
+        opened, trials = met(stand, opened, trials, number, far=all_far(opened.before, trials))
+    if number == 1 and search.options.fallback and not search.spent and _tells(opened, trials):
+        best = next(iter(by_cost(trials)), None)
+        if best is not None and not is_noise(best.refit, search.seed):
+            opened, trials = _outside(search, stand, opened, trials)
+    return opened, trials
+
+
+def _shot_of(pick: Pick, theta: Array) -> Shot:
+    """Return what was refitted as a shot, to be begun with these unknowns."""
+    return Shot(pick.candidate, pick.probe, pick.fall, theta, pick.factor)
+
+
+def _field(search: SearchContext, found: Sequence[CandidateEffect], shots: Sequence[Shot]) -> list[Shot]:
+    """Return the shots that are refitted: of each effect the best candidates."""
+    count: Counter[str] = Counter()
+    several, most = 0, OF_EFFECT * (THOROUGH if search.options.thorough else 1)
+    taken: dict[int, Shot] = {}
+    for s in shots:
+        c = found[s.candidate]
+        if s.candidate in taken or count[c.effect] >= most or (len(c.at) > 1 and several >= TOGETHER):
+            continue
+        count[c.effect] += 1
+        several += len(c.at) > 1
+        taken[s.candidate] = s
+    return [*taken.values()]
+
+
+def _led_on(
+    stand: Stand, opened: Round, trials: Sequence[CandidateFit], number: int
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the trials with what is found from the gains of the best, again while something comes nearer."""
+    trials = best_each(trials)
+    asked: set[tuple[int, tuple[float, ...]]] = set()
+    for _ in range(TURNS):
+        leaders = [t for t in _leaders(opened, trials) if (t.pick.candidate, tuple(t.refit.theta)) not in asked]
+        if not leaders or stand.search.spent:
+            break
+        asked |= {(t.pick.candidate, tuple(t.refit.theta)) for t in leaders}
+        before = by_cost(trials)[0]
+        more: list[CandidateFit] = []
+        for t in leaders:
+            opened, shots = _beside(stand, opened, t, number)
+            more += stand.refitted(opened.candidates, shots, f"round {number}: neighbours", trials)
+        trials = best_each([*trials, *more])
+        if by_cost(trials)[0] is before:
+            break
+    return opened, trials
+
+
+def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit]:
+    """Return the best refit of each of the best effects."""
+    sound = by_cost(trials)
+    if not sound:
+        return []
+    least = LEVEL * (opened.before.chi2 - sound[0].refit.chi2)
+    each: dict[str, CandidateFit] = {}
+    for t in sound:
+        if opened.before.chi2 - t.refit.chi2 >= least:
+            each.setdefault(opened.candidates[t.pick.candidate].effect, t)
+    return list(each.values())[:BEAM]
+
+
+def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tuple[Round, list[Shot]]:
+    """Return the round and the shots of what is at the leader's place or is its effect, from the gains that the leader came to.
+
+    Its effect elsewhere, and at several places of which one is the leader's, is tried in the leader's size too, and another kind
+    of delay there with a delay as long.
+    """
+    own = opened.candidates[lead.pick.candidate]
+    sizes = lead.refit.sizes(lead.refit.placed[-1])
+    found = list(opened.candidates)
+    same = [k for k in opened.screen.best() if found[k].effect == own.effect]
+    like = [k for k in same if len(found[k].at) == len(own.at)]
+    around = [k for k in same if set(found[k].at) > set(own.at)]
+    parts = [k for k in same if len(found[k].at) == 1 and any(found[k].at[0] in found[f].at for f in around)]
+    here = [k for k, c in enumerate(found) if c.at == own.at and not c.still]
+    which = list(dict.fromkeys((*here, *like[: 2 * OF_EFFECT], *parts, *around)))
+    late = effects()[own.effect].delay_with(sizes)
+    for k in which:
+        if found[k].effect == own.effect:
+            found[k] = _with_sizes(found[k], [sizes])
+        elif late:
+            found[k] = _with_sizes(found[k], _delaying(found[k], late))
+    theta = gains_of(opened.before, lead.refit)
+    screen = stand.screen(found, f"round {number}: beside {own.label}", which, theta)
+    best = opened.before.chi2 - lead.refit.chi2
+    near = [
+        s
+        for s in screen.shots
+        if s.candidate != lead.pick.candidate
+        # Of an effect in proportion to its size the fall is exact in that, and at the leader's gains hardly moves with them.
+        and s.fall >= (Race().near if in_proportion(found[s.candidate], s.probe) else Race().reach) * best
+    ]
+    return replace(opened, candidates=tuple(found)), _field(stand.search, found, near)
+
+
+def _denser(candidate: CandidateEffect) -> CandidateEffect:
+    """Return a candidate with three times as many sizes, where it has one size and bends what it acts on."""
+    values = [p.values[n] for p in candidate.probes for n in p.free if len(p.free) == 1]
+    if len(values) < max(2, len(candidate.probes)) or min(values) <= 0.0 or in_proportion(candidate, 0):
+        return candidate
+    (name,) = candidate.probes[0].free
+    ends = sorted(values)
+    between = [a * (b / a) ** share for a, b in pairwise(ends) for share in (1 / 3, 2 / 3)]
+    return _with_sizes(candidate, [{**candidate.probes[0].values, name: v} for v in between])
+
+
+def _delaying(candidate: CandidateEffect, late: float) -> list[dict[str, float]]:
+    """Return the sizes at which a candidate delays so long, from its probe that delays most alike; none of what is no delay."""
+    delays = [effects()[candidate.effect].delay_with(p.values) for p in candidate.probes]
+    near = {n: abs(math.log(d / late)) for n, d in enumerate(delays) if d is not None and d * late > 0.0}
+    if not near:
+        return []
+    n = min(near, key=lambda k: near[k])
+    return [moved(candidate, n, late / (delays[n] or late))]
+
+
+def _with_sizes(candidate: CandidateEffect, sizes: Sequence[dict[str, float]]) -> CandidateEffect:
+    """Return the candidate with further probes at these sizes, each within bounds."""
+    known = {tuple(sorted(p.values.items())) for p in candidate.probes}
+    probes, entry = list(candidate.probes), effects()[candidate.effect]
+    for values in sizes:
+        moved = {n: values.get(n, v) for n, v in candidate.probes[0].values.items()}
+        present = present_in(entry, moved)
+        like = next((p for p in candidate.probes if present_in(entry, p.values) == present), None)
+        if like is None:
+            continue
+        free = {n: (min(low, moved[n]), max(high, moved[n])) for n, (low, high) in like.free.items()}
+        if tuple(sorted(moved.items())) not in known:
+            probes.append(Probe(like.effect, FrozenMap(moved), FrozenMap(free)))
+    return replace(candidate, probes=tuple(probes))
+
+
+def _outside(
+    search: SearchContext, stand: Stand, opened: Round, trials: list[CandidateFit]
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the round with the refits of forms outside the catalogue, and the form that comes nearer than any effect, if one does.
+
+    A form with many values finds the place and the gains where an effect, beside biased gains, did not: a filter whose poles and zeros
+    meet is a gain. So every effect is tried there, begun with the gains that the form came to. Where one of them comes near the
+    noise too, the catalogue lacks nothing.
+    """
+    opened = replace(opened, forms=tried(search, opened))
+    form = standing(search, opened, opened.forms or (), by_cost(trials)[0].refit)
+    if form is None or search.spent:
+        return opened, trials
+    at = form.refit.placed[-1].candidate.at
+    which = [k for k, c in enumerate(opened.candidates) if c.at == at and not c.still]
+    text = "round 1: in the stead of a form"
+    screen = stand.screen(opened.candidates, text, which, gains_of(opened.before, form.refit))
+    shots = list(screen.best().values())[:FIELD]
+    trials = best_each([*trials, *stand.refitted(opened.candidates, shots, text, trials)])
+    return replace(opened, form=form if all_far(opened.before, trials) else None), trials
+
+
+def _tells(opened: Round, trials: Sequence[CandidateFit]) -> bool:
+    """Return True where a refit takes away a share of what is beyond noise: where none does, the noise is louder than stated."""
+    least = opened.before.chi2 - telling(opened.before)
+    return any(not t.refit.failure and t.refit.chi2 < least for t in trials)
+
+
+def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit], number: int) -> Round:
+    """The round with its refits ranked and its winner, put into the model; or what speaks against the best.
+
+    Ranked by what the fitted and the held-out data say together. Of those that are as good the likeliest wins: an effect's
+    probability before any data is shared by all its places and sources, so an offset goes before one of many couplings. Of those
+    that are as likely and imply other values of the parameters that one wins whose values are nearest to the given ones.
+    """
+    tried = {t.pick.candidate for t in trials}
+    trials = [*trials, *(t for t in opened.failed if t.pick.candidate not in tried)]
+    sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
+    if not sound:
+        return replace(opened, failed=failed, why="no candidate could be refitted")
+    before, found = opened.before, opened.candidates
+    ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
+    ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
+    if opened.form is not None:
+        return replace(opened, trials=tuple(ranked), failed=failed, ruler=ruler, why=BEYOND)
+    level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
+    refused = {id(t): against(search, before, t, opened, first=number == 1) for t in level}
+    many = Counter(c.effect for c in found)
+    unlikely = {id(t): 2.0 * np.log(many[found[t.pick.candidate].effect]) - t.told for t in level}
+    likeliest = sorted((t for t in level if not refused[id(t)]), key=lambda t: unlikely[id(t)])
+    winner = next(iter(likeliest), None)
+    if winner is not None:
+        tied = [t for t in likeliest if unlikely[id(t)] <= unlikely[id(winner)] + TIED]
+        winner = nearest(winner, tied, lambda t: implied(t.refit), lambda t: off_given(t.refit))
+        placed = in_place(before, winner.refit)
+        if placed.failure:
+            return replace(
+                opened,
+                trials=tuple(ranked),
+                failed=failed,
+                ruler=ruler,
+                why=f"{found[winner.pick.candidate].label}: {placed.failure}",
+            )
+        new = gained(replace(winner, refit=placed), before, ruler)
+        ranked, winner = [new if t is winner else t for t in ranked], new
+    why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
+    return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
+
+
+def against(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:
+    """Objection to naming a trial's effect, in words; empty where there is none. opened: the round that tells what noise does."""
+    p = opened.screen.p(before.chi2 - trial.refit.chi2)
+    return objections(before, trial, p, search.options, search.tolerance, first=first)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,24 +1,171 @@
-"""Candidates compared on a model: screened, and refitted in a race."""
+"""Candidates compared on a model: screened, and refitted in a race; and what a round of the search comes to.
+
+In a race all refits run a little, and those that cannot catch up with the best are left where they are.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.context import SearchContext
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, excess
+from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, RefitResult, failed_at, find, job
 from hvdc_ident.discrepancy.movable import Form, Movable, present_in
 from hvdc_ident.discrepancy.nominal import thinned
-from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import FAILURES, Refit, RefitJob, failed_at
-from hvdc_ident.discrepancy.refit_jobs import job
+from hvdc_ident.discrepancy.options import SearchContext
+from hvdc_ident.discrepancy.pushes import Pushed, pushed
 from hvdc_ident.discrepancy.screen import Bench, Screen, Shot, screened
 from hvdc_ident.effects import effects
+from hvdc_ident.executor import mapped
+from hvdc_ident.fit import Problem
 from hvdc_ident.model import Model
+
+UNTRIED = "not tried: the budget ended"
+"""Failure of a refit that was not begun."""
+BATCH = 6
+"""Refits in one piece of work, of one model where they share it: a model takes longer to send than some steps of a refit."""
+
+
+@dataclass(frozen=True)
+class Race:
+    """Budget of the successive halving of refits.
+
+    laps: evaluations of every refit that still runs, one lap after the other. reach, near: share of the best refit's fall of chi2
+    that one has to come to for another lap, and to be run to its end. least: refits, the best, that run another lap anyway.
+    """
+
+    laps: tuple[int, ...] = (2, 5)
+    reach: float = 0.4
+    near: float = 0.7
+    least: int = 12
+
+    def run(
+        self, search: SearchContext, before: Refit, jobs: Sequence[RefitJob], texts: Sequence[str], best: float = np.inf
+    ) -> list[Refit]:
+        """The jobs' refits: some evaluations each, and then those to their ends that are within reach of the best.
+
+        before: the model without what they add. best: the least chi2 of refits done before. In the first lap an effect that may
+        begin anywhere begins at rest.
+        """
+        first = [replace(j, evaluations=self.laps[0], judged=False, problem=_from_rest(j, before)) for j in jobs]
+        refits = done(search, first, texts)
+        left = [j.evaluations - self.laps[0] for j in jobs]
+        for lap in self.laps[1:]:
+            running = self._within(self.reach, before.chi2, best, refits, least=self.least)
+            refits = _on(search, jobs, refits, running, [min(lap, n) for n in left], texts)
+            left = [n - lap if k in running else n for k, n in enumerate(left)]
+        near = self._within(self.near, before.chi2, best, refits, least=0)
+        ends = [f"{t}, to the end" for t in texts]
+        refits = _on(search, jobs, refits, near, [max(n, 1) for n in left], ends, judged=True)
+        return [r if r.rows or r.failure else replace(r, failure=BEHIND) for r in refits]
+
+    def _within(self, share: float, before: float, best: float, refits: Sequence[Refit], least: int) -> list[int]:
+        """Those that come to this share of what the best gains, and the first `least` of all."""
+        gained = [-np.inf if r.failure else before - r.chi2 for r in refits]
+        leader = max([before - best, *gained], default=0.0)
+        # Where none is better than nothing, all are still on their way.
+        goal = share * leader if leader > 0.0 else -np.inf
+        order = sorted((k for k, g in enumerate(gained) if g > -np.inf), key=lambda k: -gained[k])
+        return [k for n, k in enumerate(order) if n < least or gained[k] >= goal]
+
+
+def _from_rest(job: RefitJob, before: Refit) -> Problem:
+    return replace(job.problem, free_initial_states=before.problem.free_initial_states)
+
+
+BEHIND = "left behind: others explain far more"
+"""Why a refit was not carried to its end."""
+
+
+def _on(
+    search: SearchContext,
+    jobs: Sequence[RefitJob],
+    refits: Sequence[Refit],
+    which: Sequence[int],
+    evaluations: Sequence[int],
+    texts: Sequence[str],
+    *,
+    judged: bool = False,
+) -> list[Refit]:
+    """The refits, some of them run on from where they are; one that fails stays there, unless it is to be judged."""
+    again = [
+        replace(jobs[k], begins=(refits[k].theta,), spare=(), evaluations=evaluations[k], judged=judged)
+        for k in which
+        if judged or not refits[k].ended
+    ]
+    asked = [k for k in which if judged or not refits[k].ended]
+    further = done(search, again, [texts[k] for k in asked])
+    better = {k: r for k, r in zip(asked, further, strict=True) if judged or not r.failure}
+    return [better.get(k, r) for k, r in enumerate(refits)]
+
+
+def done(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) -> list[Refit]:
+    """The jobs' refits, in their order, wherever they are done; once the budget is over none but the first are begun."""
+    if jobs:
+        search.tell(0, len(jobs), texts[0])
+    batches: list[list[RefitJob]] = []
+    for j in jobs:
+        if batches and len(batches[-1]) < BATCH and batches[-1][-1].model is j.model:
+            batches[-1].append(j)
+        else:
+            batches.append([j])
+    outcomes = iter(mapped(search.executor, _all, batches))
+    refits: list[Refit] = []
+    for n, batch in enumerate(batches):
+        if n and search.spent:
+            rest = [j for b in batches[n:] for j in b]
+            refits += [Refit(j.model, j.placed, j.problem, j.noise, j.begins[0], failure=UNTRIED) for j in rest]
+            break
+        refits += [found.refit(j) for found, j in zip(next(outcomes), batch, strict=True)]
+        search.tell(len(refits), len(jobs), texts[len(refits) - 1])
+    return refits
+
+
+def _all(jobs: Sequence[RefitJob]) -> list[RefitResult]:
+    return [find(j) for j in jobs]
+
+
+@dataclass(frozen=True, eq=False)
+class FoundForm:
+    """A form outside the catalogue, refitted. before: the model without it; gain: delta BIC over that. others: refits of other
+    forms, or of the same elsewhere, that explain as much."""
+
+    before: Refit
+    refit: Refit
+    gain: float
+    others: tuple[Refit, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Round:
+    """Result of one round. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
+
+    signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: every refit,
+    the best first. ruler: what BIC counts by. forms: the refits of forms outside the catalogue; None where none was looked for.
+    form: the one that leaves next to nothing but noise, where no effect that was refitted does.
+    """
+
+    before: Refit
+    signals: Mapping[str, tuple[Array, ...]]
+    candidates: tuple[CandidateEffect, ...]
+    screen: Screen
+    trials: tuple[CandidateFit, ...] = ()
+    failed: tuple[CandidateFit, ...] = ()
+    winner: CandidateFit | None = None
+    why: str = ""
+    significant: bool = False
+    ruler: Ruler | None = None
+    forms: tuple[CandidateFit, ...] | None = None
+    form: FoundForm | None = None
+
+    def answers(self) -> Mapping[str, Pushed]:
+        """Return the model's runs with their answers to pushes, by experiment; none of a model that is closed inside."""
+        return pushed(self.before, self.signals) if isinstance(self.before.model, Model) else {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +221,17 @@ class Stand:
     def refitted(
         self, found: Sequence[CandidateEffect], shots: Sequence[Shot], text: str, earlier: Sequence[CandidateFit] = ()
     ) -> list[CandidateFit]:
-        """Return the shots refitted, in a race with each other and with those refitted earlier."""
+        """Return the shots refitted, in a race with each other and with those refitted earlier, and the larger forms of those that
+        leave more than noise: where the equations of one size do, more sizes gain nothing but their price."""
+        trials = self._raced(found, shots, text, earlier)
+        loud = [t for t in trials if not t.refit.failure and excess(t.refit)]
+        wider = {(t.pick.candidate, n): t for t in loud for n in larger(found[t.pick.candidate], t.pick.probe)}
+        more = [Shot(k, n, t.pick.fall, gains_of(self.before, t.refit)) for (k, n), t in wider.items()]
+        return [*trials, *(self._raced(found, more, text, [*earlier, *trials]) if more else ())]
+
+    def _raced(
+        self, found: Sequence[CandidateEffect], shots: Sequence[Shot], text: str, earlier: Sequence[CandidateFit]
+    ) -> list[CandidateFit]:
         jobs: list[RefitJob] = []
         of: list[Pick] = []
         trials: list[CandidateFit] = []
@@ -88,10 +245,11 @@ class Stand:
                 why = str(error) or type(error).__name__
                 trials.append(CandidateFit(pick, failed_at(self.before, why), -np.inf))
         texts = [f"{text}: {found[p.candidate].label}" for p in of]
-        best = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
-        refits = Race().run(self.search, self.before, jobs, texts, best)
+        least = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
+        refits = Race().run(self.search, self.before, jobs, texts, least)
         if sound := [r for r in refits if not r.failure]:
-            self.search.lead(min(sound, key=lambda r: r.chi2))
+            best = min(sound, key=lambda r: r.chi2)
+            self.search.lead(" and ".join(p.candidate.label for p in best.placed), math.sqrt(best.chi2 / best.rows))
         return [*trials, *(CandidateFit(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
 
 

@@ -13,14 +13,12 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import Ruler, at_edge, clear, evidence_between
 from hvdc_ident.discrepancy.explain import sentence
-from hvdc_ident.discrepancy.options import SHORTLIST
-from hvdc_ident.discrepancy.race import done
-from hvdc_ident.discrepancy.refit import Refit, RefitJob
-from hvdc_ident.discrepancy.refit_jobs import job
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, job
+from hvdc_ident.discrepancy.options import SHORTLIST, SearchContext
 from hvdc_ident.discrepancy.result import StandIn
+from hvdc_ident.discrepancy.stand import Round, done
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.immutable import FrozenMap
 

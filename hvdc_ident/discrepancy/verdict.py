@@ -11,23 +11,23 @@ import numpy as np
 
 from hvdc_ident.data import Array, event_time
 from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, formula_rivals, likely, rivals
-from hvdc_ident.discrepancy.context import Form, SearchContext
 from hvdc_ident.discrepancy.evidence import louder_than_noise, material_gap, worst
 from hvdc_ident.discrepancy.explain import moved_parameters
 from hvdc_ident.discrepancy.findings import finding, values_by_place
 from hvdc_ident.discrepancy.forms import instead_of
+from hvdc_ident.discrepancy.hypothesis import Refit, signal, unseen
 from hvdc_ident.discrepancy.implied import implied
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE
-from hvdc_ident.discrepancy.record_noise import FEWEST, first_at_rest
-from hvdc_ident.discrepancy.refit import Refit, signal, unseen
+from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
 from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict, as_line
 from hvdc_ident.discrepancy.search import SearchOutcome
+from hvdc_ident.discrepancy.stand import FoundForm
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.adequacy import MATTERS
+from hvdc_ident.fit.record_noise import FEWEST, first_at_rest
 from hvdc_ident.text import figures, listed, percentage, value_by_place
 
 DOMINANT = 0.5
@@ -56,7 +56,7 @@ class Judgement:
     tests: tuple[Binned, ...]
     sets: tuple[tuple[Rival, ...], ...] = ()
     experiment: Mapping[str, Any] = field(default_factory=dict)
-    instead: Form | None = None
+    instead: FoundForm | None = None
     doubt: str = ""
     caveat: str = ""
     remainder: Remainder | None = None
@@ -234,7 +234,7 @@ def tests_of(search: SearchContext, last: Refit) -> tuple[Binned, ...]:
 
 def _with_formulas(
     search: SearchContext, outcome: SearchOutcome, sets: tuple[tuple[Rival, ...], ...]
-) -> tuple[tuple[tuple[Rival, ...], ...], Form | None]:
+) -> tuple[tuple[tuple[Rival, ...], ...], FoundForm | None]:
     """The sets with formulas from outside the catalogue that explain as much, and a formula that explains more than an effect does.
 
     They are tried in the stead of an effect that would be named by the catalogue alone, unless no form outside it is asked for.
@@ -248,11 +248,11 @@ def _with_formulas(
         behind, near = formula_rivals(found, formulas, search.options)
         best = max((t for t, _ in formulas), key=lambda t: t.told, default=None)
         if best is not None and np.isinf(behind):
-            return (), Form(found.before, best.refit, best.gain)
+            return (), FoundForm(found.before, best.refit, best.gain)
         wide = (*(replace(r, delta_bic=r.delta_bic + behind) for r in group), *near)
         likeliest = classes(wide)[0]
         if best is not None and likeliest.names[0] in OUTSIDE and likeliest.probability >= CERTAIN:
-            return (), Form(found.before, best.refit, best.gain)
+            return (), FoundForm(found.before, best.refit, best.gain)
         wider.append(wide)
     return tuple(wider), None
 

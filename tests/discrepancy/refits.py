@@ -10,9 +10,8 @@ from cases import FREE, SIGMA, TRUE, model
 
 from hvdc_ident import Experiment, Model, simulate
 from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, added, judged
 from hvdc_ident.discrepancy.nominal import nominal
-from hvdc_ident.discrepancy.placed import added
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
-from hvdc_ident.discrepancy.bode import derivative_spectrum, recorded
+from hvdc_ident.discrepancy.location import derivative_spectrum, recorded
 from hvdc_ident.immutable import FrozenMap
 
 STEP, LAG = 2e-3, 0.02

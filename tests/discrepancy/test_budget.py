@@ -10,9 +10,9 @@ import pytest
 from cases import FREE, experiments, model
 
 from hvdc_ident import Experiment
-from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, refit_jobs, rounds
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, hypothesis, search
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.refit import Refit, RefitJob
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob
 
 NAMES = ["lag", "gain", "limit", "deadband"]
 
@@ -29,9 +29,9 @@ def rough() -> tuple[Experiment, ...]:
 
 
 def test_more_is_refitted_where_a_thorough_search_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rounds, "OF_EFFECT", 1)
+    monkeypatch.setattr(search, "OF_EFFECT", 1)
     begun: list[str] = []
-    plain = refit_jobs.job
+    plain = hypothesis.job
 
     def counted(before: Refit, candidate: CandidateEffect, *given: Any) -> RefitJob:
         begun.append(candidate.label)
@@ -50,7 +50,7 @@ def test_more_is_refitted_where_a_thorough_search_is_asked_for(monkeypatch: pyte
 
 
 def test_a_budget_ends_the_search_and_what_was_not_tried_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rounds, "OF_EFFECT", 1)
+    monkeypatch.setattr(search, "OF_EFFECT", 1)
     options = DiagnosisOptions(bootstraps=100, budget=1e-6)
     found = diagnose(model(), rough(), FREE, effects=NAMES, options=options)
     assert any("The budget ended before" in note for note in found.notes)

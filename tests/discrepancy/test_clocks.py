@@ -8,10 +8,10 @@ import pytest
 from cases import FREE, TRUE, experiments, model
 from refits import plain
 
-from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, refit_jobs
-from hvdc_ident.discrepancy.clocks import _moved, _refitted, as_recorded, clocks, on_their_clocks
-from hvdc_ident.discrepancy.context import SearchContext
-from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, hypothesis
+from hvdc_ident.discrepancy.hypothesis import Refit
+from hvdc_ident.discrepancy.moves import _moved, _refitted, as_recorded, clocks, on_their_clocks
+from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 
@@ -79,7 +79,7 @@ def test_records_are_put_back_on_their_clocks_where_that_is_no_worse() -> None:
 def test_records_stay_where_the_hypothesis_does_not_run_on_moved_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     first = plain(experiments(late=LATE))
     search, done = search_of(first), on_their_clocks(search_of(first), first, first)
-    monkeypatch.setattr(refit_jobs, "job_of", raising)
+    monkeypatch.setattr(hypothesis, "job_of", raising)
     assert on_their_clocks(search, first, first) == (first, first)
     assert as_recorded(search, *done) == done
 

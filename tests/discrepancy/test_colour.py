@@ -12,9 +12,9 @@ from scipy.stats import multivariate_normal
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.noise_colour import RHO, TANH, likelihood, together, without_common
-from hvdc_ident.discrepancy.record_noise import OutputNoise, draws, noise_of
 from hvdc_ident.fit import Problem
+from hvdc_ident.fit.noise_colour import RHO, TANH, likelihood, together, without_common
+from hvdc_ident.fit.record_noise import OutputNoise, draws, noise_of
 from hvdc_ident.immutable import FrozenMap
 
 BEFORE = 50

@@ -11,7 +11,7 @@ from refits import answered, beside, plain
 from scipy.stats import kstest
 
 from hvdc_ident import InputSignal
-from hvdc_ident.discrepancy.refit import Refit, run
+from hvdc_ident.discrepancy.hypothesis import Refit, run
 from hvdc_ident.discrepancy.residual_checks import constancy
 from hvdc_ident.discrepancy.verdict import Doubt, _turned, doubt, one_way
 from hvdc_ident.effects import apply_effects

@@ -15,9 +15,9 @@ from refits import beside, plain
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy import findings as told_as
 from hvdc_ident.discrepancy.classes import classes
-from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.explain import at_given, off_given, sentence
-from hvdc_ident.discrepancy.refit import run
+from hvdc_ident.discrepancy.hypothesis import run
+from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
 from hvdc_ident.discrepancy.verdict import Judgement, headline, keeps_tolerance, leaves_more_than_noise

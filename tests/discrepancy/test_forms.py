@@ -19,11 +19,12 @@ from hvdc_ident import Experiment, InputSignal, Model, Trajectory, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.classes import formula_rivals
-from hvdc_ident.discrepancy.context import Round, SearchContext
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, alike
 from hvdc_ident.discrepancy.forms import expression, instead_of, standing, tried, with_values
-from hvdc_ident.discrepancy.refit import run
-from hvdc_ident.discrepancy.rounds import one_round
+from hvdc_ident.discrepancy.hypothesis import run
+from hvdc_ident.discrepancy.options import SearchContext
+from hvdc_ident.discrepancy.search import one_round
+from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap

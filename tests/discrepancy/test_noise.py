@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.discrepancy.record_noise import OutputNoise, freedom_of, noise_of, without_tone
 from hvdc_ident.fit import FitParameter
+from hvdc_ident.fit.record_noise import OutputNoise, freedom_of, noise_of, without_tone
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 from hvdc_ident.study.recordings import with_noise

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.refit import run
+from hvdc_ident.discrepancy.hypothesis import run
 from hvdc_ident.immutable import FrozenMap
 
 WIDTH = 0.08

@@ -14,10 +14,8 @@ from scipy.stats import norm
 
 from hvdc_ident import Experiment, InputSignal, simulate
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.context import slot_signals
-from hvdc_ident.discrepancy.latent import TRIED, Inversion, _hats
-from hvdc_ident.discrepancy.pushes import Pushed, Whitening, pushed
-from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals
+from hvdc_ident.discrepancy.pushes import TRIED, Inversion, Pushed, Whitening, _hats, pushed
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card

@@ -10,13 +10,12 @@ import pytest
 from cases import FREE, experiments, model
 from refits import beside, plain
 
-from hvdc_ident.discrepancy import diagnose, refit, refit_jobs
+from hvdc_ident.discrepancy import diagnose, hypothesis
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.context import Course, SearchContext
-from hvdc_ident.discrepancy.options import DiagnosisOptions
-from hvdc_ident.discrepancy.race import Race
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, run
+from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.screen import _Runner
+from hvdc_ident.discrepancy.stand import Race
 from hvdc_ident.errors import ComputationError, InputError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
@@ -97,7 +96,7 @@ def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on
     sound, broken = job(before, "lag", "wm", 0.05), job(before, "lag", "drag", 0.05)
     alone = run(sound)
     for place in ("_best_walk", "judged", "_walk"):
-        plain = getattr(refit, place)
+        plain = getattr(hypothesis, place)
 
         def fails(of: object, *given: object, plain: Callable[..., object] = plain) -> object:
             placed = getattr(of, "placed", None)
@@ -106,7 +105,7 @@ def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on
             return plain(of, *given)
 
         with monkeypatch.context() as patched:
-            patched.setattr(refit, place, fails)
+            patched.setattr(hypothesis, place, fails)
             told, lost = Race(reach=-1e6, near=-1e6).run(SEARCH, before, [sound, broken], ["a", "b"])
         assert str(error) in lost.failure
         assert not told.failure and told.chi2 == pytest.approx(alone.chi2, rel=1e-5)
@@ -114,7 +113,7 @@ def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on
 
 def test_a_diagnosis_outlives_a_candidate_that_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     """The gain raises where its refit is made; the lag that is missing is named all the same."""
-    plain = refit_jobs.job
+    plain = hypothesis.job
 
     def fails(before: Refit, candidate: CandidateEffect, *given: object) -> object:
         if candidate.effect == "gain":

@@ -8,10 +8,10 @@ from refits import beside
 
 from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, judged, run
+from hvdc_ident.discrepancy.moves import _with_free, held_again, released
 from hvdc_ident.discrepancy.nominal import nominal
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
-from hvdc_ident.discrepancy.released import _with_free, held_again, released
+from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator

@@ -11,16 +11,25 @@ from cases import FREE, SIGMA, TRUE, experiments, model
 from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, InputSignal, simulate
-from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, rounds
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
+from hvdc_ident.discrepancy import search as searching
 from hvdc_ident.discrepancy.classes import _akin, _equal, classes
-from hvdc_ident.discrepancy.context import Round, SearchContext
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, as_recorded, behinds, objections
-from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.refitted import excess, like_noise, misses
+from hvdc_ident.discrepancy.evidence import (
+    CandidateFit,
+    Pick,
+    as_recorded,
+    behinds,
+    excess,
+    like_noise,
+    misses,
+    objections,
+)
+from hvdc_ident.discrepancy.hypothesis import Refit, run
+from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder
 from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.rounds import against, one_round
-from hvdc_ident.discrepancy.search import SearchOutcome
+from hvdc_ident.discrepancy.search import SearchOutcome, against, one_round
+from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.discrepancy.verdict import Judgement, _weighed
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
@@ -302,7 +311,7 @@ def test_of_effects_that_explain_as_much_the_one_with_the_fewest_places_wins(mon
     kinds = [c.effect for c in found.candidates]
     assert kinds.count("offset") == 1 < kinds.count("conductance")
     as_good = [CandidateFit(Pick(k, 0, 1.0, 500.0), found.trials[0].refit, 0.0) for k in range(len(kinds))]
-    monkeypatch.setattr(rounds, "against", lambda *_args, **_first: "")
+    monkeypatch.setattr(searching, "against", lambda *_args, **_first: "")
     for trials in (as_good, as_good[::-1]):
-        winner = rounds.closed(search, found, trials, 1).winner
+        winner = searching.closed(search, found, trials, 1).winner
         assert winner is not None and kinds[winner.pick.candidate] == "offset"

@@ -9,8 +9,8 @@ import pytest
 from cases import FREE, SIGMA, experiments, model
 
 from hvdc_ident import Experiment, Trajectory
+from hvdc_ident.discrepancy.hypothesis import METHOD
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
-from hvdc_ident.discrepancy.refit import METHOD
 from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap

@@ -15,10 +15,9 @@ from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions
 from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
-from hvdc_ident.discrepancy.context import SearchContext, slot_signals
+from hvdc_ident.discrepancy.hypothesis import Refit, as_given, slot_signals
 from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
-from hvdc_ident.discrepancy.refit import Refit
-from hvdc_ident.discrepancy.refit_jobs import as_given
+from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.screen import ANY, CHORD, Linearised, screened
 from hvdc_ident.discrepancy.stand import Stand
 from hvdc_ident.effects import apply_effects, effects

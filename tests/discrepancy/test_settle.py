@@ -10,14 +10,12 @@ from cases import experiments
 from refits import beside, plain
 
 from hvdc_ident.discrepancy import search as searching
-from hvdc_ident.discrepancy.context import Round, SearchContext, slot_signals
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, clear
-from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.hypothesis import Refit, job_of, run, slot_signals
+from hvdc_ident.discrepancy.options import DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.pushes import pushed
-from hvdc_ident.discrepancy.refit import Refit, run
-from hvdc_ident.discrepancy.refit_jobs import job_of
-from hvdc_ident.discrepancy.rounds import one_round
-from hvdc_ident.discrepancy.search import _last, forward, settled
+from hvdc_ident.discrepancy.search import _last, forward, one_round, settled
+from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import insertion_point_of

@@ -9,10 +9,10 @@ from scipy.integrate import solve_ivp
 from hvdc_ident import Experiment, InputSignal
 from hvdc_ident.data import Trajectory
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.discrepancy.size_curves import size_curves
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
+from hvdc_ident.study.size_curves import size_curves
 
 LOOP = parse_card("""
 schema = 1

@@ -16,13 +16,12 @@ from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.context import SearchContext
 from hvdc_ident.discrepancy.evidence import clear
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, as_given, job, run
 from hvdc_ident.discrepancy.movable import Form, movable
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, run
-from hvdc_ident.discrepancy.refit_jobs import as_given, job
+from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.residual_checks import loud_after_breaks
-from hvdc_ident.discrepancy.rounds import one_round
+from hvdc_ident.discrepancy.search import one_round
 from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
 

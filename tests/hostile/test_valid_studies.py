@@ -12,9 +12,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from hvdc_ident.cli import app
-from hvdc_ident.discrepancy.context import slot_signals
+from hvdc_ident.discrepancy.hypothesis import Refit, judged, slot_signals
 from hvdc_ident.discrepancy.nominal import nominal
-from hvdc_ident.discrepancy.refit import Refit, judged
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.fit.noise_model import autoregression
 from hvdc_ident.simulate import ModelSimulator, simulate

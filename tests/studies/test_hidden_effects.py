@@ -14,11 +14,10 @@ from hvdc_ident import simulate as package
 from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import DiagnosisOptions
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.context import SearchContext
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, added, judged, run
 from hvdc_ident.discrepancy.nominal import nominal
-from hvdc_ident.discrepancy.placed import added
-from hvdc_ident.discrepancy.refit import Refit, RefitJob, judged, run
-from hvdc_ident.discrepancy.rounds import one_round
+from hvdc_ident.discrepancy.options import SearchContext
+from hvdc_ident.discrepancy.search import one_round
 from hvdc_ident.effects import EffectUse, Probe, apply_effects, effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap

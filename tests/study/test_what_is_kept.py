@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import hvdc_ident
-from hvdc_ident.discrepancy.refit import Refit
+from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.fit.bootstrap import _refit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.partial_fits import _alone

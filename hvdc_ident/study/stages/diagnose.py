@@ -23,12 +23,12 @@ class NothingIdentified(ComputationError):
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
-    from hvdc_ident.discrepancy.size_curves import size_curves
     from hvdc_ident.identifiability import gate
     from hvdc_ident.model import Model
     from hvdc_ident.study.augmented import compared
     from hvdc_ident.study.pipeline import executor_of
     from hvdc_ident.study.schema import DiagnoseTable
+    from hvdc_ident.study.size_curves import size_curves
 
     _need(study)
     report = earlier["identify"]

@@ -1,27 +1,163 @@
-"""Refits: gains and effect together, with exact sensitivities, from where the score put them."""
+"""Hypotheses: the model with some effects at insertion points, their sizes and its free parameters refitted together.
+
+A refit runs from where the screen put it, with exact sensitivities, and is judged on data that it has not seen.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment
+from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.movable import Movable, in_proportion
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out, orthonormal
-from hvdc_ident.discrepancy.placed import Placed
-from hvdc_ident.discrepancy.record_noise import OutputNoise
-from hvdc_ident.effects import distance_from_neutral, effects
+from hvdc_ident.effects import EffectUse, Probe, apply_effects, distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
-from hvdc_ident.fit import Problem
+from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
+from hvdc_ident.fit.record_noise import OutputNoise
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate import simulate
+from hvdc_ident.model import AnyModel, Model, insertion_point
+from hvdc_ident.simulate import ModelSimulator, Tolerance, equilibria, simulate
+
+PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=20_000)
+"""Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""
+FAR = 5.0
+"""Times a probe's size at most, or this share of it at least, that a refit begins at: a score far from its size says little."""
+EXACT = 1e3
+"""Largest such factor for an effect in proportion to its size, whose score at one size is that at every."""
+ROOM = 3.0
+"""Times the size asked for: how far a refit may go."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An effect in a model: its candidate, its use, and by its own parameter names those of the model.
+
+    movable: whether its place is chosen at run time, so that its use is none of the model's own.
+    """
+
+    candidate: CandidateEffect
+    use: EffectUse
+    names: FrozenMap[str]
+    bounds: FrozenMap[tuple[float, float]]
+    start: FrozenMap[float]
+    movable: bool = False
+
+
+def added(
+    model: AnyModel,
+    problem: Problem,
+    candidate: CandidateEffect,
+    probe: int,
+    factor: float,
+    made: dict[Hashable, AnyModel] | None = None,
+) -> tuple[AnyModel, Problem, Placed, Array]:
+    """The model and problem with one more effect, and where it starts: the probe, or the size the score asks for.
+
+    made: models made of this one before, to which this may add another: one of an effect serves for all its free sizes.
+    Raises ModelError where the effect cannot be put there.
+    """
+    candidate = reaching(candidate, probe, factor)
+    chosen = candidate.probes[probe]
+    values = moved(candidate, probe, factor)
+    use = candidate.use(replace(chosen, values=FrozenMap(values)))
+    present = [
+        n
+        for n in effects()[candidate.effect].parameters
+        if n not in candidate.named and not _absent(candidate, n, values)
+    ]
+    settled = tuple((n, values[n]) for n in present if n not in chosen.free)
+    key = (candidate.effect, candidate.at, candidate.source, candidate.named, tuple(present), settled)
+    made = {} if made is None else made
+    larger = made[key] = made.get(key) or apply_effects(model, [use])
+    new = [n for n in larger.parameters if n not in model.parameters]
+    names = dict(zip(present, new, strict=True))
+    bounds = {n: b for n, b in chosen.free.items() if n in names}
+    free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
+    more = replace(
+        problem,
+        simulator=ModelSimulator(larger, PATIENCE),
+        free=(*problem.free, *free),
+        free_initial_states=problem.free_initial_states or begins_anywhere(larger, model, [use]),
+    )
+    placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
+    return larger, more, placed, np.array([f.start for f in free])
+
+
+def begins_anywhere(model: AnyModel, without: AnyModel, uses: Sequence[EffectUse]) -> bool:
+    """Return True where a record of the model with these effects need not begin at the steady state that the solver finds.
+
+    An effect moves the model by itself, or effects leave open at which of many steady states it rests, as without them it does
+    not: a dead band before an integrator holds it at any level, which is the one that was left by what came before.
+    """
+    entries = [effects()[u.effect] for u in uses]
+    if any(e.self_exciting for e in entries):
+        return True
+    if not (any(e.holds for e in entries) and isinstance(model, Model) and isinstance(without, Model)):
+        return False
+    return _determinant(model) == 0.0 and _determinant(without) not in (None, 0.0)
+
+
+def _determinant(model: Model) -> float | None:
+    """Sign of the determinant of the equations at the model's own steady state; None where it has none."""
+    anchor = equilibria(model).anchor(model, np.array([i.value for i in model.inputs.values()]))
+    return None if anchor is None else anchor.sign
+
+
+def _absent(candidate: CandidateEffect, name: str, values: Mapping[str, float]) -> bool:
+    q = effects()[candidate.effect].parameters[name]
+    return q.optional and values[name] == q.neutral
+
+
+def reaching(candidate: CandidateEffect, probe: int, factor: float) -> CandidateEffect:
+    """The candidate with room in the probe's bounds for the size that a score asks for, where it is in proportion to that.
+
+    What a slot carries by itself is no measure of what is added there: a friction that hardly moves may be kicked hard.
+    """
+    chosen, entry = candidate.probes[probe], effects()[candidate.effect]
+    if not np.isfinite(factor) or abs(factor) <= 1.0 or not in_proportion(candidate, probe):
+        return candidate
+    free = dict(chosen.free)
+    for n in (n for n in free if entry.parameters[n].neutral == 0.0):
+        asked, (low, high) = ROOM * min(abs(factor), EXACT) * abs(chosen.values[n]), free[n]
+        q = entry.parameters[n]
+        free[n] = (max(min(low, -asked), q.min) if low < 0 else low, min(max(high, asked), q.max))
+    wider = replace(chosen, free=FrozenMap(free))
+    return replace(candidate, probes=(*candidate.probes[:probe], wider, *candidate.probes[probe + 1 :]))
+
+
+def moved(candidate: CandidateEffect, probe: int, factor: float) -> dict[str, float]:
+    """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant."""
+    values, free = candidate.probes[probe].values, candidate.probes[probe].free
+    entry, found = effects()[candidate.effect], dict(values)
+    most = EXACT if in_proportion(candidate, probe) else FAR
+    size = float(np.clip(abs(factor), 1.0 / most, most)) if np.isfinite(factor) and factor else 1.0
+    if factor < 0 and "phase" in found:
+        found["phase"] += np.pi if found["phase"] <= 0 else -np.pi
+    sign = -1.0 if factor < 0 and "phase" not in found else 1.0
+    for n, q in entry.parameters.items():
+        if q.neutral is None or n not in free or (q.optional and values[n] == q.neutral):
+            continue
+        neutral = values[q.neutral] if isinstance(q.neutral, str) else float(q.neutral)
+        if np.isinf(neutral):
+            # A delay is in proportion to 1/wn; where a bend begins is in proportion to nothing.
+            if entry.equivalent_delay is not None and factor > 0:
+                found[n] = values[n] / size
+            continue
+        found[n] = neutral + sign * size * (values[n] - neutral)
+    for n, (low, high) in free.items():
+        margin = 1e-3 * (high - low) if low <= 0 else 0.0
+        found[n] = float(np.clip(found[n], low + margin if margin else low * 1.001, high - 1e-3 * (high - low)))
+    return found
+
 
 METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
 """A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""
@@ -371,3 +507,149 @@ def _input(experiment: Experiment, name: str, at_rest: float) -> Array:
 def unseen(refit: Refit) -> float | None:
     """The held-out residual in noise units; without held-out experiments that of parts left out."""
     return refit.holdout if refit.holdout is not None else refit.press
+
+
+def job(
+    before: Refit,
+    candidate: CandidateEffect,
+    probe: int,
+    factor: float,
+    theta: Array,
+    movable: Movable | None = None,
+) -> RefitJob:
+    """Return the refit of a model with one more effect, at a probe times a factor, begun beside the unknowns `theta`.
+
+    movable: the model with an effect of this form that can be moved, where there is one; else the effect is put in.
+    Raises ModelError where the effect cannot sit there.
+    """
+    k = len(before.problem.free)
+    if movable is None:
+        model, problem, placed, sizes = added(before.model, before.problem, candidate, probe, factor)
+    else:
+        candidate = reaching(candidate, probe, factor)
+        values, chosen = moved(candidate, probe, factor), candidate.probes[probe]
+        model = movable.model
+        known = before.values
+        named = {n: known.get(p, model.parameters[p].value) for n, p in candidate.named.items()}
+        names = {n: name for n, name in movable.names.items() if n not in candidate.named}
+        bounds = {n: b for n, b in chosen.free.items() if n in names}
+        free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
+        weights = movable.placed(candidate) | movable.sized({**values, **named})
+        held = {n: v for n, v in weights.items() if n not in {f.name for f in free}}
+        use = candidate.use(replace(chosen, values=FrozenMap(values)))
+        entry = effects()[candidate.effect]
+        anywhere = before.problem.free_initial_states or entry.self_exciting
+        if entry.holds and not anywhere:
+            anywhere = begins_anywhere(apply_effects(before.model, [use]), before.model, [use])
+        problem = replace(
+            before.problem,
+            simulator=movable.simulator(PATIENCE),
+            free=(*before.problem.free, *free),
+            held=before.problem.held | held,
+            free_initial_states=anywhere,
+        )
+        placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values), movable=True)
+        sizes = np.array([f.start for f in free])
+    begin = np.concatenate([theta[:k], sizes, theta[k:]])
+    return RefitJob(model, (*before.placed, placed), problem, (begin,), before.noise)
+
+
+BIASED = 0.4
+"""Share of its given value by which a gain has moved when it may have taken an effect's place."""
+
+
+def moved_far(refit: Refit) -> bool:
+    """Return True where a gain has moved so far, or stands on a bound, that it may have taken an effect's place."""
+    gains = ((refit.problem.free[k], float(refit.theta[k])) for k in refit.gains)
+    return any(abs(value - f.given) > BIASED * abs(f.given) or f.on_bound(value) for f, value in gains)
+
+
+def as_given(refit: Refit) -> Array | None:
+    """The unknowns with the gains at their given values, as near as the bounds let; None where they are there already."""
+    theta = refit.theta_at_given
+    for k in refit.gains:
+        f = refit.problem.free[k]
+        theta[k] = min(max(theta[k], f.min), f.max)
+    return None if np.array_equal(theta, refit.theta) else theta
+
+
+def in_place(before: Refit, trial: Refit) -> Refit:
+    """Return a refit with its last effect put into the model `before` for good, refitted from there; a failure is told."""
+    placed = trial.placed[-1]
+    if not placed.movable:
+        return trial
+    sizes = FrozenMap(trial.sizes(placed))
+    probe = Probe(placed.candidate.effect, sizes, placed.bounds)
+    try:
+        only = replace(placed.candidate, probes=(probe,))
+        found = run(replace(job(before, only, 0, 1.0, before.theta), begins=(trial.theta,)))
+    except FAILURES as error:
+        return replace(trial, failure=str(error))
+    candidate = replace(found.placed[-1].candidate, probes=placed.candidate.probes)
+    return replace(found, placed=(*found.placed[:-1], replace(found.placed[-1], candidate=candidate)))
+
+
+def refit_again(first: Refit, here: Refit, placed: Sequence[Placed]) -> Refit:
+    """The nominal model `first` with these effects, refitted from where they stand in the hypothesis `here`; a failure is told."""
+    try:
+        return run(job_of(first, here, placed, {}))
+    except FAILURES as error:
+        return replace(here, failure=str(error))
+
+
+def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]) -> RefitJob:
+    """The refit of the nominal model with these effects; sizes: of some, by their place, instead of where they stand."""
+    model, free, again = first.model, list(first.problem.free), []
+    at = here.values
+    for k, p in enumerate(placed):
+        own = sizes.get(k) or {n: at.get(name, p.start[n]) for n, name in p.names.items()}
+        values = {n: float(np.clip(own.get(n, v), *p.bounds[n])) if n in p.bounds else v for n, v in p.start.items()}
+        named = {n: v for n, v in p.use.parameters.items() if isinstance(v, str)}
+        parameters: dict[str, float | str] = {**values, **named}
+        use = replace(p.use, parameters=FrozenMap(parameters), prefix="").within(model)
+        before = set(model.parameters)
+        model = apply_effects(model, [use])
+        new = [n for n in model.parameters if n not in before]
+        names = dict(zip(p.names, new, strict=True))
+        free += [FitParameter(names[n], values[n], *p.bounds[n]) for n in p.bounds]
+        moved = replace(p.candidate, at=use.at, source=use.source)
+        again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
+    problem = replace(
+        here.problem,
+        simulator=ModelSimulator(model, PATIENCE),
+        free=tuple(free),
+        held=first.problem.held,
+        free_initial_states=begins_anywhere(model, first.model, [p.use for p in placed]),
+    )
+    nuisance = here.theta[len(here.problem.free) :]
+    gains = [at.get(f.name, f.start) for f in first.problem.free]
+    begin = np.concatenate([gains, [f.start for f in free[len(gains) :]], nuisance])
+    return RefitJob(model, tuple(again), problem, (begin,), here.noise)
+
+
+def slot_signals(before: Refit) -> dict[str, tuple[Array, ...]]:
+    """The signal at every slot of the model that all experiments have, one array an experiment, at its rows.
+
+    An instrument has slots of its own in the run of its experiment, which are none of the model's. Nothing is looked for
+    inside the effects that are in the model already.
+    """
+    model, experiments = before.model, before.problem.fitted_experiments
+    slots = [p for p in model.insertion_points if not any(one.use.made(p) for one in before.placed)]
+    if not isinstance(model, Model):
+        inputs = {p: tuple(signal(before, p).values()) for p in slots if p in model.inputs}
+        outputs = [o for o in experiments[0].outputs if all(o in e.outputs for e in experiments)]
+        runs = [simulate(model, e.with_(measured=None), before.values, outputs=outputs) for e in experiments]
+        ends = {o if o not in model.inputs else f"outputs.{o}": o for o in outputs}
+        return inputs | {p: tuple(np.asarray(r[o]) for r in runs) for p, o in ends.items() if p in slots}
+    # Of outputs those that are recorded: an effect at another one is not seen.
+    recorded = {o for e in experiments for o in e.outputs}
+    kinds = {p: insertion_point(model, p) for p in slots}
+    kept = [p for p in slots if kinds[p][0] != "output" or kinds[p][1] in recorded]
+    names = list(dict.fromkeys(kinds[p][1] for p in kept))
+    tolerance = before.problem.simulator.tolerance if isinstance(before.problem.simulator, ModelSimulator) else None
+    found: dict[str, list[Array]] = {p: [] for p in kept}
+    for e in experiments:
+        run = simulate(model, e.with_(measured=None, instrument={}), before.values, outputs=names, tolerance=tolerance)
+        for p in kept:
+            found[p].append(np.asarray(run[kinds[p][1]]))
+    return {p: tuple(own) for p, own in found.items()}

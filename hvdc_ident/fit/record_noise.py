@@ -13,15 +13,16 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, Trajectory, at_rest, event_time, noise_floor
-from hvdc_ident.discrepancy.noise_colour import TANH, Colour, Likelihood, likelihood, together, without_common
-from hvdc_ident.discrepancy.options import SURE
 from hvdc_ident.errors import StudyError
 from hvdc_ident.fit.likelihood import QuantisedNoise
+from hvdc_ident.fit.noise_colour import TANH, Colour, Likelihood, likelihood, together, without_common
 from hvdc_ident.fit.noise_model import AR, autoregression, scatter_of, segments
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.immutable import FrozenMap
 
+SURE = 4.0
+"""Standard errors beyond which nothing is put down to chance: one in 16 000, where a diagnosis asks some hundred such questions."""
 FEWEST = 8
 """Rows before an event from which anything is told of the noise."""
 GIVEN = "given"
