@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -102,9 +102,10 @@ def candidates(
         for effect in tried:
             if not kinds <= set(effect.insertion_kinds):
                 continue
-            if effect.name == "droop" and doubled:
-                continue  # without its deadband a droop is a negative coupling, which is tried
             usable = brought
+            if effect.name == "droop" and doubled:
+                # Without its deadband a droop is a negative coupling: where its name suits, it is tried in place of that.
+                usable = tuple(b for b in brought if droops(model, at, b))
             if effect.name == "conductance":  # of the slot's own signal it is a gain, which is tried
                 usable = tuple(b for b in brought if not proportional(signals[at[0]], signals[b]))
             found += _at(model, effect, at, joined, still, about, usable)
@@ -138,10 +139,55 @@ def _at(
         if all(s in may for s, may in zip(own, open_to, strict=True))
     }
     return [
-        CandidateEffect(effect.name, at, _halved(probes(effect, signal, other)), source=joined_sources(own))
+        CandidateEffect(effect.name, at, _probes_of(model, effect, at, own, signal, other), source=joined_sources(own))
         for own, other in seen.items()
         if not (still and other.high == other.low)
     ]
+
+
+def _probes_of(
+    model: AnyModel, effect: Effect, at: tuple[str, ...], own: Sequence[str], signal: SignalScales, other: SignalScales
+) -> tuple[Probe, ...]:
+    """Return the sizes of an effect with another signal; of a coupling that would be called a droop if negative the others."""
+    found = _halved(probes(effect, signal, other))
+    if effect.name != "coupling" or not all(droops(model, at, s) for s in own):
+        return found
+    return tuple(replace(p, free=FrozenMap({n: (0.0, high) for n, (_, high) in p.free.items()})) for p in found)
+
+
+UNITS = {
+    "voltage": ("V", "kV", "MV"), "current": ("A", "kA"), "power": ("W", "kW", "MW", "VA", "kVA", "MVA"),
+    "reactive power": ("var", "kvar", "Mvar"), "frequency": ("Hz", "mHz", "rad/s"),
+}  # fmt: skip
+LETTERS = {"voltage": "VvUE", "current": "Ii", "power": "PS", "reactive power": "Q", "frequency": "fw"}
+
+
+def quantity(model: AnyModel, place: str) -> str:
+    """Return what a signal is, by its unit, or in per unit by the letter that its name begins with; empty where neither tells."""
+    kind, name = kind_of(model, place), place.removeprefix("outputs.")
+    sections: Any = {
+        "input": "inputs",
+        "output": "outputs",
+        "state": "states",
+        "signal": "signals",
+        "algebraic": "algebraic",
+    }
+    known = getattr(model, sections[kind], {}).get(name)
+    unit = getattr(known, "unit", "")
+    by_unit = next((q for q, units in UNITS.items() if unit in units), "")
+    return by_unit or next((q for q, letters in LETTERS.items() if name[:1] in letters and name[:1]), "")
+
+
+def droops(model: AnyModel, at: Sequence[str], source: str) -> bool:
+    """Return True where what is taken away in proportion to a signal is called a droop: a power, current or frequency acts on
+    another quantity."""
+    brought = quantity(model, source)
+    return brought not in ("", "voltage") and all(quantity(model, p) != brought for p in at)
+
+
+def leaks(model: AnyModel, at: Sequence[str], source: str) -> bool:
+    """Return True where what is taken away in proportion to a signal is called a conductance: of a voltage, a current or power."""
+    return quantity(model, source) == "voltage" and all(quantity(model, p) in ("current", "power", "") for p in at)
 
 
 def own_sources(at: Sequence[str], brought: Sequence[str], known: Collection[str]) -> list[tuple[str, ...]]:

@@ -305,7 +305,7 @@ def _shot(parcel: _Parcel) -> _Found:
         except FAILURES as error:
             found.failures[column[0]] = str(error) or type(error).__name__
             continue
-        step, fell, factor = bench.without.stepped(r - was, runner.reach, held=bench.held)
+        step, fell, factor = bench.without.stepped(r - was, runner.reach(column), held=bench.held)
         found.shots.append(Shot(*column, chi2 - fell, bench.point + step, factor))
         left = nominal.projected((was - r)[:, None])[:, 0]
         found.size[column], found.left[column] = float(np.sum((was - r) ** 2)), float(left @ left)
@@ -369,10 +369,12 @@ class _Runner:
 
     parcel: _Parcel
 
-    @cached_property
-    def reach(self) -> tuple[float, float]:
+    def reach(self, column: tuple[int, int]) -> tuple[float, float]:
         """Factors on the size that a step may ask for."""
-        return ANY if any(is_proportional(m.form) for m in self.parcel.movable.values()) else CHORD
+        if not any(is_proportional(m.form) for m in self.parcel.movable.values()):
+            return CHORD
+        free = self.parcel.candidates[column[0]].probes[column[1]].free
+        return ANY if any(low < 0.0 for low, _ in free.values()) else (0.0, np.inf)
 
     @cached_property
     def _problems(self) -> Mapping[bool, Problem]:

@@ -17,7 +17,7 @@ from itertools import pairwise
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
+from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates, leaks
 from hvdc_ident.discrepancy.evidence import (
     CandidateFit,
     Pick,
@@ -64,6 +64,7 @@ from hvdc_ident.discrepancy.screen import Shot
 from hvdc_ident.discrepancy.stand import Race, Round, Stand, done, gains_of
 from hvdc_ident.effects import Probe, effects
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import AnyModel
 
 OF_EFFECT = 8
 """Refits of one effect in a field, at least where so many come into question: places that cannot be told apart are neighbours."""
@@ -340,6 +341,7 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
     if winner is not None:
         tied = [t for t in likeliest if unlikely[id(t)] <= unlikely[id(winner)] + TIED]
         winner = nearest(winner, tied, lambda t: implied(t.refit), lambda t: off_given(t.refit))
+        winner = _well_named(before.model, found, winner, tied)
         placed = in_place(before, winner.refit)
         if placed.failure:
             return replace(
@@ -353,6 +355,19 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
         ranked, winner = [new if t is winner else t for t in ranked], new
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
+
+
+def _well_named(
+    model: AnyModel, found: Sequence[CandidateEffect], winner: CandidateFit, tied: Sequence[CandidateFit]
+) -> CandidateFit:
+    """Return of those that explain as much as the winner, there and from there, one whose name suits these signals, where its own
+    does not: reactive power that acts on a voltage is a droop, and no conductance."""
+    own = found[winner.pick.candidate]
+    if own.effect != "conductance" or all(leaks(model, own.at, s) for s in own.sources):
+        return winner
+    others = [t for t in tied if found[t.pick.candidate].effect in ("droop", "coupling")]
+    there = [t for t in others if (found[t.pick.candidate].at, found[t.pick.candidate].source) == (own.at, own.source)]
+    return next(iter(there), winner)
 
 
 def against(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:

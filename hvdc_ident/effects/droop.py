@@ -48,4 +48,13 @@ EFFECT = Effect(
         }
     ),
     needs_source=True,
+    equals=FrozenMap(
+        {
+            "coupling": lambda p, source: None if p.get("deadband") else {"k": -p["k"]},
+            # Counted from a start value of 0, the other signal is its change.
+            "conductance": lambda p, source: (
+                {"g": p["k"]} if source.size and source[0] == 0.0 and not p.get("deadband") else None
+            ),
+        }
+    ),
 )
