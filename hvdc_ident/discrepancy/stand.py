@@ -221,11 +221,17 @@ class Stand:
     def refitted(
         self, found: Sequence[CandidateEffect], shots: Sequence[Shot], text: str, earlier: Sequence[CandidateFit] = ()
     ) -> list[CandidateFit]:
-        """Return the shots refitted, in a race with each other and with those refitted earlier, and the larger forms of those that
-        leave more than noise: where the equations of one size do, more sizes gain nothing but their price."""
+        """Return the shots refitted, in a race with each other and with those refitted earlier; and their larger forms where none
+        leaves noise: beside equations of one size that do, more sizes gain nothing but their price."""
         trials = self._raced(found, shots, text, earlier)
-        loud = [t for t in trials if not t.refit.failure and excess(t.refit)]
-        wider = {(t.pick.candidate, n): t for t in loud for n in larger(found[t.pick.candidate], t.pick.probe)}
+        if any(not t.refit.failure and not excess(t.refit) for t in (*earlier, *trials)):
+            return trials
+        wider = {
+            (t.pick.candidate, n): t
+            for t in trials
+            if t.refit.failure in ("", BEHIND)
+            for n in larger(found[t.pick.candidate], t.pick.probe)
+        }
         more = [Shot(k, n, t.pick.fall, gains_of(self.before, t.refit)) for (k, n), t in wider.items()]
         return [*trials, *(self._raced(found, more, text, [*earlier, *trials]) if more else ())]
 

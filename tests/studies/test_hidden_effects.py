@@ -424,7 +424,7 @@ def test_the_sensitivity_study_sets_a_number_wherever_it_is_used_and_sets_it_bac
 
     study = load("hidden_effects", "sensitivity")
     by_label = {n.label: n for n in study.numbers()}
-    assert {"options.TOLERANCE", "refitted.PRICE", "options.set_bic"} <= set(by_label)
+    assert {"options.TOLERANCE", "evidence.PRICE", "options.set_bic"} <= set(by_label)
     with study.changed(by_label["options.TOLERANCE"], 0.3) as changed:
         assert options.TOLERANCE == remainder.TOLERANCE == verdict.TOLERANCE == 0.3 and changed == DiagnosisOptions()
     assert options.TOLERANCE == remainder.TOLERANCE == verdict.TOLERANCE == by_label["options.TOLERANCE"].value
@@ -439,9 +439,9 @@ def test_the_sensitivity_table_lists_the_sensitive_numbers_first() -> None:
     study = load("hidden_effects", "sensitivity")
     base = {"number": "", "factor": 1.0, "case": "1 a", "verdict": "named", "found": ["lag"], "seconds": 2.0}
     runs = [base]
-    for number in ("options.BEAM", "options.SURE"):
+    for number in ("options.BEAM", "options.TOLERANCE"):
         runs += [base | {"number": number, "factor": f, "seconds": 3.0} for f in study.FACTORS]
     runs[-1] |= {"verdict": "ambiguous", "found": ["gain", "lag"]}
     rows = study.table(runs).splitlines()
-    assert rows[2] == "| options.SURE | 4 | same in 1 | 1 a: named (lag) becomes ambiguous (gain, lag) | 1.5 |"
+    assert rows[2] == "| options.TOLERANCE | 0.01 | same in 1 | 1 a: named (lag) becomes ambiguous (gain, lag) | 1.5 |"
     assert rows[3] == "| options.BEAM | 2 | same in 1 | same in 1 | 1.5 |"
