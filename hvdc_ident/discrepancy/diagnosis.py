@@ -25,8 +25,8 @@ from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect, StandIn
+from hvdc_ident.discrepancy.screen import UNTRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
-from hvdc_ident.discrepancy.stand import UNTRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.discrepancy.stand_ins import stand_ins
 from hvdc_ident.discrepancy.verdict import (
@@ -54,6 +54,8 @@ CLOSED = (
     "not, and no form outside the catalogue was looked for."
 )
 
+UNFINISHED = "The budget ended before all candidates were tried."
+UNTESTED = "The budget ended: neither forms outside the catalogue nor whether anything else is missing was asked."
 UNTRIED = (
     "No single effect came near the noise. {} candidates that promise less were not refitted; a thorough search refits more of "
     "them (thorough = true in [diagnose])."
@@ -109,6 +111,8 @@ def diagnose(
     search = replace(search, held=held_now, stated=stated(model, free), records=first.problem.experiments)
     outcome = from_either_side(search, first)
     judgement = judge(search, first, outcome)
+    if search.spent and outcome.kept:
+        notes = (*notes, UNTESTED)
     inside = isinstance(model, Model)
     other = None
     if judgement.instead is not None:
@@ -119,6 +123,8 @@ def diagnose(
         notes = (*notes, CLOSED)
     if left := 0 if chosen.thorough else _left_out(first, outcome.rounds[0]):
         notes = (*notes, UNTRIED.format(left))
+    if left := sum(why == NOT_BEGUN for r in outcome.rounds for why in r.screen.failures.values()):
+        notes = (*notes, f"The budget ended before {left} candidates were looked at: their status is {NOT_BEGUN!r}.")
     if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.rounds for t in r.failed):
         notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
@@ -202,6 +208,8 @@ def _assembled(
             others = stand_ins(search, last, outcome.rounds[0], tuple(moved.parameters))
             moved = beside_stand_ins(moved, others)
             findings, text = (moved,), moved.text
+    if search.spent and not in_place:
+        text = f"{text} {UNFINISHED}"
     if off := clocks(search, last):
         text = f"{text} {told(off)}"
     if louder := contradiction(model, first.noise, LOUDER):

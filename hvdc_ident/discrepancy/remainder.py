@@ -150,7 +150,7 @@ def _beyond(tolerance: Mapping[str, float], last: Refit, floor: float) -> Frozen
 def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     """The remainder with the test for a latent input; as it is for a model that is closed inside, or cannot be linearised."""
     nominal = last.nominal()
-    if not isinstance(last.model, Model):
+    if not isinstance(last.model, Model) or search.spent:
         return found
     try:
         signals = slot_signals(last)

@@ -40,6 +40,8 @@ SEEN = 1.0
 """Sum of squares of an answer, in noise units, below which no experiment excites it."""
 LEFT = 1e-3
 """Share of the square of an answer that the parameters have to leave: runs of a search are exact to a few of its hundredths."""
+UNTRIED = "not tried: the budget ended"
+"""Failure of a candidate that was not simulated, or not refitted."""
 PARCEL = 150
 """Candidates in one piece of work: some tenths of a second."""
 
@@ -233,10 +235,12 @@ def screened(
     executor: Executor | None = None,
     tell: Callable[[int, int], None] = lambda done, total: None,
     columns: Iterable[tuple[int, int]] | None = None,
+    spent: Callable[[], bool] = lambda: False,
 ) -> Screen:
     """Return the screen of candidates; one at several places is told by its parts.
 
-    columns: candidates and probes, by their places in the lists, instead of all that move.
+    columns: candidates and probes, by their places in the lists, instead of all that move. spent: whether the budget is over; what
+    was not simulated by then has failed, but for the first piece of work.
     """
     every = ((k, n) for k, c in enumerate(candidates) if not c.still for n in range(len(c.probes)))
     parcels = list(_parcels(bench, candidates, every if columns is None else columns))
@@ -252,6 +256,9 @@ def screened(
         failures |= found.failures
         largest = np.maximum(largest, found.largest)
         tell(done, len(parcels))
+        if spent():
+            failures |= {k: UNTRIED for parcel in parcels[done:] for k, _ in parcel.columns}
+            break
     ran = {s.candidate for s in shots}
     return Screen(
         ranked(shots, candidates), size, left, largest, {k: why for k, why in failures.items() if k not in ran}

@@ -19,14 +19,12 @@ from hvdc_ident.discrepancy.movable import Form, Movable, present_in
 from hvdc_ident.discrepancy.nominal import thinned
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.pushes import Pushed, pushed
-from hvdc_ident.discrepancy.screen import Bench, Screen, Shot, screened
+from hvdc_ident.discrepancy.screen import UNTRIED, Bench, Screen, Shot, screened
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit import Problem
 from hvdc_ident.model import Model
 
-UNTRIED = "not tried: the budget ended"
-"""Failure of a refit that was not begun."""
 BATCH = 6
 """Refits in one piece of work, of one model where they share it: a model takes longer to send than some steps of a refit."""
 
@@ -208,8 +206,9 @@ class Stand:
             bench = replace(bench, point=point, noise=bench.noise[:, :0])
         tell = self.search.tell
         return screened(
-            bench, found, executor=self.search.executor, tell=lambda n, of: tell(n, of, text), columns=columns
-        )
+            bench, found, executor=self.search.executor, tell=lambda n, of: tell(n, of, text), columns=columns,
+            spent=lambda: self.search.spent,
+        )  # fmt: skip
 
     def movable(self, candidate: CandidateEffect, probe: int) -> Movable | None:
         """Return the model with the candidate's effect to be moved; None where it is put in: at several places, or in a closed model."""

@@ -241,7 +241,7 @@ def _with_formulas(
     """
     wider: list[tuple[Rival, ...]] = []
     for found, group in zip(outcome.kept, sets, strict=True):
-        if not search.options.fallback or classes(group)[0].probability < CERTAIN:
+        if not search.options.fallback or search.spent or classes(group)[0].probability < CERTAIN:
             wider.append(group)
             continue
         formulas = instead_of(search, found)

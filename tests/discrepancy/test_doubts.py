@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import TRUE, corners, experiments, model
+from cases import FREE, TRUE, corners, experiments, model
 from refits import answered, beside, plain
 from scipy.stats import kstest
 
 from hvdc_ident import InputSignal
+from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.discrepancy.hypothesis import Refit, run
 from hvdc_ident.discrepancy.residual_checks import constancy
 from hvdc_ident.discrepancy.verdict import Doubt, _turned, doubt, one_way
@@ -88,3 +89,18 @@ def test_of_a_play_that_is_passed_in_one_direction_it_is_said() -> None:
     against = one_way(refits["up"])
     assert against is not None and "turn by more than 0.2" in against.why and "ramps both ways" in against.advice
     assert one_way(refits["both"]) is None
+
+
+def test_a_play_that_each_record_passes_one_way_may_be_a_dead_band_and_the_record_that_would_tell_is_named() -> None:
+    """A load that begins at 0 and only rises: behind both it is smaller by their width."""
+    played = apply_effects(model(), [{"effect": "backlash", "at": ["load"], "parameters": {"width": 0.08}}])
+    rises = ([(0.2, 0.5)], [(0.2, 0.2), (0.7, 0.2)], [(0.3, 0.35)])
+    moved = [
+        replace(e, inputs=FrozenMap({"load": InputSignal.corners(corners(0.0, rise))}))
+        for e, rise in zip(experiments(), rises, strict=True)
+    ]
+    names = ("backlash", "deadband", "deadband-step", "offset")
+    found = diagnose(model(), answered(played, moved, seed=3), FREE, effects=names, places=["load"])
+    assert found.verdict == "named" and "does the same in these records (deadband)" in found.findings[0].text
+    assert "ramps both ways" in found.separating_experiment["text"]
+    assert found.findings[0].parameters["width"].value == pytest.approx(0.08, rel=0.02)
