@@ -16,7 +16,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates, leaks
 from hvdc_ident.discrepancy.evidence import (
     CandidateFit,
@@ -152,8 +151,9 @@ def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -
         opened, trials = _led_on(stand, opened, trials, number)
     elif given is not None and not search.spent:
         # Beside an effect the records may be explained by other values of the parameters too.
-        shots = [_shot_of(t.pick, given) for t in by_cost(trials)[:OF_EFFECT]]
-        more = stand.refitted(opened.candidates, shots, f"{text}: from the given values", trials)
+        where, which = f"{text}: from the given values", [t.pick.candidate for t in by_cost(trials)[:OF_EFFECT]]
+        shots = [*stand.screen(opened.candidates, where, which, given).best().values()]
+        more = stand.refitted(opened.candidates, shots, where, trials)
         opened, trials = _led_on(stand, opened, best_each([*trials, *more]), number)
     if not search.spent:
         opened, trials = met(stand, opened, trials, number, far=all_far(opened.before, trials))
@@ -162,11 +162,6 @@ def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -
         if best is not None and not is_noise(best.refit, search.seed):
             opened, trials = _outside(search, stand, opened, trials)
     return opened, trials
-
-
-def _shot_of(pick: Pick, theta: Array) -> Shot:
-    """Return what was refitted as a shot, to be begun with these unknowns."""
-    return Shot(pick.candidate, pick.probe, pick.fall, theta, pick.factor)
 
 
 def _field(search: SearchContext, found: Sequence[CandidateEffect], shots: Sequence[Shot]) -> list[Shot]:
