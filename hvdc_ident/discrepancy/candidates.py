@@ -29,6 +29,8 @@ from hvdc_ident.model import AnyModel, Model, insertion_point
 Signals = Mapping[str, tuple[Array, ...]]
 """By place: the signal in each fitted experiment."""
 
+ROOM = 0.1
+"""Share of a size that its bounds leave it, at least."""
 SAME = 1e-9
 """Of their size: by how much two signals may differ that are one, as a source."""
 STILL = 1e-9
@@ -62,6 +64,28 @@ class CandidateEffect:
     def use(self, probe: Probe) -> EffectUse:
         """The effect as the model takes it."""
         return probe.use(self.at, self.source, self.named)
+
+    def with_sizes(self, sizes: Iterable[Mapping[str, float]], like: Sequence[Probe] | None = None) -> CandidateEffect:
+        """Return the candidate with further probes at these sizes, each well within its bounds.
+
+        Each has the free sizes and bounds of the probe with the same equations among its own, or of those `like` which it is to be;
+        one of other equations is left out, and so is one that is there.
+        """
+        entry, probes = effects()[self.effect], list(self.probes)
+        known = {p.values for p in probes}
+        for values in sizes:
+            own = FrozenMap({n: values.get(n, v) for n, v in (like or self.probes)[0].values.items()})
+            present = entry.present(own)
+            model = next((p for p in like or self.probes if entry.present(p.values) == present), None)
+            if model is None or own in known:
+                continue
+            known.add(own)
+            free = {
+                n: (min(low, own[n] - ROOM * abs(own[n])), max(high, own[n] + ROOM * abs(own[n])))
+                for n, (low, high) in model.free.items()
+            }
+            probes.append(Probe(self.effect, own, FrozenMap(free)))
+        return replace(self, probes=tuple(probes))
 
 
 def entries(names: Iterable[str] | Literal["all"]) -> tuple[Effect, ...]:

@@ -19,7 +19,7 @@ from hvdc_ident.discrepancy.candidates import additive, candidates
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, best_each, gained, is_far, left_by
 from hvdc_ident.discrepancy.explain import sentence
 from hvdc_ident.discrepancy.hypothesis import Refit, in_place, unseen
-from hvdc_ident.discrepancy.movable import equations, in_proportion, present_in
+from hvdc_ident.discrepancy.movable import equations, in_proportion
 from hvdc_ident.discrepancy.options import REFUTED, SearchContext
 from hvdc_ident.discrepancy.pushes import Pushed, Whitening
 from hvdc_ident.discrepancy.screen import Shot
@@ -207,7 +207,7 @@ def expression(refit: Refit, *, filled: bool = False) -> str:
         return ""
     if entry.words is not None:
         return entry.words(sizes)["transfer"]
-    alone = equations(c.effect, present_in(entry, sizes))
+    alone = equations(c.effect, entry.present(sizes))
     names = {"u": c.at[0].removeprefix("outputs."), "source": c.source.removeprefix("outputs.")}
     known = {symbol(n): symbol(name) for n, name in names.items() if name}
     text = to_text((alone.outputs["y"].value - symbol("u")).expand().xreplace(known))

@@ -20,8 +20,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit, as_given
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
 from hvdc_ident.discrepancy.screen import Shot
 from hvdc_ident.discrepancy.stand import Race, Round, Stand, gains_of
-from hvdc_ident.effects import Probe, SignalScales, effects, size_grid
-from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.effects import SignalScales, effects, size_grid
 
 PLACES = 4
 """Places at which a quantiser is tried in all its sizes, some thousand."""
@@ -154,19 +153,12 @@ def _beside(grid: Array, sizes: Sequence[float]) -> Array:
     return grid[np.unique(np.concatenate(at))]
 
 
-def _with_probes(candidate: CandidateEffect, sizes: Sequence[float]) -> CandidateEffect:
-    """Return the candidate with probes at these sizes alone."""
-    like, name = candidate.probes[0], _named(candidate)
-    low, high = like.free[name]
-    each = [
-        Probe(
-            like.effect,
-            like.values | {name: float(s)},
-            FrozenMap(like.free | {name: (min(low, 0.9 * float(s)), max(high, 1.1 * float(s)))}),
-        )
-        for s in sizes
-    ]
-    return replace(candidate, probes=tuple(each))
+def _at(candidate: CandidateEffect, sizes: Sequence[float]) -> CandidateEffect:
+    """Return the candidate at these sizes alone."""
+    own = candidate.probes[0].values
+    return replace(candidate, probes=()).with_sizes(
+        [{**own, _named(candidate): float(s)} for s in sizes], like=candidate.probes
+    )
 
 
 def _looked_at(
@@ -180,7 +172,7 @@ def _looked_at(
     """Return by candidate the best of some sizes, none of them neighbours, with what the screen says of them."""
     if not sizes:
         return {}
-    found = [_with_probes(c, sizes[k].tolist()) if k in sizes else c for k, c in enumerate(opened.candidates)]
+    found = [_at(c, sizes[k].tolist()) if k in sizes else c for k, c in enumerate(opened.candidates)]
     shots = [s for point in points for s in stand.screen(found, text, list(sizes), point, held=True).shots]
     best: dict[int, list[Shot]] = {}
     for s in sorted(shots, key=lambda s: -s.fall):
@@ -200,7 +192,7 @@ def _refitted(
     """Return the round, whose candidates have these sizes too, and the trials with the refits begun there."""
     found, shots = list(opened.candidates), []
     for k, own in best.items():
-        more = _with_probes(found[k], [size for size, _ in own]).probes
+        more = _at(found[k], [size for size, _ in own]).probes
         shots += [replace(s, probe=len(found[k].probes) + n, factor=1.0) for n, (_, s) in enumerate(own)]
         found[k] = replace(found[k], probes=(*found[k].probes, *more))
     opened = replace(opened, candidates=tuple(found))

@@ -51,7 +51,7 @@ class Form:
     @classmethod
     def of(cls, model: Model, candidate: CandidateEffect, values: Mapping[str, float]) -> Form:
         """Return the form of a candidate with these sizes."""
-        present = present_in(effects()[candidate.effect], values)
+        present = effects()[candidate.effect].present(values)
         seats = {(insertion_point(model, p)[0], on_loop(model, p)) for p in candidate.at}
         alike = len({equations(candidate.effect, present, *s) for s in (*seats, ("signal", False))}) == 1
         loop = any(circular for _, circular in seats)
@@ -258,18 +258,13 @@ def is_proportional(form: Form) -> bool:
 def in_proportion(candidate: CandidateEffect, probe: int) -> bool:
     """Return True where a candidate adds to its signal in proportion to its size, as it stands in a probe."""
     entry, values = effects()[candidate.effect], candidate.probes[probe].values
-    return is_proportional(Form(candidate.effect, present_in(entry, values)))
-
-
-def present_in(entry: Effect, values: Mapping[str, float]) -> tuple[str, ...]:
-    """Return the parameters of an effect that stand in its equations: optional ones at neutral are left out."""
-    return tuple(n for n, q in entry.parameters.items() if not (q.optional and values.get(n, q.neutral) == q.neutral))
+    return is_proportional(Form(candidate.effect, entry.present(values)))
 
 
 def added(candidate: CandidateEffect, probe: Probe, u: Array, source: Array | None) -> Array:
     """Return (K,) what an effect in proportion to its size adds to its signal u (K,). source: (K,) what it brings in, where it does."""
     entry = effects()[candidate.effect]
-    alone = equations(candidate.effect, present_in(entry, probe.values))
+    alone = equations(candidate.effect, entry.present(probe.values))
     expression = (alone.outputs["y"].value - symbol("u")).xreplace({symbol(n): v for n, v in probe.values.items()})
     signals = {"u": u, "source": np.zeros_like(u) if source is None else source}
     symbols = [symbol(n) for n in signals]

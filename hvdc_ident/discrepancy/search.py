@@ -54,15 +54,14 @@ from hvdc_ident.discrepancy.hypothesis import (
 )
 from hvdc_ident.discrepancy.implied import TIED, implied, nearest, off_given
 from hvdc_ident.discrepancy.met import met
-from hvdc_ident.discrepancy.movable import in_proportion, present_in
+from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.moves import clocks, held_again, on_their_clocks, released
 from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.residual_checks import tones
 from hvdc_ident.discrepancy.screen import Shot
 from hvdc_ident.discrepancy.stand import Race, Round, Stand, done, gains_of
-from hvdc_ident.effects import Probe, effects
-from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.effects import effects
 from hvdc_ident.model import AnyModel
 
 OF_EFFECT = 8
@@ -232,9 +231,9 @@ def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tup
     late = effects()[own.effect].delay_with(sizes)
     for k in which:
         if found[k].effect == own.effect:
-            found[k] = _with_sizes(found[k], [sizes])
+            found[k] = found[k].with_sizes([sizes])
         elif late:
-            found[k] = _with_sizes(found[k], _delaying(found[k], late))
+            found[k] = found[k].with_sizes(_delaying(found[k], late))
     theta = gains_of(opened.before, lead.refit)
     screen = stand.screen(found, f"round {number}: beside {own.label}", which, theta)
     best = opened.before.chi2 - lead.refit.chi2
@@ -256,7 +255,7 @@ def _denser(candidate: CandidateEffect) -> CandidateEffect:
     (name,) = candidate.probes[0].free
     ends = sorted(values)
     between = [a * (b / a) ** share for a, b in pairwise(ends) for share in (1 / 3, 2 / 3)]
-    return _with_sizes(candidate, [{**candidate.probes[0].values, name: v} for v in between])
+    return candidate.with_sizes([{**candidate.probes[0].values, name: v} for v in between])
 
 
 def _delaying(candidate: CandidateEffect, late: float) -> list[dict[str, float]]:
@@ -267,22 +266,6 @@ def _delaying(candidate: CandidateEffect, late: float) -> list[dict[str, float]]
         return []
     n = min(near, key=lambda k: near[k])
     return [moved(candidate, n, late / (delays[n] or late))]
-
-
-def _with_sizes(candidate: CandidateEffect, sizes: Sequence[dict[str, float]]) -> CandidateEffect:
-    """Return the candidate with further probes at these sizes, each within bounds."""
-    known = {tuple(sorted(p.values.items())) for p in candidate.probes}
-    probes, entry = list(candidate.probes), effects()[candidate.effect]
-    for values in sizes:
-        moved = {n: values.get(n, v) for n, v in candidate.probes[0].values.items()}
-        present = present_in(entry, moved)
-        like = next((p for p in candidate.probes if present_in(entry, p.values) == present), None)
-        if like is None:
-            continue
-        free = {n: (min(low, moved[n]), max(high, moved[n])) for n, (low, high) in like.free.items()}
-        if tuple(sorted(moved.items())) not in known:
-            probes.append(Probe(like.effect, FrozenMap(moved), FrozenMap(free)))
-    return replace(candidate, probes=tuple(probes))
 
 
 def _outside(

@@ -15,7 +15,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, excess
 from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, RefitResult, failed_at, find, job
-from hvdc_ident.discrepancy.movable import Form, Movable, present_in
+from hvdc_ident.discrepancy.movable import Form, Movable
 from hvdc_ident.discrepancy.nominal import thinned
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.pushes import Pushed, pushed
@@ -273,7 +273,7 @@ def larger(candidate: CandidateEffect, probe: int) -> list[int]:
 
 def _forms(candidate: CandidateEffect) -> list[frozenset[str]]:
     entry = effects()[candidate.effect]
-    return [frozenset(present_in(entry, p.values)) for p in candidate.probes]
+    return [frozenset(entry.present(p.values)) for p in candidate.probes]
 
 
 def gains_of(before: Refit, refit: Refit) -> Array:

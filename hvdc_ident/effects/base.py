@@ -244,6 +244,12 @@ class Effect:
         """Return the equivalent delay with these values, s; None for what is no delay of any kind."""
         return None if self.equivalent_delay is None else float(self.equivalent_delay(values))
 
+    def present(self, values: Mapping[str, float]) -> tuple[str, ...]:
+        """Return the parameters that stand in the equations with these values: optional ones at neutral are left out."""
+        return tuple(
+            n for n, q in self.parameters.items() if not (q.optional and values.get(n, q.neutral) == q.neutral)
+        )
+
     @property
     def needs_grid(self) -> bool:
         """True where a parameter of the effect must be searched over many values."""
