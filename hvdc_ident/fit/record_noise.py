@@ -27,6 +27,9 @@ FEWEST = 8
 """Rows before an event from which anything is told of the noise."""
 GIVEN = "given"
 """The source of a standard deviation that stands as it was given."""
+MOVING = "the records before the event less the model's run, which moves there: at most so much"
+"""The source where inputs that are recorded with their noise keep the model moving. What it lacks is in such rows too, so that the
+noise is no more; all rows tell more of what it lacks, and no steps from row to row tell of noise that a recorder has smoothed."""
 LOUDER, QUIETER = "louder", "quieter"
 """What records before the event are, where they are not as loud as was stated."""
 SCATTER_ERROR = 0.9
@@ -115,7 +118,7 @@ class Quiet:
     deviation told; step: what the whole records are rounded to; rounded: their noise when below that. floor: the least a
     record can hold. scatter: the white noise that all rows show from one to the next, and their number. longer: an AR model
     of several coefficients, where there are rows enough. even: evenly spaced rows. own: by experiment the variance and the number
-    of its rows at rest. moving: rows before the events that are not at rest.
+    of its rows at rest. moving: rows before the events that are not at rest. restless: whether `records` are such rows.
     """
 
     records: tuple[Array, ...]
@@ -130,6 +133,7 @@ class Quiet:
     even: bool
     own: Mapping[str, tuple[float, int]]
     moving: int
+    restless: bool = False
 
     @property
     def rows(self) -> int:
@@ -147,6 +151,11 @@ class Quiet:
 def _quiet(output: str, experiments: Sequence[Experiment], runs: Mapping[str, Mapping[str, Array]]) -> Quiet:
     resting = {e.name: _before(e, output, runs.get(e.name, {}).get(output)) for e in experiments}
     before = {name: (t, r) for name, (t, r, _) in resting.items() if r.size}
+    scatter = scatter_of([_less(e, output, runs.get(e.name, {}).get(output)) for e in experiments], output)
+    restless = not before and scatter is None
+    if restless:
+        moved = {e.name: _until_event(e, output, runs[e.name].get(output)) for e in experiments if e.name in runs}
+        before = {name: (t, without_line(t, r)) for name, (t, r, _) in moved.items() if r.size >= FEWEST}
     quiet = without_tone([t for t, _ in before.values()], [r for _, r in before.values()])
     whole = [e.measured[output][np.isfinite(e.measured[output])] for e in experiments if e.measured is not None]
     step, given, even = _step(whole), _given(output, experiments), _even(experiments)
@@ -166,11 +175,12 @@ def _quiet(output: str, experiments: Sequence[Experiment], runs: Mapping[str, Ma
         step,
         rounded,
         floor,
-        scatter_of([_less(e, output, runs.get(e.name, {}).get(output)) for e in experiments], output),
+        scatter,
         longer if len(longer) > 1 else (),
         even,
         {n: (float(r @ r) / (r.size - 2), r.size) for n, r in zip(before, quiet, strict=True)},
         sum(moving for _, _, moving in resting.values()),
+        restless and bool(before),
     )
 
 
@@ -231,8 +241,9 @@ def _told(quiet: Quiet, colour: Colour, found: Likelihood | None) -> OutputNoise
     if given is None:
         own = _by_record(quiet, std, fresh)
         return OutputNoise(
-            std, model, colour.error, step, "the records before the event", rows, freedom, by_record=FrozenMap(own)
-        )
+            std, model, colour.error, step, MOVING if quiet.restless else "the records before the event", rows, freedom,
+            by_record=FrozenMap(own),
+        )  # fmt: skip
     margin = 1.0 + SURE / np.sqrt(2.0 * max(rows, 1) * fresh)
     if colour.tanh and found is not None:
         lack, above = _lack(found, given)
@@ -346,18 +357,23 @@ def _before(experiment: Experiment, output: str, run: Array | None) -> tuple[Arr
 
     run: (n,) of the model at the experiment's rows; None where there is none.
     """
+    t, misfit, moved = _until_event(experiment, output, run)
+    first = first_at_rest(t, misfit, moved) if t.size else None
+    if first is None:
+        return t[:0], misfit[:0], t.size if t.size >= FEWEST else 0
+    return t[first:], without_line(t[first:], misfit[first:]), first
+
+
+def _until_event(experiment: Experiment, output: str, run: Array | None) -> tuple[Array, Array, Array]:
+    """The times before the event, the rows there less the model's run, and that run; nothing without an event."""
     assert experiment.measured is not None
     event = experiment.event if experiment.event is not None else event_time(experiment.inputs)
-    none = np.empty(0)
     if event is None:
-        return none, none, 0
+        return np.empty(0), np.empty(0), np.empty(0)
     keep = (experiment.time < event - 1e-12) & np.isfinite(experiment.measured[output])
     t, y = experiment.time[keep], experiment.measured[output][keep]
-    run = np.zeros(t.size) if run is None else run[keep]
-    first = first_at_rest(t, y - run, run)
-    if first is None:
-        return none, none, t.size if t.size >= FEWEST else 0
-    return t[first:], without_line(t[first:], (y - run)[first:]), first
+    moved = np.zeros(t.size) if run is None else run[keep]
+    return t, y - moved, moved
 
 
 def first_at_rest(time: Array, misfit: Array, run: Array) -> int | None:

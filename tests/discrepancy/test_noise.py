@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from cases import SIGMA, TIME, experiments
 from scipy.integrate import solve_ivp
+from scipy.signal import lfilter
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.fit import FitParameter
-from hvdc_ident.fit.record_noise import OutputNoise, freedom_of, noise_of, without_tone
+from hvdc_ident.fit.record_noise import MOVING, OutputNoise, freedom_of, noise_of, without_tone
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 from hvdc_ident.study.recordings import with_noise
@@ -207,3 +208,27 @@ def test_a_stated_noise_that_the_records_refute_is_said_beside_the_verdict() -> 
     assert "i (stated 0.0002, shown 0.00" in found.text
     assert found.noise["v"]["contradicted"] == "louder"
     assert found.noise["v"]["std"] == pytest.approx(1e-3, rel=0.15)
+
+
+def test_rows_before_an_event_tell_at_most_how_large_the_noise_is_where_a_recorded_input_keeps_the_model_moving() -> (
+    None
+):
+    """The input is played back with its noise, and the recorder smooths: no rows are at rest, no steps from row to row tell."""
+    random = np.random.default_rng(8)
+    time = np.arange(3000) * 1e-3
+
+    def smooth(count: int) -> Array:
+        return np.asarray(np.convolve(random.standard_normal(count + 59), np.ones(60) / np.sqrt(60.0), "valid"))
+
+    size, records, runs = 2e-3, [], {}
+    for name in ("one", "two"):
+        u = 1.0 + 0.004 * smooth(time.size) - 0.1 * (time >= 1.0)
+        answer = np.array(lfilter([1e-3 / 0.05], [1.0, 1e-3 / 0.05 - 1.0], u - 1.0))
+        measured = Trajectory(time, (answer + size * smooth(time.size))[:, None], ("y",), ("",))
+        signal = InputSignal.corners(zip(time.tolist(), u.tolist(), strict=True))
+        records.append(Experiment(time, name, inputs=FrozenMap({"u": signal}), measured=measured, event=1.0))
+        runs[name] = {"y": 0.9 * answer}
+    found = noise_of(records, runs)["y"]
+    assert found.source == MOVING and found.rows == 2000 and found.moving == 2000
+    assert found.std == pytest.approx(size, rel=0.25) and found.model
+    assert noise_of(records, {n: {"y": 3.0 * r["y"]} for n, r in runs.items()})["y"].std > size
