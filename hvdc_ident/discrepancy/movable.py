@@ -23,9 +23,8 @@ from functools import cache, lru_cache
 import numpy as np
 import sympy as sp
 
-from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.effects import Additions, Effect, Probe, effects, leads_back
+from hvdc_ident.effects import Additions, Effect, effects, leads_back
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Algebraic, Model, Output, Signal, fresh, insertion_point, rewritten, with_derivative_signal
@@ -259,17 +258,3 @@ def in_proportion(candidate: CandidateEffect, probe: int) -> bool:
     """Return True where a candidate adds to its signal in proportion to its size, as it stands in a probe."""
     entry, values = effects()[candidate.effect], candidate.probes[probe].values
     return is_proportional(Form(candidate.effect, entry.present(values)))
-
-
-def added(candidate: CandidateEffect, probe: Probe, u: Array, source: Array | None) -> Array:
-    """Return (K,) what an effect in proportion to its size adds to its signal u (K,). source: (K,) what it brings in, where it does."""
-    entry = effects()[candidate.effect]
-    alone = equations(candidate.effect, entry.present(probe.values))
-    expression = (alone.outputs["y"].value - symbol("u")).xreplace({symbol(n): v for n, v in probe.values.items()})
-    signals = {"u": u, "source": np.zeros_like(u) if source is None else source}
-    symbols = [symbol(n) for n in signals]
-    for name, state in alone.states.items():  # what such an effect remembers is where it began
-        held = sp.lambdify(symbols, state.rest)(*(v[0] for v in signals.values()))
-        expression = expression.xreplace({symbol(name): sp.Float(float(held))})
-    found = sp.lambdify(symbols, expression)(*signals.values())
-    return np.asarray(np.broadcast_to(found, u.shape), dtype=float)

@@ -55,10 +55,6 @@ class Pushed:
         """(n,) s."""
         return self.experiment.time
 
-    def signal(self, place: str) -> Array:
-        """(n,): the slot's own signal on the run."""
-        return self.values[place]
-
     def answer(self, place: str, pushes: Array) -> Array:
         """Return (o, n, nc), what the outputs do in answer to pushes (n, nc) at a slot, to first order; nan where a run fails."""
         found = np.full((len(self.outputs), self.time.size, pushes.shape[1]), np.nan)

@@ -81,10 +81,6 @@ class Screen:
         """Return the chance that noise alone makes chi2 fall as much anywhere."""
         return float((1 + np.count_nonzero(self.largest >= fall)) / (1 + self.largest.size))
 
-    def threshold(self, significance: float) -> float:
-        """Return the fall that noise alone exceeds with this chance."""
-        return float(np.quantile(self.largest, 1.0 - significance)) if self.largest.size else 0.0
-
     def best(self) -> dict[int, Shot]:
         """Return the best shot of each candidate, the best first."""
         found: dict[int, Shot] = {}

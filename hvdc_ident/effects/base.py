@@ -207,8 +207,7 @@ class Effect:
     self_exciting: True where it moves the model by itself, so that a record of it does not begin in steady state.
     holds: True where it passes no small change on, so that what integrates its signal may rest at any level.
     equivalent_delay: delay of a slow signal, s, from its parameters' values, which effects that are hard to tell apart
-    share; None for what is no delay of any kind. numpy_form: y of u in numpy, where the equations are too many to be
-    evaluated for thousands of sizes. generalises: effects that it becomes at the end of a parameter's range, and whose data
+    share; None for what is no delay of any kind. generalises: effects that it becomes at the end of a parameter's range, and whose data
     it therefore explains, at the price of that parameter. reversal: the parameter by more than which the signal has to
     reverse for the effect to be more than a shift. equals: other effects that are the same equation at the same place.
     """
@@ -235,7 +234,6 @@ class Effect:
     self_exciting: bool = False
     holds: bool = False
     equivalent_delay: Callable[[Mapping[str, float]], float] | None = None
-    numpy_form: Callable[[Array, Mapping[str, Array]], Array] | None = None
     generalises: tuple[str, ...] = ()
     reversal: str = ""
     equals: FrozenMap[Equality] = field(default_factory=FrozenMap)

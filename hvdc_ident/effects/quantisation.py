@@ -97,7 +97,6 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     holds=True,
-    numpy_form=lambda u, p: p["step"] * np.floor(u / p["step"] + 0.5),
     sentence="{at} is rounded to multiples of {step}",
     excited_by="slow ramps both ways over several levels",
     example=FrozenMap({"step": 0.03}),

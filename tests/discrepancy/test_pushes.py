@@ -120,7 +120,7 @@ def test_a_small_gain_error_answers_as_the_model_with_it(lagged: Refit, place: s
     """At signals without a jump: between two rows of a push a jump is a ramp."""
     first = at_truth(lagged)
     path = pushed(first, slot_signals(first))["fit-1"]
-    found = path.answer(place, 1e-4 * path.signal(place)[:, None])[:, :, 0].T
+    found = path.answer(place, 1e-4 * path.values[place][:, None])[:, :, 0].T
     with_it = apply_effects(model(), [{"effect": "gain", "at": place, "parameters": {"k": 1.0001}}])
     e = path.experiment
     exact = (
@@ -136,8 +136,8 @@ def test_the_run_of_a_card_with_other_values_is_its_own(lagged: Refit) -> None:
     for first in (lagged, braked):
         path = pushed(first, slot_signals(first))["fit-1"]
         run = simulate(model(), path.experiment, first.values, outputs=["w", "drag"], tolerance=EXACT)
-        assert path.signal("w") == pytest.approx(run["w"], abs=1e-6)
-        assert path.signal("drag") == pytest.approx(run["drag"], abs=1e-6)
+        assert path.values["w"] == pytest.approx(run["w"], abs=1e-6)
+        assert path.values["drag"] == pytest.approx(run["drag"], abs=1e-6)
 
 
 def test_the_directions_are_those_of_all_hats_beside_the_parameters(lagged: Refit, runs: dict[str, Pushed]) -> None:

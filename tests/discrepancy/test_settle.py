@@ -128,4 +128,4 @@ def test_rounds_that_are_over_have_the_answers_of_their_model() -> None:
     again, anew = outcome.rounds[0].answers(), pushed(first, slot_signals(first))
     assert again.keys() == anew.keys() == {"fit-1", "fit-2"}
     for name, path in anew.items():
-        np.testing.assert_array_equal(again[name].signal("wm"), path.signal("wm"))
+        np.testing.assert_array_equal(again[name].values["wm"], path.values["wm"])
