@@ -61,8 +61,13 @@ class Told:
         return {n: plain(getattr(self, n)) for n in self.__dataclass_fields__ if n != "refit"}
 
 
-def tried(search: SearchContext, opened: Round, at: Collection[str] | None = None) -> tuple[CandidateFit, ...]:
-    """Return the refits of forms, each none of the catalogue's effects, the best of each candidate.
+def tried(
+    search: SearchContext,
+    opened: Round,
+    at: Collection[str] | None = None,
+    kinds: Collection[str] = ("term", "filter", "curve"),
+) -> tuple[CandidateFit, ...]:
+    """Return the refits of forms of these kinds, each none of the catalogue's effects, the best of each candidate.
 
     at: places; those where effects of the catalogue explain most, where none are given. Values on a curve begin at no addition, so
     that their first step is the linear regression on it: curves are not screened.
@@ -72,7 +77,7 @@ def tried(search: SearchContext, opened: Round, at: Collection[str] | None = Non
         return ()
     places = _promising(opened) if at is None else at
     times = [e.time for e in before.problem.fitted_experiments]
-    names = [n for n, e in effects().items() if e.outside]
+    names = [n for n, e in effects().items() if e.outside in kinds]
     found = [
         c
         for c in candidates(before.model, opened.signals, times, names, search.places)
@@ -153,9 +158,9 @@ def instead_of(search: SearchContext, opened: Round) -> tuple[tuple[CandidateFit
     if not delays and (remembers or effect.needs_grid or additive(effect) or others):
         return ()
     kind = "filter" if delays else "term"
-    refits = (
-        opened.forms if delays and opened.forms is not None else tried(search, opened, None if delays else (place,))
-    )
+    refits = opened.forms if delays else None
+    if refits is None:
+        refits = tried(search, opened, None if delays else (place,), (kind,))
     count = sum(c.effect == effect.name and len(c.at) == 1 for c in opened.candidates)
     linear = in_proportion(opened.candidates[winner.pick.candidate], winner.pick.probe)
     weighed = []
