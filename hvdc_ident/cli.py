@@ -340,12 +340,13 @@ def models(*, console: Console) -> None:
 
 def effects(*, console: Console) -> None:
     """List the effects that a model may lack. Each has sizes that show on a per-unit signal; those that `diagnose` does not
-    try, or only where they are named, say so."""
+    try at once say where it does."""
     from hvdc_ident.effects import Effect
     from hvdc_ident.effects import effects as known
 
     def line(e: Effect) -> str:
-        tried = "at states; diagnose: not tried" if e.of_derivative else "diagnose: tried where it is named"
+        tried = "tried where no other effect explains the records" if e.outside else "tried where it is named"
+        tried = f"at states; diagnose: {tried}" if e.of_derivative else f"diagnose: {tried}"
         return f"{e.summary}; {e.example_text}" + ("" if e.tried_by_default else f" ({tried})")
 
     _catalogue("effects", {name: e.summary if console.json else line(e) for name, e in known().items()}, console)
