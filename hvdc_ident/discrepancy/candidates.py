@@ -117,7 +117,7 @@ def candidates(
     if not isinstance(model, Model):
         brought += tuple(p for p in live if kind_of(model, p) == "output")
     tried = entries(names)
-    doubled = any(e.name == "coupling" for e in tried)
+    doubled, leaky = (any(e.name == n for e in tried) for n in ("coupling", "conductance"))
     found: list[CandidateEffect] = []
     for at in groups:
         joined = SignalScales.joined([about[p] for p in at])
@@ -132,8 +132,17 @@ def candidates(
                 usable = tuple(b for b in brought if droops(model, at, b))
             if effect.name == "conductance":  # of the slot's own signal it is a gain, which is tried
                 usable = tuple(b for b in brought if not proportional(signals[at[0]], signals[b]))
-            found += _at(model, effect, at, joined, still, about, usable)
+            more = _at(model, effect, at, joined, still, about, usable)
+            found += [_no_conductance(c, about) for c in more] if effect.name == "loss" and leaky else more
     return tuple(found)
+
+
+def _no_conductance(loss: CandidateEffect, about: Mapping[str, SignalScales]) -> CandidateEffect:
+    """Return a loss without the size of its magnitude alone, where the other signal keeps its sign: that is a conductance."""
+    if not all(about[s].low > 0.0 or about[s].high < 0.0 for s in loss.sources):
+        return loss
+    entry = effects()[loss.effect]
+    return replace(loss, probes=tuple(p for p in loss.probes if entry.present(p.values) != ("b",)))
 
 
 def _at(

@@ -112,19 +112,19 @@ def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on
 
 
 def test_a_diagnosis_outlives_a_candidate_that_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gain raises where its refit is made; the lag that is missing is named all the same."""
+    """The delay raises where its refit is made; the lag that is missing is named all the same."""
     plain = hypothesis.job
 
     def fails(before: Refit, candidate: CandidateEffect, *given: object) -> object:
-        if candidate.effect == "gain":
-            raise ValueError("no such gain")
+        if candidate.effect == "delay":
+            raise ValueError("no such delay")
         return plain(before, candidate, *given)  # type: ignore[arg-type]
 
     monkeypatch.setattr("hvdc_ident.discrepancy.stand.job", fails)
-    found = diagnose(model(), experiments(lag=0.03), FREE, effects=["lag", "gain"], places=["wm"])
+    found = diagnose(model(), experiments(lag=0.03), FREE, effects=["lag", "delay"], places=["wm"])
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text
     statuses = {c.effect: c.status for c in found.candidates if c.round == 1}
-    assert statuses == {"lag": "refitted", "gain": "failed: no such gain"}
+    assert statuses == {"lag": "refitted", "delay": "failed: no such delay"}
 
 
 def test_a_candidate_that_cannot_be_screened_is_told_and_the_others_are_looked_at(
