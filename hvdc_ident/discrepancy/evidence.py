@@ -85,6 +85,10 @@ class Ruler:
         share = self.effective / self.rows
         return (before - after) * share / self.scale - more * self.price
 
+    def between(self, before: Refit, after: Refit) -> float:
+        """Return the gain of one refit over another, by their chi2 and the number of their parameters."""
+        return self.gain(before.chi2, after.chi2, len(after.problem.free) - len(before.problem.free))
+
     @property
     def price(self) -> float:
         """Price of one more parameter, in BIC."""
@@ -203,7 +207,7 @@ def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> fl
 def gained(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
     """Return the trial with what it gains in BIC over the model before, and what the held-out data add to that."""
     more = len(trial.refit.problem.free) - len(before.problem.free)
-    gain = ruler.gain(before.chi2, trial.refit.chi2, more)
+    gain = ruler.between(before, trial.refit)
     return CandidateFit(trial.pick, trial.refit, gain, evidence_between(before, trial.refit, ruler, more))
 
 

@@ -10,13 +10,12 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import Placed, Refit, held_out, unseen
+from hvdc_ident.discrepancy.hypothesis import Placed, Refit, held_out, uncertainty_of, unseen
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, StandIn, Table
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.record_noise import SURE
-from hvdc_ident.fit.uncertainty import uncertainty
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures, listed, percentage, quantity
 
@@ -193,8 +192,7 @@ def beside_stand_ins(moved: Finding, others: Sequence[StandIn]) -> Finding:
 def moved_parameters(last: Refit, names: Collection[str]) -> Finding | None:
     """The parameters, of those named, whose estimates are clearly off the given values, as one finding; None where none is."""
     problem = last.problem
-    spans = np.array([u.span for u in problem.unknowns])
-    known = uncertainty(problem.blocks(last.theta), problem.names, spans, dict.fromkeys(problem.outputs, "given"))
+    known = uncertainty_of(problem, problem.blocks(last.theta))
     sizes, told = {}, []
     for k in last.gains:
         free, value, std = problem.free[k], float(last.theta[k]), known.std(problem.free[k].name)

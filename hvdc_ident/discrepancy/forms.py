@@ -14,20 +14,18 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import additive, candidates
 from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, best_each, gained, is_far, left_by
 from hvdc_ident.discrepancy.explain import sentence
-from hvdc_ident.discrepancy.hypothesis import Refit, in_place, unseen
+from hvdc_ident.discrepancy.hypothesis import Refit, in_place, uncertainty_of, unseen
 from hvdc_ident.discrepancy.movable import equations, in_proportion
 from hvdc_ident.discrepancy.options import REFUTED, SearchContext
-from hvdc_ident.discrepancy.pushes import Pushed, Whitening
+from hvdc_ident.discrepancy.pushes import answered, hats
 from hvdc_ident.discrepancy.screen import Shot
 from hvdc_ident.discrepancy.stand import FoundForm, Round, Stand
 from hvdc_ident.effects import effects
 from hvdc_ident.expression import parse, symbol, to_text
 from hvdc_ident.files import plain
-from hvdc_ident.fit.uncertainty import uncertainty
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.text import listed
@@ -41,7 +39,7 @@ TIME_KNOTS = 24
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """What is told of a form outside the catalogue. kind: term, filter, curve, disturbance or nothing.
+    """A form outside the catalogue as it is told. kind: term, filter, curve, disturbance or nothing.
 
     at: the insertion point; expression and coefficients: of a term or a filter; curve: of the others, {over, at, value, std}.
     refit: the model with the form; text: a sentence.
@@ -127,13 +125,13 @@ def standing(
 def _gain(search: SearchContext, before: Refit, refit: Refit, best: Refit | None) -> float | None:
     """Return what a form gains, in BIC; None where it does not stand."""
     ruler = Ruler.of(refit)
-    gain = ruler.gain(before.chi2, refit.chi2, refit.count - before.count)
+    gain = ruler.between(before, refit)
     was, now = unseen(before), unseen(refit)
     if was is None or now is None or gain <= search.options.named_bic or was - now <= search.options.holdout_share:
         return None
     if best is None:
         return gain if left_by(refit) <= REFUTED * left_by(before) else None
-    ahead = ruler.gain(best.chi2, refit.chi2, refit.count - best.count) > search.options.named_bic
+    ahead = ruler.between(best, refit) > search.options.named_bic
     return gain if ahead and not is_far(before, refit) else None
 
 
@@ -238,10 +236,7 @@ def _curve(refit: Refit) -> dict[str, Any]:
     placed = refit.placed[-1]
     entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
     assert entry.curve is not None
-    spans = np.array([u.span for u in refit.problem.unknowns])
-    known = uncertainty(
-        refit.problem.blocks(refit.theta), refit.problem.names, spans, dict.fromkeys(refit.problem.outputs, "given")
-    )
+    known = uncertainty_of(refit.problem, refit.problem.blocks(refit.theta))
     at, value = entry.curve(sizes)
     names = [n for n in placed.bounds if n in placed.names]
     slopes = np.column_stack(
@@ -265,11 +260,10 @@ def course(search: SearchContext, opened: Round) -> Told:
     paths, nominal = opened.answers(), opened.before.nominal()
     experiments = nominal.problem.fitted_experiments
     at = np.linspace(min(e.time[0] for e in experiments), max(e.time[-1] for e in experiments), TIME_KNOTS)
-    units = np.eye(at.size)
     residual, best = nominal.projected(nominal.residual), None
     for place in [p for p in _promising(opened) if search.looks_at(p)]:
         columns = nominal.projected(
-            np.vstack([_answers(nominal, e, paths[e.name], place, at, units) for e in experiments])
+            np.vstack([answered(nominal, e, paths[e.name], place, hats(e.time, at)) for e in experiments])
         )
         columns = np.where(np.isfinite(columns), columns, 0.0)
         norms = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
@@ -289,10 +283,3 @@ def course(search: SearchContext, opened: Round) -> Told:
         return Told("disturbance", place, text, delta_bic=worth, curve=curve)
     text = f"It acts at {place}; with one experiment a disturbance cannot be told from a form."
     return Told("curve", place, text, delta_bic=worth, curve=curve)
-
-
-def _answers(nominal: Any, experiment: Any, path: Pushed, place: str, at: Array, units: Array) -> Array:
-    """(rows, k) answers of an experiment to hats over time, whitened."""
-    pushes = np.column_stack([np.interp(path.time, at, unit) for unit in units])
-    blocks = [b for b in nominal.blocks if b.experiment == experiment.name]
-    return Whitening.of(blocks, experiment, nominal)(path.answer(place, pushes))

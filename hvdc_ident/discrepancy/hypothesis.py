@@ -6,7 +6,7 @@ A refit runs from where the screen put it, with exact sensitivities, and is judg
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
@@ -58,26 +58,17 @@ def added(
     candidate: CandidateEffect,
     probe: int,
     factor: float,
-    made: dict[Hashable, AnyModel] | None = None,
 ) -> tuple[AnyModel, Problem, Placed, Array]:
-    """The model and problem with one more effect, and where it starts: the probe, or the size the score asks for.
+    """Return the model and problem with one more effect, and where it starts: the probe, or the size that its screen asks for.
 
-    made: models made of this one before, to which this may add another: one of an effect serves for all its free sizes.
     Raises ModelError where the effect cannot be put there.
     """
     candidate = reaching(candidate, probe, factor)
     chosen = candidate.probes[probe]
     values = moved(candidate, probe, factor)
     use = candidate.use(replace(chosen, values=FrozenMap(values)))
-    present = [
-        n
-        for n in effects()[candidate.effect].parameters
-        if n not in candidate.named and not _absent(candidate, n, values)
-    ]
-    settled = tuple((n, values[n]) for n in present if n not in chosen.free)
-    key = (candidate.effect, candidate.at, candidate.source, candidate.named, tuple(present), settled)
-    made = {} if made is None else made
-    larger = made[key] = made.get(key) or apply_effects(model, [use])
+    present = [n for n in effects()[candidate.effect].present(values) if n not in candidate.named]
+    larger = apply_effects(model, [use])
     new = [n for n in larger.parameters if n not in model.parameters]
     names = dict(zip(present, new, strict=True))
     bounds = {n: b for n, b in chosen.free.items() if n in names}
@@ -110,11 +101,6 @@ def _determinant(model: Model) -> float | None:
     """Sign of the determinant of the equations at the model's own steady state; None where it has none."""
     anchor = equilibria(model).anchor(model, np.array([i.value for i in model.inputs.values()]))
     return None if anchor is None else anchor.sign
-
-
-def _absent(candidate: CandidateEffect, name: str, values: Mapping[str, float]) -> bool:
-    q = effects()[candidate.effect].parameters[name]
-    return q.optional and values[name] == q.neutral
 
 
 def reaching(candidate: CandidateEffect, probe: int, factor: float) -> CandidateEffect:
@@ -354,9 +340,7 @@ def _apart(begins: Sequence[Array]) -> list[Array]:
 def judged(refit: Refit) -> Refit:
     """The refit with its intervals, and what it predicts of data it has not seen."""
     blocks = refit.problem.blocks(refit.theta)
-    names = refit.problem.names
-    spans = np.array([u.span for u in refit.problem.unknowns])
-    known = uncertainty(blocks, names, spans, dict.fromkeys(refit.problem.outputs, "given"))
+    names, known = refit.problem.names, uncertainty_of(refit.problem, blocks)
     # What unknown starts took is what chance would have left there: refits with and without them are then compared fairly.
     chi2 = sum(b.chi2 + b.taken for b in blocks)
     rows = sum(b.residual.size for b in blocks)
@@ -367,6 +351,12 @@ def judged(refit: Refit) -> Refit:
         refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=holdout(refit.problem, refit.theta),
         press=press(blocks), std=FrozenMap(std), apart=apart,
     )  # fmt: skip
+
+
+def uncertainty_of(problem: Problem, blocks: Sequence[ResidualBlock]) -> Uncertainty:
+    """Return the uncertainty of a problem's unknowns by its residuals, whose noise is taken as known."""
+    spans = np.array([u.span for u in problem.unknowns])
+    return uncertainty(blocks, problem.names, spans, dict.fromkeys(problem.outputs, "given"))
 
 
 def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks: Sequence[ResidualBlock]) -> float:

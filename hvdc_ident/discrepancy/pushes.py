@@ -147,6 +147,17 @@ class Whitening:
         return self.treatment.applied(b.scaled(y), time, b.output, self.name)
 
 
+def hats(time: Array, knots: Array) -> Array:
+    """Return (n, k) hats: 1 at their knot (k,), straight to 0 at its neighbours, level beyond the first and the last."""
+    return np.column_stack([np.interp(time, knots, unit) for unit in np.eye(knots.size)])
+
+
+def answered(nominal: Nominal, experiment: Experiment, path: Pushed, place: str, pushes: Array) -> Array:
+    """Return (rows, k) whitened answers of a fitted experiment to pushes (n, k) at a place; nan where a run fails."""
+    blocks = [b for b in nominal.blocks if b.experiment == experiment.name]
+    return Whitening.of(blocks, experiment, nominal)(path.answer(place, pushes))
+
+
 EVEN, QUICK = 16, 8
 """Knots of a push over a record, and over each part of it behind a break of an input, ever nearer to the break."""
 MOST = 120
@@ -174,9 +185,8 @@ class Inversion:
         """Return the inversion of one slot on the fitted experiments."""
         experiments, shown = nominal.problem.fitted_experiments, []
         for e in experiments:
-            whitening = Whitening.of([b for b in nominal.blocks if b.experiment == e.name], e, nominal)
-            hats = _hats(e, MOST // len(experiments))
-            shown.append(np.nan_to_num(whitening(paths[e.name].answer(place, hats))))
+            over = _hats(e, MOST // len(experiments))
+            shown.append(np.nan_to_num(answered(nominal, e, paths[e.name], place, over)))
         taken = np.hstack([q.T @ s for q, s in zip(_split(nominal.basis, shown), shown, strict=True)])
         square = block_diag(*(s.T @ s for s in shown)) - taken.T @ taken
         free = nominal.projected(nominal.residual[:, None])
@@ -258,4 +268,4 @@ def _hats(experiment: Experiment, most: int) -> Array:
     knots = np.unique(np.concatenate([np.linspace(begin, end, even), breaks, *behind]))
     knots = t[np.unique(np.searchsorted(t, knots).clip(max=t.size - 1))]
     knots = np.unique(knots)
-    return np.column_stack([np.interp(t, knots, unit) for unit in np.eye(knots.size)])
+    return hats(t, knots)

@@ -107,7 +107,7 @@ def one_round(search: SearchContext, before: Refit, number: int, *, little: bool
         return replace(opened, why=nothing)
     if little or (p > search.options.significance and not loud):
         first = stand.refitted(found, _field(search, found, screen.shots)[:SHORTLIST], f"round {number}")
-        gains = [_gain(before, t.refit) for t in first if not t.refit.failure]
+        gains = [Ruler.of(t.refit).between(before, t.refit) for t in first if not t.refit.failure]
         named = max(gains, default=0.0) > search.options.named_bic
         if not (named and _significant(search, opened, first)) or (little and all_far(before, first)):
             return replace(opened, failed=tuple(t for t in first if t.refit.failure), why=nothing)
@@ -115,11 +115,6 @@ def one_round(search: SearchContext, before: Refit, number: int, *, little: bool
     if not _significant(search, opened, trials):
         return replace(opened, failed=tuple(t for t in trials if t.refit.failure), why=nothing)
     return closed(search, replace(opened, significant=True), trials, number)
-
-
-def _gain(before: Refit, after: Refit) -> float:
-    """Return what effects gain in BIC over the model before."""
-    return Ruler.of(after).gain(before.chi2, after.chi2, after.count - before.count)
 
 
 def _significant(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> bool:
@@ -303,8 +298,8 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
     probability before any data is shared by all its places and sources, so an offset goes before one of many couplings. Of those
     that are as likely and imply other values of the parameters that one wins whose values are nearest to the given ones.
     """
-    tried = {t.pick.candidate for t in trials}
-    trials = [*trials, *(t for t in opened.failed if t.pick.candidate not in tried)]
+    refitted = {t.pick.candidate for t in trials}
+    trials = [*trials, *(t for t in opened.failed if t.pick.candidate not in refitted)]
     sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
     if not sound:
         return replace(opened, failed=failed, why="no candidate could be refitted")
@@ -393,8 +388,7 @@ def from_either_side(search: SearchContext, first: Refit) -> SearchOutcome:
     except FAILURES as error:
         return replace(outcome, notes=(*outcome.notes, f"from the given values nothing was looked for: {error}"))
     ruler = Ruler.of(min(last, again.refit, key=lambda r: r.chi2))
-    more = len(again.refit.problem.free) - len(last.problem.free)
-    nearer = bool(again.kept) and ruler.gain(last.chi2, again.refit.chi2, more) > search.options.named_bic
+    nearer = bool(again.kept) and ruler.between(last, again.refit) > search.options.named_bic
     return again if nearer else outcome
 
 
