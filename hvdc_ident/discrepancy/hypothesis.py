@@ -52,37 +52,6 @@ class Placed:
     movable: bool = False
 
 
-def added(
-    model: AnyModel,
-    problem: Problem,
-    candidate: CandidateEffect,
-    probe: int,
-    factor: float,
-) -> tuple[AnyModel, Problem, Placed, Array]:
-    """Return the model and problem with one more effect, and where it starts: the probe, or the size that its screen asks for.
-
-    Raises ModelError where the effect cannot be put there.
-    """
-    candidate = reaching(candidate, probe, factor)
-    chosen = candidate.probes[probe]
-    values = moved(candidate, probe, factor)
-    use = candidate.use(replace(chosen, values=FrozenMap(values)))
-    present = [n for n in effects()[candidate.effect].present(values) if n not in candidate.named]
-    larger = apply_effects(model, [use])
-    new = [n for n in larger.parameters if n not in model.parameters]
-    names = dict(zip(present, new, strict=True))
-    bounds = {n: b for n, b in chosen.free.items() if n in names}
-    free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-    more = replace(
-        problem,
-        simulator=ModelSimulator(larger, PATIENCE),
-        free=(*problem.free, *free),
-        free_initial_states=problem.free_initial_states or begins_anywhere(larger, model, [use]),
-    )
-    placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values))
-    return larger, more, placed, np.array([f.start for f in free])
-
-
 def begins_anywhere(model: AnyModel, without: AnyModel, uses: Sequence[EffectUse]) -> bool:
     """Return True where a record of the model with these effects need not begin at the steady state that the solver finds.
 
@@ -512,35 +481,36 @@ def job(
     movable: the model with an effect of this form that can be moved, where there is one; else the effect is put in.
     Raises ModelError where the effect cannot sit there.
     """
-    k = len(before.problem.free)
+    candidate = reaching(candidate, probe, factor)
+    chosen, values = candidate.probes[probe], moved(candidate, probe, factor)
+    use = candidate.use(replace(chosen, values=FrozenMap(values)))
+    entry, plain = effects()[candidate.effect], before.model
+    anywhere = before.problem.free_initial_states
+    larger = apply_effects(plain, [use]) if movable is None or (entry.holds and not anywhere) else plain
+    anywhere = anywhere or begins_anywhere(larger, plain, [use])
+    held: dict[str, float] = {}
     if movable is None:
-        model, problem, placed, sizes = added(before.model, before.problem, candidate, probe, factor)
+        model, simulator = larger, ModelSimulator(larger, PATIENCE)
+        present = [n for n in entry.present(values) if n not in candidate.named]
+        names = dict(zip(present, [n for n in model.parameters if n not in plain.parameters], strict=True))
     else:
-        candidate = reaching(candidate, probe, factor)
-        values, chosen = moved(candidate, probe, factor), candidate.probes[probe]
-        model = movable.model
+        model, simulator = movable.model, movable.simulator(PATIENCE)
         known = before.values
         named = {n: known.get(p, model.parameters[p].value) for n, p in candidate.named.items()}
         names = {n: name for n, name in movable.names.items() if n not in candidate.named}
-        bounds = {n: b for n, b in chosen.free.items() if n in names}
-        free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
-        weights = movable.placed(candidate) | movable.sized({**values, **named})
-        held = {n: v for n, v in weights.items() if n not in {f.name for f in free}}
-        use = candidate.use(replace(chosen, values=FrozenMap(values)))
-        entry = effects()[candidate.effect]
-        anywhere = before.problem.free_initial_states or entry.self_exciting
-        if entry.holds and not anywhere:
-            anywhere = begins_anywhere(apply_effects(before.model, [use]), before.model, [use])
-        problem = replace(
-            before.problem,
-            simulator=movable.simulator(PATIENCE),
-            free=(*before.problem.free, *free),
-            held=before.problem.held | held,
-            free_initial_states=anywhere,
-        )
-        placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values), movable=True)
-        sizes = np.array([f.start for f in free])
-    begin = np.concatenate([theta[:k], sizes, theta[k:]])
+        held = movable.placed(candidate) | movable.sized({**values, **named})
+    bounds = {n: b for n, b in chosen.free.items() if n in names}
+    free = tuple(FitParameter(names[n], values[n], low, high) for n, (low, high) in bounds.items())
+    problem = replace(
+        before.problem,
+        simulator=simulator,
+        free=(*before.problem.free, *free),
+        held=before.problem.held | {n: v for n, v in held.items() if n not in {f.name for f in free}},
+        free_initial_states=anywhere,
+    )
+    placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values), movable=movable is not None)
+    k = len(before.problem.free)
+    begin = np.concatenate([theta[:k], [f.start for f in free], theta[k:]])
     return RefitJob(model, (*before.placed, placed), problem, (begin,), before.noise)
 
 

@@ -10,7 +10,7 @@ from cases import FREE, SIGMA, TRUE, model
 
 from hvdc_ident import Experiment, Model, simulate
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, added, judged
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, job, judged
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
@@ -44,6 +44,4 @@ def beside(
     """The refit of a model with one more effect, from a size; what has no bounds stays."""
     probe = Probe(effect, FrozenMap(values), FrozenMap(bounds))
     candidate = CandidateEffect(effect, (at,), (probe,), source=source)
-    larger, problem, placed, start = added(before.model, before.problem, candidate, 0, 1.0)
-    begin = np.concatenate([before.theta, start])
-    return RefitJob(larger, (*before.placed, placed), problem, (begin,), before.noise)
+    return job(before, candidate, 0, 1.0, before.theta)
