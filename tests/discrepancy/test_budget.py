@@ -1,4 +1,4 @@
-"""How much a search looks at: more where a thorough one is asked for, less once its budget is over."""
+"""The extent of a search: larger where a thorough one is asked for, smaller once its budget is over."""
 
 from __future__ import annotations
 
