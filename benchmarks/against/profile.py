@@ -10,7 +10,6 @@ import engine as link_bench  # of the folder above
 import numpy as np
 
 from hvdc_ident.fit import fit
-from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.fit.uncertainty import TWO_SIDED
 
@@ -28,18 +27,22 @@ def profiling() -> Iterator[Line]:
 
     logging.disable(logging.WARNING)
     problem, _ = recorded(Plant())
-    objective, count = LeastSquares.of(problem), [0]
+    count = [0]
     best = np.array([fit(problem, starts=1).values[f.name] for f in FREE])
-    mine = link_bench.best(lambda: profiles(objective, best), 5, 1)
-    own = profiles(objective, best)
+    mine = link_bench.best(lambda: profiles(problem, best), 5, 1)
+    own = profiles(problem, best)
 
     def cost(theta: np.ndarray) -> float:
         count[0] += 1
-        return float(objective.evaluate(theta).cost)
+        return problem.cost(theta)
+
+    def gradient(theta: np.ndarray) -> np.ndarray:
+        r, jacobian = problem.residual(theta)
+        return np.asarray(jacobian.T @ r)
 
     low, high = [f.min for f in FREE], [f.max for f in FREE]
     theirs = pypesto.Problem(
-        pypesto.Objective(fun=cost, grad=lambda theta: objective.evaluate(theta).gradient), low, high,
+        pypesto.Objective(fun=cost, grad=gradient), low, high,
         x_names=[f.name for f in FREE],
     )  # fmt: skip
     optimizer = pypesto.optimize.ScipyOptimizer(method="L-BFGS-B")

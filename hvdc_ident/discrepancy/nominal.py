@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor
-from hvdc_ident.fit import FitParameter, Problem, Simulator
+from hvdc_ident.fit import FitParameter, Problem, Simulator, StartOutcome
 from hvdc_ident.fit.record_noise import GIVEN, OutputNoise, draws, noise_of, stated_by
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.simulator import approximate, observe
-from hvdc_ident.identifiability.gate import gate, gated
+from hvdc_ident.identifiability.gate import gate, gated, searched
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, null_directions
@@ -190,8 +190,10 @@ def nominal(
         raise StudyError("nothing to diagnose", expected='an experiment of role "fit" with measured outputs')
     problem = Problem(simulator, tuple(experiments), tuple(parameters), held=FrozenMap(held))
     noise = noise_of([e for e in experiments if e.outputs], _runs(problem))
+    begun: tuple[StartOutcome, ...] = ()
     if report is not None:
         problem = gated(problem, gate(report, diagnosis=True))
+        begun = searched(report, [f.name for f in problem.free])
     # What is known of the noise goes into the records: a fit keeps weights of its own for deterministic outputs only.
     told = tuple(
         off_jumps(e).with_(noise=FrozenMap({o: n for o in e.outputs if (n := _stated(e, o, noise[o])) is not None}))
@@ -200,7 +202,7 @@ def nominal(
     models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
     quantised = {o: q for o, n in noise.items() if (q := n.quantised) is not None}
     problem = replace(problem, experiments=told, rho=FrozenMap(models), quantised_noise=FrozenMap(quantised))
-    optimum, result = pilot_fit(problem, starts=starts, seed=seed, executor=executor)
+    optimum, result = pilot_fit(problem, starts=starts, seed=seed, begun=begun, executor=executor)
     notes = (
         [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []
     )

@@ -16,8 +16,8 @@ from scipy.special import chdtrc, fdtrc, stdtrit
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.adequacy import ljung_box
+from hvdc_ident.fit.descent import descend
 from hvdc_ident.fit.noise_model import from_misfit
-from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import compared_rows, per_deviation, stretches
 from hvdc_ident.fit.result import FitResult
@@ -103,7 +103,7 @@ def held_out_nuisances(problem: Problem, result: FitResult) -> dict[str, dict[st
         theta[:known] = [result.values[f.name] for f in alone.free]
         fixed = np.arange(theta.size) < known
         try:
-            end = descend(LeastSquares.of(alone), theta, fixed, enough=1e-6)
+            end = descend(alone, theta, fixed, enough=1e-6)
         except SimulationError:
             nuisances[e.name] = None
             continue

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor, mapped
-from hvdc_ident.fit.objective import LeastSquares, bounded_step, descend
+from hvdc_ident.fit.descent import LeastSquares, bounded_step, descend
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.sensitivity import normalised
@@ -82,16 +82,15 @@ def _refit(problem: Problem, theta: Array, blocks: Sequence[ResidualBlock], coun
     space = drawn.coordinates
     low, high = space.bounds
     x, scaled = space.scaled(theta[places]), jacobian * space.slope(theta[places])
-    first = space.unscaled(x + bounded_step(scaled.T @ r, scaled.T @ scaled, 0.0, low - x, high - x))
+    first = space.unscaled(x + bounded_step(scaled.T @ r, scaled.T @ scaled, low - x, high - x))
 
     def residual(at: Array) -> tuple[Array, Array]:
         return _counted(drawn.blocks(at), times, list(range(at.size)))
 
     objective = LeastSquares(drawn.unknowns, residual)
-    none = np.zeros(len(places), dtype=bool)
     for start in (first, theta[places]):  # a step that leads out of what can be simulated is not taken
         try:
-            end = descend(objective, start, none, enough=1e-3)
+            end = descend(objective, start, enough=1e-3)
         except SimulationError:
             continue
         estimates = theta.copy()

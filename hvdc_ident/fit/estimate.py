@@ -16,33 +16,33 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import assessed
-from hvdc_ident.fit.multistart import (
-    DISTINCT,
-    LocalMinimum,
-    cost_at,
-    distinct,
-    has_clocks,
-    local_minima,
-    multistart,
-    prewhitened,
-    reweighted,
-    search_clock_offsets,
-    whitened_by_residuals,
-)
+from hvdc_ident.fit.descent import predicted_reduction
 from hvdc_ident.fit.noise_model import source_text
 from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
-from hvdc_ident.fit.objective import predicted_reduction
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import NOT_ASKED, Covariance, Estimate, FitResult, StartOutcome, Status
+from hvdc_ident.fit.search import (
+    DISTINCT,
+    SAME,
+    LocalMinimum,
+    cost_at,
+    distinct,
+    has_clocks,
+    local_minima,
+    prewhitened,
+    reweighted,
+    same_place,
+    search,
+    search_clock_offsets,
+    whitened_by_residuals,
+)
 from hvdc_ident.fit.simulator import unknown_of
 from hvdc_ident.fit.uncertainty import Uncertainty, estimates_of, uncertainty
 from hvdc_ident.immutable import FrozenMap
 
-SAME = 0.1
-"""A run whose cost is higher by less has reached the optimum: no estimate is off by half its standard deviation."""
 SETTLED = 1e-3
 """A Gauss-Newton step that lowers the cost by less moves no estimate by a twentieth of its standard deviation."""
 
@@ -57,11 +57,13 @@ def fit(
     executor: Executor | None = None,
     progress: Progress | None = None,
     assess: bool = True,
+    begun: Sequence[StartOutcome] = (),
 ) -> FitResult:
     """Return the best optimum of a multistart with its covariance, tests of its residuals and the outcome of every start.
 
-    starts: runs in all (default 8; 1 for an optimiser that searches the whole range by itself); the first from the
-    given start, the others from a seeded Latin hypercube over the bounds, nuisances from their own start.
+    starts: runs in all (left out: 8, and more where they leave a doubt, see `search`); the first from the given start, the
+    others from a seeded Latin hypercube over the bounds, nuisances from their own start. begun: a search that is taken up
+    from where its runs ended, in place of new starts.
     optimiser: one of the catalogue, by name or with options; the ends of all but the default are refined by least squares.
     whiten: "no", "pre-event" (AR model of the noise before the event) or "residual" (of the first fit's residuals).
     assess: whether goodness and validation are wanted too.
@@ -70,7 +72,8 @@ def fit(
     not-converged; failed (no start could be simulated to an end). A run that fails raises nothing: it is in `starts`.
     """
     first = prewhitened(problem, whiten)
-    points, runs = multistart(first, optimiser, starts, seed, executor, progress)
+    found = search(first, optimiser, starts, seed, executor, progress, begun)
+    points, runs = found.points, found.runs
     if all(r.status == "failed" or r.cost is None for r in runs):
         return _failed(first, points, runs, f"no start reached an end: {runs[0].message}")
     try:
@@ -264,7 +267,9 @@ def _arrived(
         (o.cost, o)
         for o in outcomes
         if o.cost is not None
-        and (o.cost <= best.cost + slack or (o.status != "failed" and _same_place(problem, best, o)))
+        and (
+            o.cost <= best.cost + slack or (o.status != "failed" and same_place(problem, best.theta, _end(problem, o)))
+        )
     ]
     return [o for _, o in sorted(reached, key=lambda pair: pair[0])]
 
@@ -284,7 +289,9 @@ def _doubt(
     spread = max(1.0, 2.0 * lowest / max(samples - len(problem.unknowns), 1))
     slack = max(1e-6 * lowest, spread * SAME / effective_share) + jump
     best = LocalMinimum(_end(problem, first), lowest)
-    others = [cost for cost, o in ends[1:] if cost > lowest + slack and not _same_place(problem, best, o)]
+    others = [
+        cost for cost, o in ends[1:] if cost > lowest + slack and not same_place(problem, best.theta, _end(problem, o))
+    ]
     if len(others) < len(ends) - 1:
         return ""
     levels = [c for k, c in enumerate(others) if k == 0 or c > others[k - 1] + slack]
@@ -307,13 +314,6 @@ def _end(problem: Problem, outcome: StartOutcome) -> Array:
     return np.array([outcome.end[n] for n in problem.names])
 
 
-def _same_place(problem: Problem, best: LocalMinimum, outcome: StartOutcome) -> bool:
-    """Return whether a run ended where the best one did."""
-    space = problem.coordinates
-    end = space.scaled(_end(problem, outcome))
-    return bool((np.abs(end - space.scaled(best.theta)) <= 1e-3 * space.ranges).all())
-
-
 def _is_optimum(problem: Problem, best: LocalMinimum, arrived: Sequence[StartOutcome]) -> bool:
     """Return whether a run that arrived says the best point is an optimum, no more can be gained, or two runs agree.
 
@@ -321,7 +321,7 @@ def _is_optimum(problem: Problem, best: LocalMinimum, arrived: Sequence[StartOut
     """
     if any(o.status == "converged" for o in arrived) or predicted_reduction(problem, best.theta) <= SETTLED:
         return True
-    return sum(o.status == "stalled" and _same_place(problem, best, o) for o in arrived) > 1
+    return sum(o.status == "stalled" and same_place(problem, best.theta, _end(problem, o)) for o in arrived) > 1
 
 
 def _with_rivals(

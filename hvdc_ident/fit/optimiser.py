@@ -13,7 +13,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.errors import InputError, SimulationError
+from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.problem import Problem
 
 OptimiserStatus = Literal["converged", "max-evaluations", "stopped", "stalled", "flat", "failed"]
@@ -68,43 +68,11 @@ class OptimiserRun:
         self.start = np.asarray(self.start, dtype=float)
         self.best = self.start.copy()
 
-    # --- coordinates: `scaled` ones keep infinite bounds; in the unit cube everything is finite ---
-
     @property
     def x0(self) -> Array:
         """Start in scaled coordinates, (p,), inside the bounds."""
         low, high = self.problem.coordinates.bounds
         return np.clip(self.problem.coordinates.scaled(self.start), low, high)
-
-    @property
-    def cube(self) -> Array:
-        """Start in the unit cube of where starts are drawn from, (p,)."""
-        shares = []
-        for u, v in zip(self.problem.unknowns, self.start, strict=True):
-            low, high = u.drawn
-            shares.append(np.log(v / low) / np.log(high / low) if u.log else (v - low) / (high - low))
-        return np.clip(np.array(shares), 0.0, 1.0)
-
-    def from_cube(self, shares: Array) -> Array:
-        """Return theta of a point of the unit cube, (p,); outside of it the nearest point inside."""
-        inside = np.clip(shares, 0.0, 1.0)
-        return np.array([u.draw(float(s)) for u, s in zip(self.problem.unknowns, inside, strict=True)])
-
-    # --- values ---
-
-    def at_cube(self, shares: Array) -> float:
-        """Return the cost at a point of the unit cube, simulated without sensitivities."""
-        return self.value(self.from_cube(shares))
-
-    def value(self, theta: Array) -> float:
-        """Return the cost at theta, or a number worse than any seen."""
-        self._count()
-        try:
-            cost = self.problem.cost(theta)
-        except SimulationError as error:
-            return self._failed(error)
-        self._seen(theta, cost)
-        return cost
 
     def residual(self, x: Array) -> Array:
         """Return the residual at scaled coordinates, (N,); infinite where the simulation fails."""
@@ -135,7 +103,8 @@ class OptimiserRun:
         try:
             r, jacobian = self.problem.residual(theta)
         except SimulationError as error:
-            self._failed(error)
+            self.failures += 1
+            self.failure = str(error)
             return None
         self._rows = r.size
         scaled = jacobian * self.problem.coordinates.slope(theta)
@@ -148,17 +117,10 @@ class OptimiserRun:
             raise BudgetSpentError
         self.evaluations += 1
 
-    def _failed(self, error: SimulationError) -> float:
-        self.failures += 1
-        self.failure = str(error)
-        return 2.0 * self._worst + 1.0
-
     def _seen(self, theta: Array, cost: float) -> None:
         self._worst = max(self._worst, cost)
         if self.cost is None or cost < self.cost:
             self.cost, self.best = cost, np.asarray(theta, dtype=float).copy()
-
-    # --- the end ---
 
     def ended(self, converged: bool, message: str) -> OptimiserResult:
         """Return the best point seen. Without any admissible point the run failed."""
@@ -178,17 +140,3 @@ class OptimiserRun:
     def refused(self, message: str) -> OptimiserResult:
         """Return the result where the method gave up."""
         return replace(self.ended(False, message), status="failed")
-
-
-def generator(seed: int, start: Array) -> np.random.Generator:
-    """Return the random numbers of a run: a stream of its own for every start, the same at every repetition."""
-    return np.random.default_rng([seed, *np.ascontiguousarray(start, dtype=float).view(np.uint32).tolist()])
-
-
-def missing(package: str, optimiser: str) -> InputError:
-    """Return the error where a package of the extra `optimisers` is not installed."""
-    return InputError(
-        f"the optimiser '{optimiser}' needs the package {package}, which is not installed",
-        where="fit.optimiser",
-        hint="pip install 'hvdc_ident[optimisers]', or another optimiser",
-    )

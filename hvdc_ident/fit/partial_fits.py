@@ -7,7 +7,7 @@ show by their spread how well one set of values serves all.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from typing import Any
@@ -25,7 +25,7 @@ from hvdc_ident.fit.estimate import fit
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.result import Covariance, FitResult, Status
+from hvdc_ident.fit.result import Covariance, FitResult, StartOutcome, Status
 from hvdc_ident.fit.simulator import unknown_of
 from hvdc_ident.immutable import FrozenMap
 
@@ -51,12 +51,14 @@ def fit_individually(
     whiten: str = "no",
     executor: Executor | None = None,
     progress: Progress | None = None,
+    begun: Callable[[Sequence[str]], Sequence[StartOutcome]] = lambda names: (),
 ) -> FitResult:
     """Return the fits of the groups, one after the other, as one result.
 
     While one group is fitted the other free parameters are held: at their estimate if their turn has been, else at
     their given value. Every estimate is conditional on those. The status is the worst of the groups'; cost, RMSE and tests
     are those of the whole problem with all estimates put in. A group that fails leaves its parameters at those values.
+    begun: from the names of a group's parameters the search that its fit takes up.
     Raises StudyError or UnknownNameError for groups that do not fit the problem.
     """
     _check(problem, groups)
@@ -72,6 +74,7 @@ def fit_individually(
             executor=executor,
             progress=progress,
             assess=False,
+            begun=begun(group.parameters),
         )
         current |= {n: result.values[n] for n in group.parameters if n in result.values and n in result.estimates}
         results.append(result)

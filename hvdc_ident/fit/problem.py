@@ -115,6 +115,11 @@ class Problem:
         return tuple(dict.fromkeys(o for e in self.fitted_experiments for o in e.outputs))
 
     @cached_property
+    def rows(self) -> int:
+        """Number of measured values that are compared."""
+        return sum(record.rows.size for records in self._records.values() for record in records)
+
+    @cached_property
     def noise_source(self) -> FrozenMap[str]:
         """Source of each output's standard deviation: "given" or "misfit", see `source_of`."""
         return FrozenMap({o: source_of(self.fitted_experiments, o) for o in self.outputs})

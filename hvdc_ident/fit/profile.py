@@ -16,9 +16,9 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
+from hvdc_ident.fit.descent import DescentResult, Residuals, descend
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.nonsmooth import Trend
-from hvdc_ident.fit.objective import DescentResult, Objective, descend
 from hvdc_ident.fit.profile_path import (
     BetterFoundError,
     DescentStep,
@@ -79,7 +79,7 @@ class Profiles:
 
 
 def profiles(
-    objective: Objective,
+    objective: Residuals,
     theta: Array,
     names: Sequence[str] | None = None,
     *,
@@ -180,7 +180,7 @@ class Failed:
     what: str
 
 
-def _descend(objective: Objective, step: DescentStep) -> DescentResult | Failed:
+def _descend(objective: Residuals, step: DescentStep) -> DescentResult | Failed:
     try:
         return descend(objective, step.theta, step.fixed, enough=step.enough)
     except SimulationError as error:
@@ -188,7 +188,7 @@ def _descend(objective: Objective, step: DescentStep) -> DescentResult | Failed:
 
 
 def _take(
-    objective: Objective, executor: Executor | None, steps: Sequence[DescentStep]
+    objective: Residuals, executor: Executor | None, steps: Sequence[DescentStep]
 ) -> Iterator[DescentResult | Failed]:
     """Return the end of each step, in order, as it is asked for."""
     return mapped(executor, partial(_descend, objective), steps)
@@ -256,7 +256,7 @@ class PairProfile:
 
 
 def profile_pair(
-    objective: Objective, theta: Array, names: tuple[str, str], first: Array, second: Array, *, enough: float = 1e-3
+    objective: Residuals, theta: Array, names: tuple[str, str], first: Array, second: Array, *, enough: float = 1e-3
 ) -> PairProfile:
     """Return the rise of the cost above the optimum theta at each pair of values, the other unknowns re-fitted from the nearest point.
 
@@ -265,7 +265,7 @@ def profile_pair(
     known = [u.name for u in objective.unknowns]
     rows = [known.index(n) for n in names]
     fixed = np.isin(np.arange(len(known)), rows)
-    best = descend(objective, theta, np.zeros(len(known), dtype=bool), enough=enough)
+    best = descend(objective, theta, enough=enough)
     rises = np.full((first.size, second.size), np.nan)
     ends: dict[tuple[int, int], DescentResult] = {}
     centre = (int(np.abs(first - best.theta[rows[0]]).argmin()), int(np.abs(second - best.theta[rows[1]]).argmin()))

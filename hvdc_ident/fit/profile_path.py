@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.descent import DescentResult
 from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
-from hvdc_ident.fit.objective import LONGEST, DescentResult
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 
+LONGEST = 10.0
+"""A logarithm moves along the tangent by at most this: no parabola holds over four decades."""
 BEYOND = 10.0
 """Without bounds a path goes on to so many times where a parabola would cross: the typical size is often a guess."""
 

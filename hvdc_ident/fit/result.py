@@ -66,6 +66,12 @@ class StartOutcome:
     evaluations: int
     group: int | None = None
 
+    @classmethod
+    def of(cls, line: Mapping[str, Any]) -> StartOutcome:
+        """Return the outcome that a line of the JSON is."""
+        start, end = FrozenMap(line["start"]), FrozenMap(line["end"])
+        return cls(start, end, line["cost"], line["status"], line["message"], line["evaluations"])
+
 
 @dataclass(frozen=True, eq=False)
 class Covariance:

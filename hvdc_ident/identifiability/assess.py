@@ -15,6 +15,7 @@ import numpy as np
 from hvdc_ident.data import Experiment
 from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.executor import Executor, Progress
+from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
@@ -40,7 +41,7 @@ from hvdc_ident.identifiability.practical import (
 )
 from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.structural import StructuralAnalysis, structural_analysis
-from hvdc_ident.identifiability.verdicts import COLLINEAR, WIDE, scale_of, unjudged_verdict, with_misfit_remark
+from hvdc_ident.identifiability.verdicts import WIDE, scale_of, unjudged_verdict, with_misfit_remark
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import LocalSensitivities, collinear_subsets, sensitivities
@@ -57,7 +58,7 @@ def identifiability(
     experiments: Iterable[Experiment],
     candidates: Iterable[FitParameter],
     *,
-    starts: int = 8,
+    starts: int | None = None,
     seed: int = 0,
     held: Mapping[str, float] | None = None,
     pair: tuple[str, str] | None = None,
@@ -185,6 +186,7 @@ def _assembled(
             "message": result.message,
             "search_doubt": result.search_doubt,
             "starts": len(result.starts),
+            "ends": [plain(s) for s in result.starts],
             "cost": first.cost,
             "chi2_per_dof": first.misfit,
             "effective_samples": dict(first.uncertainty.effective),
@@ -218,7 +220,7 @@ def _unjudged(
     halves = noise_half_widths(whole, [n for n in fitted if n not in weak], weak) if weak else {}
     for n, half in halves.items():
         scale = scale_of(assessment.free[n], verdicts[n].value)[0]
-        if half <= WIDE * scale and (verdicts[n].collinearity or 0.0) <= COLLINEAR:
+        if half <= WIDE * scale:
             verdicts[n] = with_misfit_remark(verdicts[n], ratio, half)
     return tuple(n for n in assessment.free if n in unjudged)
 

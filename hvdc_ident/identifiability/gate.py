@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from hvdc_ident.errors import require_known
-from hvdc_ident.fit import Estimate, FitResult, Problem
+from hvdc_ident.fit import Estimate, FitResult, Problem, StartOutcome
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -60,6 +60,16 @@ def gated(problem: Problem, selection: Gate) -> Problem:
         why=problem.why | {n: why for n, (_, why) in selection.held.items()},
         conditional_on=problem.conditional_on | selection.conditional_on,
     )
+
+
+def searched(report: Mapping[str, Any], names: Sequence[str]) -> tuple[StartOutcome, ...]:
+    """Return the outcomes of the report's search over these parameters, for a fit of them to take up; none where it made none.
+
+    Of a report by groups those of the group that has them.
+    """
+    pilots = report["pilot"].get("groups") or [report["pilot"]]
+    found = (p["ends"] for p in pilots if p.get("ends") and set(names) <= set(p.get("parameters", names)))
+    return tuple(StartOutcome.of(line) for line in next(found, ()))
 
 
 def gated_fit(

@@ -18,7 +18,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
-from hvdc_ident.fit.objective import DescentResult, LeastSquares, bounded_step, descend
+from hvdc_ident.fit.descent import DescentResult, bounded_step, descend
 from hvdc_ident.fit.profile import PairProfile, Profile, profile_pair
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
@@ -94,7 +94,7 @@ def rise_at_ends(optimum: LocalAnalysis, i: int, ends: tuple[float, float]) -> f
         theta = optimum.theta.copy()
         theta[i] = end
         try:
-            rises.append(descend(LeastSquares.of(optimum.problem), theta, fixed, enough=1e-3).at.cost - optimum.cost)
+            rises.append(descend(optimum.problem, theta, fixed, enough=1e-3).at.cost - optimum.cost)
         except SimulationError:
             return None
     return max(*rises, 0.0)
@@ -171,7 +171,7 @@ def bootstrap_rise(optimum: LocalAnalysis, name: str, value: float, seed: int = 
     i = problem.names.index(name)
     begin = (optimum.theta if near is None else near).copy()
     begin[i] = value
-    truth = descend(LeastSquares.of(problem), begin, np.arange(begin.size) == i, enough=1e-3).theta
+    truth = descend(problem, begin, np.arange(begin.size) == i, enough=1e-3).theta
     columns = problem.residual(truth)[1] * space.slope(truth)
     matrix = columns.T @ columns
     low, high = (side - space.scaled(truth) for side in space.bounds)
@@ -183,8 +183,8 @@ def bootstrap_rise(optimum: LocalAnalysis, name: str, value: float, seed: int = 
     rises = []
     for z in np.random.default_rng(seed).standard_normal((DRAWS, truth.size)):
         g = root @ z
-        best = bounded_step(g, matrix, 0.0, low, high)
-        at = bounded_step(g, matrix, 0.0, low_fixed, high_fixed)
+        best = bounded_step(g, matrix, low, high)
+        at = bounded_step(g, matrix, low_fixed, high_fixed)
         outside = best[i] < 0 if above else best[i] > 0
         rises.append(_cost(g, matrix, at) - _cost(g, matrix, best) if outside else 0.0)
     return float(np.quantile(rises, 0.95))
@@ -210,7 +210,7 @@ def pair_of(
         centre = optimum.value(n)
         grids.append(np.linspace(max(u.min, centre - 2 * half), min(u.max, centre + 2 * half), points))
     limit = max(thresholds(optimum)[n] for n in names)
-    pair = profile_pair(LeastSquares.of(optimum.problem), optimum.theta, names, *grids, enough=1e-3 * limit)
+    pair = profile_pair(optimum.problem, optimum.theta, names, *grids, enough=1e-3 * limit)
     return replace(pair, rises=pair.rises / limit)
 
 
@@ -231,7 +231,7 @@ def other_optima(
     with their costs. The search starts from those, and from the best with two parameters of one unit exchanged, the most
     alike in their effect first, or with a sign turned: that is where the usual second solutions lie.
     """
-    objective, space = LeastSquares.of(best.problem), best.problem.coordinates
+    space = best.problem.coordinates
     limit = max(limits.values())
 
     def same_basin(theta: Array) -> bool:
@@ -248,9 +248,7 @@ def other_optima(
     reached = [space.scaled(best.theta)]
     for theta in starts:
         try:
-            end = descend(
-                objective, theta, np.zeros(theta.size, dtype=bool), enough=1e-4 * limit, max_evaluations=EVALUATIONS
-            )
+            end = descend(best.problem, theta, enough=1e-4 * limit, max_evaluations=EVALUATIONS)
         except SimulationError:
             continue
         if end.at.cost - best.cost < limit and _new(space.scaled(end.theta), reached) and not same_basin(end.theta):

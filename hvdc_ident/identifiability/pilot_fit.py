@@ -7,7 +7,7 @@ values it bounds the standard deviations from below (Cramer and Rao).
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,12 +19,12 @@ from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
 from hvdc_ident.fit.adequacy import adequacy
-from hvdc_ident.fit.multistart import misfit_weights
+from hvdc_ident.fit.descent import descend
 from hvdc_ident.fit.noise_model import GIVEN, MISFIT, from_misfit
 from hvdc_ident.fit.nonsmooth import Trend
-from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.residual import ResidualBlock
-from hvdc_ident.fit.result import FitResult
+from hvdc_ident.fit.result import FitResult, StartOutcome
+from hvdc_ident.fit.search import misfit_weights
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
 from hvdc_ident.identifiability.structural import combinations_of, parameter_directions, scaled_slope
@@ -133,7 +133,7 @@ class LocalAnalysis:
 
         def moved(to: Mapping[str, float]) -> LocalAnalysis:
             reduced = replace(self.problem, free=remaining, held=self.problem.held | to, why=self.problem.why | why)
-            end = descend(LeastSquares.of(reduced), theta, np.zeros(theta.size, dtype=bool), enough=1e-6)
+            end = descend(reduced, theta, enough=1e-6)
             return LocalAnalysis(reduced, end.theta)
 
         try:
@@ -145,16 +145,17 @@ class LocalAnalysis:
 def pilot_fit(
     problem: Problem,
     *,
-    starts: int = 8,
+    starts: int | None = None,
     seed: int = 0,
+    begun: Sequence[StartOutcome] = (),
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> tuple[LocalAnalysis, FitResult]:
     """Return the best optimum of a multistart over the whole set of unknowns, with the weights of the misfit where needed.
 
-    Raises SimulationError, with the experiment's name, where no start could be simulated.
+    starts, seed, begun: as in `fit`. Raises SimulationError, with the experiment's name, where no start could be simulated.
     """
-    result = fit(problem, starts=starts, seed=seed, executor=executor, progress=progress, assess=False)
+    result = fit(problem, starts=starts, seed=seed, executor=executor, progress=progress, assess=False, begun=begun)
     if result.status == "failed":
         raise _failure(problem, result.message)
     weights = {

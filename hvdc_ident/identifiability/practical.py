@@ -16,7 +16,6 @@ import numpy as np
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.nonsmooth import LUCK, roughness, trend_of
-from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import Profile, profiles, trend_profiles
 from hvdc_ident.fit.profile_path import ProfileOptions
 from hvdc_ident.identifiability.likelihood_intervals import (
@@ -260,7 +259,7 @@ def _profiles(
     )
     walked = partial(
         profiles,
-        LeastSquares.of(problem),
+        problem,
         physical=physical,
         options=options,
         executor=executor,

@@ -30,7 +30,8 @@ WIDE = 0.5
 WIDER = 1.5
 """A bootstrap's interval that is so many times wider than the profile's is worth a remark."""
 COLLINEAR = 20.0
-"""A standard deviation that the other parameters make so many times larger makes it weak; half of that is worded."""
+"""A standard deviation that the others make so many times larger is worded, and so is half of that: a parameter that is known well all the
+same is not weak."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,8 +185,8 @@ def closed_verdict(
     judged = Verdict(profile.name, "weak", "", profile.value, unit, (low, high), profile=profile)
     judged = replace(judged, collinearity=collinearity, partner=partner)
     span = f"{_digits(low, half)} … {_digits(high, half)} {unit}".rstrip()
-    if share > WIDE or collinearity > COLLINEAR:
-        text = _where(profile, span, share)
+    if share > WIDE:
+        text = _where(profile, span)
         ends = (profile.lower.crossing, profile.upper.crossing)
         if ends == (None, None):
             pass  # the width of the bounds is no result
@@ -194,20 +195,22 @@ def closed_verdict(
         else:
             text += ", wider than its value; it has no bounds, and its card no typical size, to compare that with"
         if collinearity > COLLINEAR:
-            text += f", {'but' if share <= WIDE else 'and'} {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
+            text += f", and {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
         return replace(judged, reason=f"{text}.")
     text = f"It is known to ±{100 * share:.2g} % {of} (95 %: {span}), mostly from {best}"
-    if collinearity > 0.5 * COLLINEAR:
+    if collinearity > COLLINEAR:
+        text += f", though {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
+    elif collinearity > 0.5 * COLLINEAR:
         text += f", though {partner} acts much alike (collinearity {collinearity:.3g})"
     relative = std / abs(profile.value) if profile.value else None
     return replace(judged, verdict="identifiable", reason=f"{text}.", std=std, relative_std=relative)
 
 
-def _where(profile: Profile, span: str, share: float) -> str:
+def _where(profile: Profile, span: str) -> str:
     """Return the words for the profile of a weak parameter; an end that is only the parameter's own bound is no finding of the data."""
     low, high = profile.lower.crossing, profile.upper.crossing
     if low is not None and high is not None:
-        return f"It is known {'only ' if share > WIDE else ''}to lie in {span}"
+        return f"It is known only to lie in {span}"
     if low is not None or high is not None:
         return f"It is known only to lie in {span}, where the {'upper' if high is None else 'lower'} end is its physical bound"
     return f"These data do not narrow its physical bounds, {span}"

@@ -60,12 +60,10 @@ def check_questions(study: Study, where: str) -> None:
         )
     if s.fit:
         from hvdc_ident.fit.likelihood import LOSSES
-        from hvdc_ident.fit.optimisers import catalogue, need
+        from hvdc_ident.fit.optimisers import catalogue
         from hvdc_ident.fit.windowed_errors import tolerance
 
         require_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
-        with located(where):
-            need(s.fit.optimiser)
         require_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
         with located(f"{where}, fit.tolerance"):
             tolerance(s.fit.tolerance, study.path.parent)
@@ -232,7 +230,7 @@ def _no_start(study: Study, experiment: Experiment, values: Mapping[str, float])
 
 def _starts_elsewhere(study: Study, experiment: Experiment) -> bool:
     """Return whether an experiment can begin at one of the points from which a multistart searches the candidates' ranges."""
-    from hvdc_ident.fit.multistart import STARTS, starting_points
+    from hvdc_ident.fit.search import STARTS, starting_points
 
     candidates = tuple(study.candidates.values())
     points = starting_points(candidates, (), STARTS - 1, seed=0)
@@ -337,8 +335,8 @@ def best_cost_is_told(data: Mapping[str, Any]) -> Iterator[str]:
     cost = data.get("cost")
     if data.get("status") not in FINISHED or cost is None or not costs:
         return
-    from hvdc_ident.fit.multistart import DISTINCT, TIE
     from hvdc_ident.fit.nonsmooth import LUCK
+    from hvdc_ident.fit.search import DISTINCT, TIE
 
     rows = sum(t["n"] for line in (data.get("residual_tests") or {}).values() for t in line.values())
     effective = sum((data.get("effective_samples") or {}).values())

@@ -358,7 +358,7 @@ outputs = ["Irorder1"]
 # The stages. A stage runs if its table is in this file.
 [fit]
 starts = 4                        # runs of the optimiser, from start values spread over the bounds
-# optimiser = "trust-region"      # or least-squares, l-bfgs-b, nelder-mead, differential-evolution, dual-annealing, ...
+# optimiser = "trust-region"      # or least-squares, l-bfgs-b
 # loss = "huber"                  # reduces the weight of outliers; whiten = true for correlated noise
 """
 

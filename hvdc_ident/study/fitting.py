@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy as sp
 
 from hvdc_ident.files import csv_columns
-from hvdc_ident.fit import FitResult, Group, Problem, fit, fit_each, fit_individually
+from hvdc_ident.fit import FitResult, Group, Problem, StartOutcome, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
 from hvdc_ident.fit.frequency_data import with_responses
 from hvdc_ident.fit.likelihood import loss
@@ -18,6 +19,7 @@ from hvdc_ident.fit.partial_fits import part_of
 from hvdc_ident.fit.residual import compared_rows
 from hvdc_ident.fit.windowed_errors import tolerance, windowed_errors
 from hvdc_ident.identifiability import gated_fit
+from hvdc_ident.identifiability.gate import searched
 from hvdc_ident.model import Model
 from hvdc_ident.study.checks import need_candidates, need_experiments, need_start
 from hvdc_ident.study.schema import FitTable
@@ -86,15 +88,25 @@ def estimated(
     """Return the fit of the candidates that a report, as its `to_dict`, calls identifiable, and of those that are forced."""
 
     def fit_of(open_set: Problem) -> FitResult:
-        return fitted(study, with_settings(study, open_set), seed=seed, executor=executor, progress=progress)
+        settled = with_settings(study, open_set)
+        return fitted(study, settled, partial(searched, report), seed=seed, executor=executor, progress=progress)
 
     return gated_fit(problem_of(study), report, fit_of, force=force, whole=as_reported(study))
 
 
 def fitted(
-    study: Study, problem: Problem, *, seed: int, executor: Executor | None, progress: Progress | None
+    study: Study,
+    problem: Problem,
+    begun: Callable[[Sequence[str]], Sequence[StartOutcome]],
+    *,
+    seed: int,
+    executor: Executor | None,
+    progress: Progress | None,
 ) -> FitResult:
-    """The fit the study asks for, with the statistics over its experiments one by one."""
+    """The fit the study asks for, with the statistics over its experiments one by one.
+
+    begun: from names of parameters the search over them that is taken up.
+    """
     asked = asked_of(study)
     common: dict[str, Any] = {
         "starts": asked.starts,
@@ -106,7 +118,10 @@ def fitted(
     }
     individual = asked.mode == "individual"
     groups = groups_of(study, problem) if individual else []
-    result = fit_individually(problem, groups, **common) if individual else fit(problem, **common)
+    if individual:
+        result = fit_individually(problem, groups, **common, begun=begun)
+    else:
+        result = fit(problem, **common, begun=begun([f.name for f in problem.free]))
     if result.status == "failed" or len(problem.fitted_experiments) < 2:
         return result
     return replace(result, per_experiment=_one_by_one(problem, groups, result, asked.whiten, executor, progress))

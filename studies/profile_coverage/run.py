@@ -19,7 +19,6 @@ from scipy.stats import binom
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment, trajectory
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.objective import LeastSquares
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.identifiability.likelihood_intervals import thresholds
 from hvdc_ident.identifiability.pilot_fit import pilot_fit
@@ -45,7 +44,7 @@ def one(seed: int) -> dict[str, tuple[float, float, float]]:
     noisy = clean + NOISE * np.random.default_rng(seed).standard_normal(clean.size)
     data = asked.with_(measured=trajectory(TIME, {"Irorder1": noisy}), noise={"Irorder1": NOISE})
     optimum, _ = pilot_fit(Problem(simulator, (data,), FREE), starts=1)
-    found = profiles(LeastSquares.of(optimum.problem), optimum.theta, threshold=thresholds(optimum))
+    found = profiles(optimum.problem, optimum.theta, threshold=thresholds(optimum))
     ends = {}
     for n, p in found.by_name.items():
         low, high = p.ci95

@@ -11,7 +11,9 @@ from scipy.integrate import solve_ivp
 
 import hvdc_ident as hi
 from hvdc_ident.errors import SimulationError, SteadyStateError, TimingError
+from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.model import parse_card
+from hvdc_ident.simulate import ModelSimulator
 
 LATE = """
 schema = 1
@@ -128,10 +130,10 @@ def test_a_first_start_without_a_steady_state_is_one_failed_start(tmp_path, caps
     outcome = CliRunner().invoke(app, ["run", str(tank(tmp_path)), "--quiet"])
     assert outcome.exit_code == 1, outcome.output  # the given values cannot be simulated, and the rest is done
     results = tmp_path / "study-results"
-    fit = json.loads((results / "fit.json").read_text(encoding="utf-8"))
-    assert fit["starts"][0]["status"] == "failed" and "no steady state" in fit["starts"][0]["message"]
+    fitted = json.loads((results / "fit.json").read_text(encoding="utf-8"))
+    assert fitted["starts"][0]["status"] == "failed" and "no steady state" in fitted["starts"][0]["message"]
     for name, true in (("k", 0.9), ("area", 0.7)):
-        low, high = fit["estimates"][name]["ci95"]
+        low, high = fitted["estimates"][name]["ci95"]
         assert low - 0.3 * (high - low) < true < high + 0.3 * (high - low)
     simulated = json.loads((results / "simulation.json").read_text(encoding="utf-8"))
     assert "at the given values no steady state" in simulated["experiments"]["more"]["reason"]
@@ -151,7 +153,7 @@ def wave_record() -> hi.Experiment:
 
 def test_an_optimum_that_one_start_alone_reached_is_told_with_doubt():
     """The cost over a frequency has an optimum in every band of 1/3 Hz: of eight starts the nearest alone finds the lowest."""
-    found = hi.fit(parse_card(WAVE), wave_record(), ["f", "a"])
+    found = hi.fit(parse_card(WAVE), wave_record(), ["f", "a"], starts=8)
     assert found.estimates["f"].value == pytest.approx(7.0, abs=0.01)
     costs = sorted(s.cost for s in found.starts)
     assert costs[1] > 10.0 * costs[0]  # the others did end elsewhere
@@ -161,6 +163,35 @@ def test_an_optimum_that_one_start_alone_reached_is_told_with_doubt():
     )
 
 
+def test_where_one_start_alone_reached_the_lowest_cost_more_follow_by_themselves():
+    problem = wave_problem()
+    found = fit(problem, assess=False)
+    assert found.search_doubt == "" and found.values["f"] == pytest.approx(7.0, abs=0.01)
+    lowest = min(s.cost for s in found.starts)
+    assert sum(s.cost < 1.01 * lowest for s in found.starts) > 1
+    eight = fit(problem, starts=8, assess=False)
+    assert [s.start for s in found.starts[:8]] == [s.start for s in eight.starts]  # the others come on top
+    assert len(eight.starts) == 8 < len(found.starts) <= 64
+
+
+def test_a_search_is_taken_up_from_where_its_runs_ended():
+    problem = wave_problem()
+    first = fit(problem, starts=8, assess=False)
+    again = fit(problem, starts=8, assess=False, begun=first.starts)
+    assert [s.start for s in again.starts] == [s.start for s in first.starts]
+    assert again.cost == pytest.approx(first.cost, rel=1e-9) and again.search_doubt == first.search_doubt
+    spent, before = (sum(s.evaluations for s in r.starts) for r in (again, first))
+    assert spent - before < 0.2 * before
+
+
+def test_identify_and_fit_of_one_run_stand_at_one_optimum():
+    names = ["f", "a"]
+    report = hi.identify(parse_card(WAVE), wave_record(), names)
+    found = hi.fit(parse_card(WAVE), wave_record(), names, report=report)
+    assert found.values["f"] == pytest.approx(report.parameters["f"].value, rel=1e-6)
+    assert [dict(s.start) for s in found.starts] == [line["start"] for line in report.pilot["ends"]]
+
+
 def test_starts_that_agree_leave_no_doubt():
     near = hi.fit(parse_card(WAVE), wave_record(), {"f": (6.9, 7.1), "a": (0.2, 3.0)})
     assert near.search_doubt == ""
@@ -168,14 +199,16 @@ def test_starts_that_agree_leave_no_doubt():
     assert alone.search_doubt == ""  # one start was asked for
 
 
+def wave_problem() -> Problem:
+    free = (FitParameter("f", 7.1, 1.0, 60.0), FitParameter("a", 1.0, 0.2, 3.0))
+    return Problem(ModelSimulator(parse_card(WAVE)), (wave_record(),), free)
+
+
 def test_starts_along_a_valley_agree():
     """Only f*g enters: the starts end at other places with the same cost."""
     card = WAVE.replace("a*sin(2*pi*f*time)", "a*sin(2*pi*f*g*time)").replace(
         "[states]", "g = {value = 1.0, min = 0.99, max = 1.01}\n[states]"
     )
-    from hvdc_ident.fit import FitParameter, Problem, fit
-    from hvdc_ident.simulate import ModelSimulator
-
     model = parse_card(card)
     free = [FitParameter("f", 7.0, 6.95, 7.05), FitParameter("g", 1.0, 0.99, 1.01)]
     found = fit(Problem(ModelSimulator(model), (wave_record(),), tuple(free)), starts=5, assess=False)

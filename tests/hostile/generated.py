@@ -216,7 +216,7 @@ def _settings(draw: Draw, drawn: Plant, names: Sequence[str]) -> list[str]:
             "whiten = true",
             'loss = "huber"',
             'residual = "frequency"',
-            'optimiser = "nelder-mead"',
+            'optimiser = "least-squares"',
             'mode = "individual"\ngroups = [' + ", ".join(f'{{parameters = ["{n}"]}}' for n in names) + "]",
         ]
     )

@@ -12,7 +12,7 @@ from scipy.stats import binom
 from hvdc_ident.errors import StudyError
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.bootstrap import bootstrap, cluster_sandwich
-from hvdc_ident.fit.objective import LeastSquares
+from hvdc_ident.fit.descent import LeastSquares
 from hvdc_ident.fit.profile import JOINT, profile_pair, profiles
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.likelihood_intervals import bootstrap_rise, thresholds
@@ -97,7 +97,7 @@ def coverage(rho: float, given: bool, runs: int) -> dict[str, int]:
         y = decay(T, truth)[0] + coloured(np.random.default_rng(seed), T.size, rho, 0.15)
         data = recorded("e", T, {"y": 0.15} if given else {}, y=y)
         optimum, _ = pilot_fit(Problem(plant, (data,), free), starts=1)
-        found = profiles(LeastSquares.of(optimum.problem), optimum.theta, threshold=thresholds(optimum))
+        found = profiles(optimum.problem, optimum.theta, threshold=thresholds(optimum))
         for n, v in truth.items():
             low, high = found.by_name[n].ci95
             assert low is not None and high is not None

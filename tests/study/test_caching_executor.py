@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.fit import FitParameter
-from hvdc_ident.fit.objective import LeastSquares
+from hvdc_ident.fit.descent import LeastSquares
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.immutable import FrozenMap

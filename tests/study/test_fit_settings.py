@@ -151,7 +151,7 @@ def test_a_frequency_residual_and_a_named_optimiser(folder):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (("[fit]", '[fit]\noptimiser = "nelder-maed"'), r"fit.optimiser: no optimiser.*did you mean 'nelder-mead'"),
+        (("[fit]", '[fit]\noptimiser = "least-squarse"'), r"fit.optimiser: no optimiser.*did you mean 'least-squares'"),
         (("[fit]", '[fit]\nloss = "hubr"'), r"fit.loss: no loss.*did you mean 'huber'"),
         (("[fit]", '[fit]\nwhiten = "yes"'), r"fit.whiten.*'pre-event'"),
         (("[fit]", "[fit]\nband = [0, 10]"), 'band belongs to residual "frequency"'),

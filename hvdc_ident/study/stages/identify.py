@@ -24,12 +24,13 @@ SOON = 60.0
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return a verdict on each candidate with its evidence, the set a fit may use, and what to measure next."""
+    from hvdc_ident.fit.search import STARTS
     from hvdc_ident.study.fitting import need
     from hvdc_ident.study.pipeline import executor_of
     from hvdc_ident.study.study import candidate_lines
 
     need(study, "identify")
-    _first_answer(study, options, _starts(study))
+    _first_answer(study, options, _starts(study) or STARTS)
     with executor_of(study, options, "identify") as executor:
         report = judged(study, seed=options.seed, executor=executor, progress=options.progress)
     return StageResult({**report.to_dict(), "candidates": candidate_lines(study)})
@@ -57,9 +58,10 @@ def judged(
     return identifiability_by_group(*asked, groups, **common) if groups else identifiability(*asked, **common)
 
 
-def _starts(study: Study) -> int:
-    """Return the number of starts of the pilot fit."""
-    return max((study.settings.fit and study.settings.fit.starts) or 8, FEWEST_STARTS)
+def _starts(study: Study) -> int | None:
+    """Return the number of starts of the search; None: as many as it takes."""
+    asked = study.settings.fit.starts if study.settings.fit else None
+    return None if asked is None else max(asked, FEWEST_STARTS)
 
 
 def _first_answer(study: Study, options: StageOptions, starts: int) -> None:

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 from common import paper
+from scipy.optimize import minimize
 
-from hvdc_ident.data import Experiment
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import Problem
-from hvdc_ident.fit.optimisers.nelder_mead import NelderMead
 from hvdc_ident.models import load_model, vsc_hvdc_avm
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.examples import Campaign, experiments
@@ -96,19 +96,37 @@ def estimates(cause: Cause, count: int = RUNS, executor: Any = None) -> dict[str
 def _stopped(recorded: Sequence[Experiment], evaluations: int) -> dict[str, dict[str, list[float]]]:
     """Return the estimates of a simplex from Table II's starts, stopped after that many evaluations."""
     found: dict[str, dict[str, list[float]]] = {m: {n: [] for n in paper.GAINS} for m in paper.MODES.values()}
-    method = NelderMead(max_evaluations=evaluations)
     for kind, c in paper.CONTROLLERS.items():
         for e in paper.of(kind, recorded):
             problem = Problem(paper.link(), (e,), paper.free(c.gains))
-            for n, v in zip(c.gains, method.run(problem, problem.start).theta, strict=True):
+            for n, v in zip(c.gains, _simplex(problem, evaluations), strict=True):
                 found["individual"][n].append(float(v))
     for numbers in zip(
         *([e for e in recorded if c.setpoint in e.inputs] for c in paper.CONTROLLERS.values()), strict=True
     ):
         problem = Problem(paper.link(), tuple(numbers), paper.free(paper.GAINS))
-        for n, v in zip(paper.GAINS, method.run(problem, problem.start).theta, strict=True):
+        for n, v in zip(paper.GAINS, _simplex(problem, evaluations), strict=True):
             found["simultaneous"][n].append(float(v))
     return found
+
+
+def _simplex(problem: Problem, evaluations: int) -> Array:
+    """Return where Nelder and Mead's simplex, a tenth of the bounds' range wide at first, stands after so many evaluations."""
+    low, span = np.array([u.min for u in problem.unknowns]), np.array([u.span for u in problem.unknowns])
+    first = (problem.start - low) / span
+    steps = np.diag(np.where(first + 0.1 <= 1.0, 0.1, -0.1))
+    end = minimize(
+        lambda shares: problem.cost(low + shares * span),
+        first,
+        method="Nelder-Mead",
+        bounds=[(0.0, 1.0)] * first.size,
+        options={
+            "initial_simplex": np.vstack([first, first + steps]),
+            "maxfev": evaluations,
+            "adaptive": first.size > 2,
+        },
+    )
+    return np.asarray(low + end.x * span)
 
 
 def judged(cause: Cause, count: int = RUNS, executor: Any = None) -> dict[str, Any]:

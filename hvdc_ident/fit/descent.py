@@ -1,0 +1,318 @@
+"""Bounded Levenberg-Marquardt on exact sensitivities: the descent that fits, profiles, refits and bootstraps share.
+
+A step minimises |r + J p|^2 + lambda |D p|^2 in scaled coordinates with D the largest column norms so far (Moré 1978), with
+bounds met by an active set; lambda follows the ratio of actual to predicted reduction as in Nielsen (1999), "Damping parameter
+in Marquardt's method". A step is no longer than the coordinate, or 1, at first, and twice as long after each that kept half its
+promise: without bounds a full first step may land where no output answers any more. A simulation that fails shrinks the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.data import Array
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
+from hvdc_ident.sensitivity import normalised
+
+LEAST_DAMPING = 1e-14
+"""Damping of a Gauss-Newton step: its root is the share of a column that is the sensitivities' own error, so that directions
+without information do not move a step."""
+FIRST_DAMPING = 1e-3
+"""Damping with which a run from afar begins, and another after its first Gauss-Newton step that was none."""
+AS_PROMISED = 0.1
+"""A reduction within this share of the promised one shows no error of the simulation."""
+SMALLEST = 1e-10
+"""A scaled coordinate below this counts as this large where its step is judged: an optimum may lie at 0."""
+
+
+class Residuals(Protocol):
+    """A sum of squares to be minimised; a fit's `Problem` is one."""
+
+    @property
+    def unknowns(self) -> tuple[FitParameter, ...]:
+        """Unknowns with their bounds."""
+
+    def residual(self, theta: Array) -> tuple[Array, Array]:
+        """Return r, (n,), and dr/dtheta, (n, p), at theta, (p,). Raises SimulationError where theta is inadmissible."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """A sum of squares given by a function: theta to r, (n,), and dr/dtheta, (n, p)."""
+
+    unknowns: tuple[FitParameter, ...]
+    residual: Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluated:
+    """Half a sum of squares with its (p,) gradient and its (p, p) Gauss-Newton curvature, per unit of the unknowns."""
+
+    cost: float
+    gradient: Array
+    curvature: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """The residuals at a point, linear about it. theta: (p,), each unknown in its unit; x: the same in scaled coordinates.
+
+    r: (n,). jacobian: (n, p) per scaled coordinate; slope: (p,) dtheta/dx.
+    """
+
+    theta: Array
+    x: Array
+    r: Array
+    jacobian: Array
+    slope: Array
+
+    @classmethod
+    def at(cls, objective: Residuals, space: Coordinates, x: Array) -> Linearised:
+        """Return the residuals at scaled coordinates x, (p,). Raises SimulationError where they are inadmissible."""
+        theta = space.unscaled(x)
+        r, jacobian = objective.residual(theta)
+        slope = space.slope(theta)
+        return cls(theta, space.scaled(theta), r, jacobian * slope, slope)
+
+    @cached_property
+    def cost(self) -> float:
+        """Half the sum of squares."""
+        return 0.5 * float(self.r @ self.r)
+
+    @cached_property
+    def norms(self) -> Array:
+        """Length of each column, (p,), 1 for a column of zeros."""
+        norms = np.linalg.norm(self.jacobian, axis=0)
+        return np.where(norms > 0, norms, 1.0)
+
+    @cached_property
+    def gradient(self) -> Array:
+        """Gradient of the cost by scaled coordinates, (p,)."""
+        return np.asarray(self.jacobian.T @ self.r)
+
+    @cached_property
+    def _factors(self) -> tuple[Array, Array]:
+        """Triangle R of the jacobian, (k, p), and Q'r, (k,)."""
+        q, triangle = np.linalg.qr(self.jacobian)
+        return triangle, q.T @ self.r
+
+    def step(self, damping: float, size: Array, low: Array, high: Array) -> Array:
+        """Return the p in [low, high] that minimises |r + J p|^2 + damping |size p|^2, (p,)."""
+        triangle, target = self._factors
+        matrix = np.vstack([triangle, np.sqrt(damping) * np.diag(size)])
+        right = np.concatenate([-target, np.zeros(size.size)])
+
+        def solve(free: NDArray[np.bool_], p: Array) -> Array:
+            return np.asarray(np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ p[~free], rcond=None)[0])
+
+        g = self.gradient
+        blocked = ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))
+        return active_set(solve, ~blocked, low, high)
+
+    def predicted(self, p: Array) -> float:
+        """Return the reduction of the cost that the linear residuals promise for the step p, (p,)."""
+        along = self._factors[0] @ p
+        return -float(self.gradient @ p + 0.5 * along @ along)
+
+    def evaluated(self) -> Evaluated:
+        """Return cost, gradient and curvature per unit of the unknowns."""
+        inverse = 1.0 / self.slope
+        triangle = self._factors[0] * inverse
+        return Evaluated(self.cost, self.gradient * inverse, triangle.T @ triangle)
+
+
+DescentEnd = Literal["inadmissible", "flat", "stationary", "settled", "enough", "standstill", "spent"]
+
+
+@dataclass(frozen=True)
+class DescentOptions:
+    """Options of a descent; tolerances are relative and without unit, but for `enough`.
+
+    max_evaluations: simulations of the whole set a descent may take. gradient: largest cosine between the residual and a free
+    column at which a point counts as stationary. reduction: smallest relative reduction of the cost worth a step; where the cost
+    still falls just as promised, so that no error of the simulation is in sight, a thousandth of it is. step: smallest step, as a
+    share of each scaled coordinate. damping: first lambda. enough: a predicted fall of the cost not worth a step.
+    """
+
+    max_evaluations: int = 200
+    gradient: float = 1e-10
+    reduction: float = 1e-13
+    step: float = 1e-11
+    damping: float = FIRST_DAMPING
+    enough: float = 0.0
+
+
+@dataclass
+class Descent:
+    """A descent: the best point so far (None before the first), the evaluations used, and the last one's error if it failed.
+
+    fixed: (p,) unknowns that stay where they begin.
+    """
+
+    objective: Residuals
+    options: DescentOptions
+    fixed: NDArray[np.bool_] | None = None
+    evaluations: int = 0
+    failure: SimulationError | None = None
+    at: Linearised | None = None
+    space: Coordinates = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.space = Coordinates(self.objective.unknowns)
+        held = np.zeros(len(self.objective.unknowns), dtype=bool) if self.fixed is None else self.fixed
+        low, high = self.space.bounds
+        self._held, self._low, self._high = held, low, high
+
+    def room(self) -> tuple[Array, Array]:
+        """Return how far the unknowns may move from the best point, down and up, in scaled coordinates, (p,) each."""
+        assert self.at is not None
+        x = self.at.x
+        return np.where(self._held, 0.0, self._low - x), np.where(self._held, 0.0, self._high - x)
+
+    def go(self, start: Array) -> DescentEnd:
+        """Go down from start, (p,), and return why it ended.
+
+        inadmissible: the start cannot be simulated; flat: no output answers to any unknown there; stationary: the gradient is
+        zero; settled: the cost does not fall any more; enough: no fall worth a step is left; standstill: no step lowers the
+        cost although one should; spent: the evaluations are used up.
+        """
+        theta = np.asarray(start, dtype=float)
+        x = self.space.scaled(theta)
+        if not self._moved(np.where(self._held, x, np.clip(x, self._low, self._high)), np.inf):
+            return "inadmissible"
+        assert self.at is not None
+        size, damping, growth, reach = self.at.norms, self.options.damping, 2.0, 1.0
+        while self.evaluations < self.options.max_evaluations:
+            here = self.at
+            if not here.jacobian[:, ~self._held].any():
+                return "flat"
+            low, high = self.room()
+            if self._stationary(here, low, high):
+                return "stationary"
+            size = np.maximum(size, here.norms)
+            with np.errstate(over="ignore"):  # beyond the largest number a step has no limit
+                far = reach * np.where(self.space.log, 1.0, np.maximum(np.abs(here.x), 1.0))
+            p = here.step(damping, size, np.maximum(low, -far), np.minimum(high, far))
+            predicted = here.predicted(p)
+            if predicted <= self.options.enough > 0.0:
+                return "enough"
+            small = bool((np.abs(p) <= self.options.step * np.maximum(np.abs(here.x), SMALLEST)).all())
+            if small:
+                return "standstill"
+            if predicted > 0:
+                if self._moved(here.x + p, here.cost):
+                    fall = here.cost - self.at.cost
+                    ratio = fall / predicted
+                    damping, growth = max(damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), LEAST_DAMPING), 2.0
+                    reach *= 2.0 if ratio > 0.5 else 1.0
+                    least = self.options.reduction * (1e-3 if abs(ratio - 1.0) < AS_PROMISED else 1.0)
+                    if max(fall, predicted) <= least * here.cost:
+                        return "settled"
+                    continue
+                if not self.failure and predicted <= self.options.reduction * here.cost:
+                    return "standstill"
+            damping = FIRST_DAMPING if damping <= LEAST_DAMPING else damping * growth
+            growth = min(2.0 * growth, 1e6)
+        return "spent"
+
+    def _moved(self, x: Array, below: float) -> bool:
+        """Return whether the simulation at x succeeds at a cost below the given one; only then x becomes the best point."""
+        self.evaluations += 1
+        try:
+            there = Linearised.at(self.objective, self.space, x)
+        except SimulationError as error:
+            self.failure = error
+            return False
+        self.failure = None
+        if not there.cost < below:
+            return False
+        self.at = there
+        return True
+
+    def _stationary(self, here: Linearised, low: Array, high: Array) -> bool:
+        g = np.where(((low >= 0) & (here.gradient > 0)) | ((high <= 0) & (here.gradient < 0)), 0.0, here.gradient)
+        return bool((np.abs(g) <= self.options.gradient * here.norms * np.linalg.norm(here.r)).all())
+
+
+@dataclass(frozen=True, eq=False)
+class DescentResult:
+    """End of a descent: theta, (p,), the objective evaluated there, and the number of evaluations used."""
+
+    theta: Array
+    at: Evaluated
+    evaluations: int
+
+
+def descend(
+    objective: Residuals,
+    theta: Array,
+    fixed: NDArray[np.bool_] | None = None,
+    *,
+    enough: float,
+    max_evaluations: int = 80,
+) -> DescentResult:
+    """Return the minimum near theta, (p,), over the unknowns that are not fixed, within their bounds.
+
+    For descents that begin near a minimum, as each of a profile's or bootstrap's hundreds does: by Gauss-Newton steps until a
+    predicted fall of the cost is less than `enough`. Raises SimulationError where theta is inadmissible.
+    """
+    down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough), fixed)
+    down.go(theta)
+    if down.at is None:
+        assert down.failure is not None
+        raise down.failure
+    return DescentResult(down.at.theta, down.at.evaluated(), down.evaluations)
+
+
+def predicted_reduction(objective: Residuals, theta: Array) -> float:
+    """Return the fall of the cost that a Gauss-Newton step within the bounds promises. Raises SimulationError."""
+    space = Coordinates(objective.unknowns)
+    here = Linearised.at(objective, space, space.scaled(theta))
+    low, high = space.bounds
+    return here.predicted(here.step(LEAST_DAMPING, here.norms, low - here.x, high - here.x))
+
+
+def bounded_step(g: Array, h: Array, low: Array, high: Array) -> Array:
+    """Return the p in [low, high] that minimises g'p + p'h p/2, (p,), for g, (p,), and h, (p, p); p is 0 where h is.
+
+    Least squares at each stage: directions whose curvature is rounding do not move it.
+    """
+    matrix, scale = normalised(h)
+    target = -g / scale
+
+    def solve(free: NDArray[np.bool_], p: Array) -> Array:
+        rhs = target[free] - matrix[np.ix_(free, ~free)] @ (p * scale)[~free]
+        return np.asarray(np.linalg.lstsq(matrix[np.ix_(free, free)], rhs, rcond=1e-12)[0]) / scale[free]
+
+    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))) & (np.diag(h) > 0)
+    return active_set(solve, free, low, high)
+
+
+def active_set(
+    solve: Callable[[NDArray[np.bool_], Array], Array], free: NDArray[np.bool_], low: Array, high: Array
+) -> Array:
+    """Return the step p in [low, high], (p,), whose free entries solve a quadratic problem.
+
+    solve: from the mask of the free entries and p, the minimum over the free ones with the others as they are in p.
+    free: (p,) at first; the others stay at 0. Entries that would leave are put on their bound one after the other, the first
+    to leave first.
+    """
+    p = np.zeros(low.size)
+    while free.any():
+        trial = p.copy()
+        trial[free] = solve(free, p)
+        outside = (trial < low) | (trial > high)
+        if not outside.any():
+            return trial
+        limit = np.where(trial < low, low, high)
+        share = np.where(outside, limit / np.where(outside, trial, 1.0), np.inf)
+        first = int(np.argmin(share))
+        p[first], free[first] = limit[first], False
+    return p
