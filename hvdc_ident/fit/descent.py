@@ -2,8 +2,9 @@
 
 A step minimises |r + J p|^2 + lambda |D p|^2 in scaled coordinates with D the largest column norms so far (Moré 1978), with
 bounds met by an active set; lambda follows the ratio of actual to predicted reduction as in Nielsen (1999), "Damping parameter
-in Marquardt's method". A step is no longer than the coordinate, or 1, at first, and twice as long after each that kept half its
-promise: without bounds a full first step may land where no output answers any more. A simulation that fails shrinks the step.
+in Marquardt's method". A step is no longer than 1 in a logarithm and than another coordinate itself, or 1, at first, and twice as
+long after each that kept half its promise: a full first step may land where no output answers any more. A simulation that fails
+shrinks the step.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ AS_PROMISED = 0.1
 """A reduction within this share of the promised one shows no error of the simulation."""
 SMALLEST = 1e-10
 """A scaled coordinate below this counts as this large where its step is judged: an optimum may lie at 0."""
+NEAR = 10.0
+"""Longest first step of a descent that begins near a minimum: no parabola holds over four decades of a logarithm."""
 
 
 class Residuals(Protocol):
@@ -138,7 +141,8 @@ class DescentOptions:
     max_evaluations: simulations of the whole set a descent may take. gradient: largest cosine between the residual and a free
     column at which a point counts as stationary. reduction: smallest relative reduction of the cost worth a step; where the cost
     still falls just as promised, so that no error of the simulation is in sight, a thousandth of it is. step: smallest step, as a
-    share of each scaled coordinate. damping: first lambda. enough: a predicted fall of the cost not worth a step.
+    share of each scaled coordinate. damping: first lambda. enough: a predicted fall of the cost not worth a step. reach: longest
+    first step, in logarithms and in shares of the other scaled coordinates.
     """
 
     max_evaluations: int = 200
@@ -147,6 +151,7 @@ class DescentOptions:
     step: float = 1e-11
     damping: float = FIRST_DAMPING
     enough: float = 0.0
+    reach: float = 1.0
 
 
 @dataclass
@@ -188,7 +193,7 @@ class Descent:
         if not self._moved(np.where(self._held, x, np.clip(x, self._low, self._high)), np.inf):
             return "inadmissible"
         assert self.at is not None
-        size, damping, growth, reach = self.at.norms, self.options.damping, 2.0, 1.0
+        size, damping, growth, reach = self.at.norms, self.options.damping, 2.0, self.options.reach
         while self.evaluations < self.options.max_evaluations:
             here = self.at
             if not here.jacobian[:, ~self._held].any():
@@ -201,7 +206,9 @@ class Descent:
                 far = reach * np.where(self.space.log, 1.0, np.maximum(np.abs(here.x), 1.0))
             p = here.step(damping, size, np.maximum(low, -far), np.minimum(high, far))
             predicted = here.predicted(p)
-            if predicted <= self.options.enough > 0.0:
+            enough = self.options.enough
+            # A short step promises little where the whole one promises much.
+            if predicted <= enough and here.predicted(here.step(damping, size, low, high)) <= enough > 0.0:
                 return "enough"
             small = bool((np.abs(p) <= self.options.step * np.maximum(np.abs(here.x), SMALLEST)).all())
             if small:
@@ -263,7 +270,7 @@ def descend(
     For descents that begin near a minimum, as each of a profile's or bootstrap's hundreds does: by Gauss-Newton steps until a
     predicted fall of the cost is less than `enough`. Raises SimulationError where theta is inadmissible.
     """
-    down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough), fixed)
+    down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough, reach=NEAR), fixed)
     down.go(theta)
     if down.at is None:
         assert down.failure is not None

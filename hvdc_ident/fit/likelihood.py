@@ -13,6 +13,7 @@ from functools import lru_cache
 
 import numpy as np
 from numba import njit
+from scipy import special
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import StudyError, require_known
@@ -67,14 +68,14 @@ LOSSES = {
         Loss(
             "huber",
             f"the square up to {HUBER:g} sigma, then a line",
-            lambda r: np.where(np.abs(r) <= HUBER, 0.5 * r**2, HUBER * (np.abs(r) - 0.5 * HUBER)),
+            lambda r: np.asarray(special.huber(HUBER, r)),
             lambda r: np.clip(r, -HUBER, HUBER),
             lambda r: (np.abs(r) <= HUBER).astype(float),
         ),
         Loss(
             "soft-l1",
             f"a smooth way from the square to a line about {SOFT:g} sigma",
-            lambda r: SOFT**2 * (np.sqrt(1.0 + (r / SOFT) ** 2) - 1.0),
+            lambda r: np.asarray(special.pseudo_huber(SOFT, r)),
             lambda r: r / np.sqrt(1.0 + (r / SOFT) ** 2),
             lambda r: (1.0 + (r / SOFT) ** 2) ** -1.5,
         ),

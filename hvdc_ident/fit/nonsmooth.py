@@ -90,9 +90,6 @@ def roughness(problem: Problem, theta: Array) -> float:
     """Return the random change of the cost between values of theta, (p,), within its interval.
 
     0 where sensitivities are exact, for such runs are smooth, and where a run fails beside theta, so that it is not known.
-    Residuals r that jump by n change the cost by sum r n + sum n^2/2, the first of mean 0 for noise in r. n is the remainder
-    of polynomials of degree 4 through eight more runs, as fourth differences give, but at uneven steps: jumps at even
-    distances would look smooth at even ones.
     """
     if not approximate(problem.simulator):
         return 0.0
@@ -104,7 +101,18 @@ def roughness(problem: Problem, theta: Array) -> float:
     room = np.maximum(high - x, x - low)
     # All together they go through the interval of each unknown to one side.
     step = np.minimum(np.where(length > 0, REACH / np.where(length > 0, length, 1.0), 0.0), room)
-    step = np.where(high - x >= x - low, step, -step)
+    return scatter_along(problem, theta, r, np.where(high - x >= x - low, step, -step))
+
+
+def scatter_along(problem: Problem, theta: Array, r: Array, step: Array) -> float:
+    """Return the random change of the cost between theta, (p,), and a step from there, (p,) in scaled coordinates.
+
+    r: (N,) the residuals at theta. 0 where a run fails, so that it is not known. Residuals that jump by n change the cost by
+    sum r n + sum n^2/2, the first of mean 0 for noise in r. n is the remainder of polynomials of degree 4 through eight more
+    runs, as fourth differences give, but at uneven steps: jumps at even distances would look smooth at even ones.
+    """
+    space = problem.coordinates
+    x = space.scaled(theta)
     try:
         runs = np.array([r, *(residual_at(problem, space.unscaled(x + s * step)) for s in 0.5 + 0.5 * UNEVEN[1:])])
     except SimulationError:

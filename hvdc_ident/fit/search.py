@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -39,7 +40,7 @@ SIMULATIONS = 10_000
 SAME = 0.1
 """A run whose cost is higher by less has reached the optimum: no estimate is off by half its standard deviation."""
 LONGER = 1000
-"""Evaluations more that the lowest run may take which used up its own."""
+"""Evaluations more that the lowest run may take where it used up its own."""
 DISTINCT = TWO_SIDED
 """Costs that differ by less are as good: half the 95 % quantile of chi-square with one degree of freedom."""
 TIE = 1e-6
@@ -110,8 +111,8 @@ def search(
     starts: how many; None: 8, and as many again, up to 64, as long as they leave a doubt: the lowest cost was reached once, or
     it is more than the known noise, and others ended higher. Further runs are made while all together have taken fewer
     simulations than `SIMULATIONS`. begun: the outcomes of a search for these unknowns, or more of them, that is to be taken up:
-    each of its ends is gone on from, in place of new starts. The lowest of the runs that used up their evaluations is
-    continued: along a narrow valley it takes more. An optimiser with options of its own keeps the evaluations it was given.
+    each of its ends is gone on from, in place of new starts. The lowest run is continued where it used up its evaluations: along
+    a narrow valley it takes more. An optimiser with options of its own keeps the evaluations it was given.
     """
     method = named(optimiser) if isinstance(optimiser, str) else optimiser or TrustRegion()
     if not isinstance(method, TrustRegion):
@@ -123,7 +124,7 @@ def search(
         count, most, number = starts or STARTS, starts or MOST_STARTS, 0
         while True:
             points = _round(problem, count - len(found.points), seed, number)
-            found = _joined(found, points, _runs(problem, method, points, count, found, executor, progress))
+            found = _joined(found, points, _runs(problem, method, points, count, len(found.runs), executor, progress))
             count, number = min(2 * count, most), number + 1
             if len(found.points) >= count or not _worth_more(problem, found):
                 break
@@ -140,15 +141,14 @@ def _round(problem: Problem, count: int, seed: int, number: int) -> list[Array]:
 
 def _runs(
     problem: Problem,
-    method: Optimiser,
-    points: Sequence[Array],
+    method: Optimiser | _GoOn,
+    points: Sequence[Any],
     count: int,
-    before: Search,
+    done: int,
     executor: Executor | None,
     progress: Progress | None,
 ) -> list[OptimiserResult]:
-    """Return the run from each point. count: of all starts so far planned. before: runs that were made, for the progress."""
-    done = len(before.runs)
+    """Return the run from each point. count: of all starts so far planned; done: those that were made before."""
     if progress:
         why = " (they disagree)" if done else ""
         progress(done, count, f"search for the optimum, start {done + 1} of {count}{why}")
@@ -201,39 +201,54 @@ def _taken_up(
         theta = (min(max(values.get(u.name, u.start), u.min), u.max) for u in problem.unknowns)
         return np.array([*theta], dtype=float)
 
-    ends = [None if o.cost is None else placed(o.end) for o in begun]
-    distinct_ends: list[Array] = []
+    lowest = min((o.cost for o in begun if o.cost is not None), default=np.inf)
+    places: list[Array] = []
     which: list[int | None] = []
-    for end in ends:
-        alike = (
-            None if end is None else next((k for k, d in enumerate(distinct_ends) if same_place(problem, d, end)), None)
-        )
-        if end is not None and alike is None:
-            alike = len(distinct_ends)
-            distinct_ends.append(end)
-        which.append(alike)
-    runs = _runs(problem, method, distinct_ends, len(distinct_ends), Search((), ()), executor, progress)
+    stay: list[bool] = []  # those that used up their evaluations, but for the lowest: nothing more is expected of them
+    for o in begun:
+        end = placed(o.end)
+        alike = next((k for k, known in enumerate(places) if same_place(problem, known, end)), len(places))
+        if o.cost is not None and alike == len(places):
+            places.append(end)
+            stay.append(o.status == "max-evaluations" and o.cost > lowest)
+        which.append(None if o.cost is None else alike)
+    runs = _runs(problem, _GoOn(method), list(zip(places, stay, strict=True)), len(places), 0, executor, progress)
     points, results = [], []
-    for outcome, k in zip(begun, which, strict=True):
-        points.append(placed(outcome.start))
+    for number, (o, k) in enumerate(zip(begun, which, strict=True)):
+        points.append(placed(o.start))
         if k is None:
-            results.append(OptimiserResult(points[-1], None, "failed", outcome.message, outcome.evaluations))
+            results.append(OptimiserResult(points[-1], None, "failed", o.message, o.evaluations))
         else:
-            first = which.index(k) == len(results)
-            results.append(replace(runs[k], evaluations=outcome.evaluations + (runs[k].evaluations if first else 0)))
+            added = runs[k].evaluations if which.index(k) == number else 0
+            message = o.message if stay[k] else runs[k].message
+            results.append(replace(runs[k], message=message, evaluations=o.evaluations + added))
     return Search(tuple(points), tuple(results))
 
 
+@dataclass(frozen=True)
+class _GoOn:
+    """The run on from where another ended: by the method, or no further than one evaluation where it is to stay."""
+
+    method: Optimiser
+
+    def run(self, problem: Problem, end: tuple[Array, bool]) -> OptimiserResult:
+        """Return the run from an end, (p,), that stays there or not."""
+        theta, stays = end
+        return TrustRegion(max_evaluations=1).run(problem, theta) if stays else self.method.run(problem, theta)
+
+
 def _continued(problem: Problem, method: Optimiser, found: Search) -> Search:
-    """Return the search with the lowest of the runs that used up their evaluations continued."""
-    runs = list(found.runs)
-    spent = [i for i, r in enumerate(runs) if r.status == "max-evaluations" and r.cost is not None]
-    if spent and method == TrustRegion():
-        i = min(spent, key=lambda k: runs[k].cost or 0.0)
-        end = TrustRegion(max_evaluations=LONGER).run(problem, runs[i].theta)
-        if end.cost is not None:
-            runs[i] = replace(end, evaluations=runs[i].evaluations + end.evaluations)
-    return Search(found.points, tuple(runs))
+    """Return the search with the lowest run continued where it used up its evaluations."""
+    costs = [np.inf if r.cost is None else r.cost for r in found.runs]
+    lowest = int(np.argmin(costs))
+    run = found.runs[lowest]
+    if run.status != "max-evaluations" or run.cost is None or method != TrustRegion():
+        return found
+    end = TrustRegion(max_evaluations=LONGER).run(problem, run.theta)
+    if end.cost is None:
+        return found
+    longer = replace(end, evaluations=run.evaluations + end.evaluations)
+    return Search(found.points, (*found.runs[:lowest], longer, *found.runs[lowest + 1 :]))
 
 
 def same_place(problem: Problem, theta: Array, other: Array) -> bool:

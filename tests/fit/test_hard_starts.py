@@ -195,7 +195,7 @@ def test_identify_and_fit_of_one_run_stand_at_one_optimum():
 def test_starts_that_agree_leave_no_doubt():
     near = hi.fit(parse_card(WAVE), wave_record(), {"f": (6.9, 7.1), "a": (0.2, 3.0)})
     assert near.search_doubt == ""
-    alone = hi.fit(parse_card(WAVE), wave_record(), ["f", "a"], starts=1)
+    alone = fit(wave_problem(), starts=1, assess=False)
     assert alone.search_doubt == ""  # one start was asked for
 
 

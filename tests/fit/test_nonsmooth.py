@@ -110,7 +110,7 @@ def test_the_trends_estimate_is_plausible_though_a_start_ended_lower(formula, se
     assert min(s.cost for s in result.starts) < result.cost - TWO_SIDED
     assert violations("fit", told) == []
     far = copy.deepcopy(told)  # beyond what luck explains, and not within the intervals
-    far["starts"][1] |= {"cost": told["cost"] - 100.0, "end": {"a": 3.0, "k": 1.5}}
+    far["starts"][1] |= {"cost": told["cost"] - 10.0 * told["roughness"]["delta_chi2"], "end": {"a": 3.0, "k": 1.5}}
     assert len(violations("fit", far)) == 1
     assert len(violations("fit", told | {"roughness": {}})) == 1  # of a smooth cost the lowest point is the optimum
 

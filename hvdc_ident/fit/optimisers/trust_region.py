@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.descent import LEAST_DAMPING, Descent, DescentOptions
-from hvdc_ident.fit.nonsmooth import LUCK, RUNS, roughness
+from hvdc_ident.fit.nonsmooth import LUCK, RUNS, roughness, scatter_along
 from hvdc_ident.fit.optimiser import OptimiserResult, OptimiserStatus
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.simulator import approximate
@@ -21,11 +20,8 @@ from hvdc_ident.fit.simulator import approximate
 NAME = "trust-region"
 SUMMARY = "bounded Levenberg-Marquardt with exact sensitivities"
 
-
-PROBES = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.0)
-"""Tiny steps, in units of PROBE, from which the scatter of the cost is estimated."""
 PROBE = 1e-9
-"""Length of these steps in scaled coordinates."""
+"""Length in scaled coordinates of the tiny step along which the scatter of the cost is estimated."""
 
 
 @dataclass(frozen=True)
@@ -64,35 +60,14 @@ def _standstill(down: Descent, problem: Problem) -> tuple[OptimiserStatus, str]:
     promise = here.predicted(p)
     if promise <= 1e-4 * here.cost + 1e-12 * here.r.size:
         return "converged", "no smaller step lowers the cost"
-    error = _scatter(down, p, low, high)
+    # Adaptive steps of an integrator make the cost jump from one parameter value to the next, however close they are.
+    error = scatter_along(problem, here.theta, here.r, PROBE * p / np.abs(p).max())
+    down.evaluations += RUNS
     if promise > LUCK * error and approximate(
         problem.simulator
     ):  # smooth near a local minimum, and nonsmooth beyond it
-        down.evaluations += RUNS
         error = max(error, roughness(problem, here.theta))
+        down.evaluations += RUNS
     if promise <= LUCK * error:
         return "converged", f"no step lowers the cost by more than its own scatter there ({error:.2g})"
     return "stalled", "the sensitivities promise a lower cost that no step reaches (a jump, or their error)"
-
-
-def _scatter(down: Descent, p: Array, low: Array, high: Array) -> float:
-    """Return the standard deviation of the cost's noise over tiny even steps along p, (p,); 0 where one of them fails.
-
-    Third differences remove a smooth cost. Adaptive steps of an integrator make it jump from one parameter
-    value to the next, however close they are (Moré and Wild 2011, "Estimating computational noise",
-    doi 10.1137/100786125).
-    """
-    assert down.at is not None
-    unit = PROBE * p / np.abs(p).max()
-    room = np.where(unit > 0, high, np.where(unit < 0, -low, np.inf))
-    unit = np.where(room > -PROBES[0] * np.abs(unit), unit, 0.0)
-    costs = []
-    for k in PROBES:
-        down.evaluations += 1
-        try:
-            r, _ = down.objective.residual(down.space.unscaled(down.at.x + k * unit))
-        except SimulationError:
-            return 0.0
-        costs.append(0.5 * float(r @ r))
-    differences = np.diff(costs, 3)
-    return float(np.sqrt(np.mean(differences**2) / 20.0))  # 20 = 1 + 9 + 9 + 1, of white noise of 1
