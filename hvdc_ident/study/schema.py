@@ -479,7 +479,7 @@ class GroupTable(TomlTable):
 class FitTable(TomlTable):
     """[fit]: how the candidates are estimated.
 
-    starts: left out, 8, or 1 for an optimiser that searches the whole range by itself. whiten: true is "pre-event".
+    starts: left out, 8, and up to 64 as long as they leave a doubt. whiten: true is "pre-event".
     guard: s on either side of an input's break that are not compared. band: Hz, of the frequency-domain residual (left
     out: all). tolerance: profile of the windowed errors, shipped or a TOML file beside the study.
     """
