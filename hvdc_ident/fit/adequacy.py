@@ -28,6 +28,9 @@ LEVEL = 1e-3
 MATTERS = 2.0
 """Ratio of the residual's power to the noise's from which intervals that rest on the noise are wrong (see above)."""
 NEXT = "hvdc-ident diagnose STUDY"
+MOVED = "what the model lacks may move the estimates by more than any noise, so that no interval is given"
+"""The consequence of a misfit for what is estimated. A fit leaves of a missing effect what no parameter can make good, and that does
+not tell how much of it the parameters have made good."""
 
 Verdict = Literal["fits", "does-not-fit", "noise-understated", "noise-overstated", "not-judged"]
 WORST_FIRST: tuple[Verdict, ...] = ("does-not-fit", "noise-understated", "noise-overstated", "fits", "not-judged")
@@ -69,6 +72,11 @@ class Adequacy:
     outputs: FrozenMap[ResidualSize] = field(default_factory=FrozenMap)
     text: str = ""
     next: str = ""
+
+    @property
+    def systematic(self) -> bool:
+        """True where the residual is more than noise: the model lacks something, which moves the estimates by what no residual tells."""
+        return self.verdict == "does-not-fit"
 
     @property
     def widening(self) -> float:
@@ -177,8 +185,7 @@ def _sentence(sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapp
     parts = [_line(o, s, sources[o]) for o, s in sizes.items() if s.verdict == verdict]
     text = "; ".join(p for p in parts if p)
     if verdict == "does-not-fit":
-        more = "the intervals hold the misfit in place of the noise, and a systematic misfit may still move the estimates beyond them"
-        return f"{text}: {more}", NEXT
+        return f"{text}: {MOVED}", NEXT
     values = ", ".join(
         f"{o} = {s.noise * s.times:.3g}" for o, s in sizes.items() if s.verdict == verdict and s.noise and s.times
     )

@@ -117,7 +117,7 @@ def _result(
     doubt = _doubt(problem, outcomes, samples, effective_share, jump)
     message = f"{doubt}; {message}" if doubt else message
     inner, everything = inner.widened(judged.widening), everything.widened(judged.widening)
-    estimates = estimates_of(problem, best.theta, blocks, inner, everything)
+    estimates = estimates_of(problem, best.theta, blocks, inner, everything, systematic=judged.systematic)
     estimates = _with_rivals(problem, estimates, near)
     squares = sum(float(b.residual @ b.residual) for b in blocks)
     in_time = blocks if problem.band is None else problem.blocks(best.theta, derivatives=False, in_time=True)

@@ -27,6 +27,7 @@ from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import Covariance, FitResult, StartOutcome, Status
 from hvdc_ident.fit.simulator import unknown_of
+from hvdc_ident.fit.uncertainty import NO_INTERVAL
 from hvdc_ident.immutable import FrozenMap
 
 _WORST: tuple[Status, ...] = ("failed", "not-converged", "two-optima", "at-bound", "converged")
@@ -169,7 +170,10 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
     tests = residual_tests(blocks, whole.fitted_experiments)
     judged = adequacy(whole, blocks, result.noise_source, result.effective_samples, result.rho)
     chi2 = squares / spare if spare > 0 else None
-    result = replace(result, cost=cost, chi2_per_dof=chi2, adequacy=judged, residual_tests=tests)
+    stated = result.estimates
+    if judged.systematic:  # together, though each group may fit its own records
+        stated = FrozenMap({n: e if e.method == "none" else e.without_interval(NO_INTERVAL) for n, e in stated.items()})
+    result = replace(result, cost=cost, chi2_per_dof=chi2, adequacy=judged, residual_tests=tests, estimates=stated)
     return assessed(whole, result)
 
 

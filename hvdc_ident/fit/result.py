@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 from hvdc_ident.data import Array
@@ -52,6 +52,11 @@ class Estimate:
     unit: str = ""
     reason: str = ""
     ci95_independent: tuple[float, float] | None = None
+
+    def without_interval(self, why: str) -> Estimate:
+        """Return the estimate without standard deviation and interval, and why."""
+        reason = f"{self.reason}; {why}" if self.reason else why
+        return replace(self, std=None, std_raw=None, ci95=None, ci95_independent=None, method="none", reason=reason)
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,8 @@ TWO_SIDED = 1.92
 """Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
 ONE_SIDED = 1.353
 """Rise at the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile."""
+NO_INTERVAL = "no interval: the model lacks something"
+"""Remark on an estimate where the residual is more than noise."""
 WIDER = 2.0
 """From this ratio of an interval to that of independent residuals on, the difference is said in words."""
 SINGULAR = 1e-7
@@ -233,9 +235,15 @@ def _reasons(names: Sequence[str], unseen: Array, null: Array, *, too_few: bool)
 
 
 def estimates_of(
-    problem: Problem, theta: Array, blocks: Sequence[ResidualBlock], inner: Uncertainty, everything: Uncertainty
+    problem: Problem,
+    theta: Array,
+    blocks: Sequence[ResidualBlock],
+    inner: Uncertainty,
+    everything: Uncertainty,
+    *,
+    systematic: bool = False,
 ) -> dict[str, Estimate]:
-    """Return the estimate of every unknown by name.
+    """Return the estimate of every unknown by name. systematic: the residual is more than noise; no estimate has an interval then.
 
     inner: about the unknowns inside their bounds, the others held there; everything: about all of them.
     An unknown inside gets value, std and the t interval, as far as the parameter may go by its nature; the only one on a
@@ -258,6 +266,7 @@ def estimates_of(
         else:
             estimate = _at_bound(unknown, float(value), float(slope), everything, alone=len(bound) == 1)
         unit = unit_of(problem.simulator, nuisances[name]) if name in nuisances else parameters[name].unit
+        estimate = estimate.without_interval(NO_INTERVAL) if systematic else estimate
         estimates[name] = replace(estimate, unit=unit, conditional_on=tuple(problem.conditional_on.get(name, ())))
     return estimates
 

@@ -164,7 +164,8 @@ def _assembled(
         scale = scale_of(assessment.free[n], value)[0]
         norm = whole.information.norms[n]
         verdict = replace(verdict.noted(assessment.remark), value=value, scale=scale, sensitivity_norm=norm)
-        assessment.verdicts[n] = verdict.scattered(scatter[n], resampled) if resampled and n in scatter else verdict
+        verdict = verdict.scattered(scatter[n], resampled) if resampled and n in scatter else verdict
+        assessment.verdicts[n] = verdict.under_misfit() if first.adequacy.systematic else verdict
     several = last is not None and len(last.problem.fitted_experiments) > 1
     tests = heterogeneity(last) if last is not None and several else FrozenMap()
     matrix = first.information.matrix

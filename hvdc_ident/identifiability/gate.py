@@ -104,7 +104,10 @@ def gated_fit(
     result = fit(gated(problem, selection))
     if result.status == "failed":
         return result
-    estimates = {n: _stated(n, e, report, selection, whole=whole) for n, e in result.estimates.items()}
+    systematic = result.adequacy is not None and result.adequacy.systematic  # then neither has an interval
+    estimates = {
+        n: e if systematic else _stated(n, e, report, selection, whole=whole) for n, e in result.estimates.items()
+    }
     on_bound = _at_bound(report, selection)
     ordered = {n: {**estimates, **on_bound}.get(n) for n in report["parameters"]}
     stated = FrozenMap({n: e for n, e in ordered.items() if e is not None})

@@ -205,7 +205,7 @@ def pair_of(
     for n in names:
         u = optimum.problem.unknowns[optimum.problem.names.index(n)]
         v = verdicts[n]
-        low, high = v.ci95 or (None, None)
+        low, high = v.profile.ci95 if v.profile is not None else (None, None)
         half = 0.5 * (high - low) if low is not None and high is not None else 0.25 * u.span
         centre = optimum.value(n)
         grids.append(np.linspace(max(u.min, centre - 2 * half), min(u.max, centre + 2 * half), points))

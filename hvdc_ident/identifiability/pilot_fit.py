@@ -18,7 +18,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
-from hvdc_ident.fit.adequacy import adequacy
+from hvdc_ident.fit.adequacy import Adequacy, adequacy
 from hvdc_ident.fit.descent import descend
 from hvdc_ident.fit.noise_model import GIVEN, MISFIT, from_misfit
 from hvdc_ident.fit.nonsmooth import Trend
@@ -110,10 +110,15 @@ class LocalAnalysis:
         return 2.0 * self.cost / max(n - self.theta.size, 1)
 
     @cached_property
-    def excess(self) -> float:
-        """The misfit where `fit.adequacy` calls it larger than the noise told, else 1; 1 without noise."""
+    def adequacy(self) -> Adequacy:
+        """The verdict on the size of the residuals."""
         known = self.uncertainty
-        return adequacy(self.problem, self.blocks, self.problem.noise_source, known.effective, known.rho).widening
+        return adequacy(self.problem, self.blocks, self.problem.noise_source, known.effective, known.rho)
+
+    @property
+    def excess(self) -> float:
+        """The misfit where it is larger than the noise told, else 1; 1 without noise."""
+        return self.adequacy.widening
 
     def value(self, name: str) -> float:
         """The value of an unknown, in its unit."""

@@ -83,8 +83,8 @@ def _estimates(
     """Return the fitted parameters of the augmented model with 95 % intervals, at the values of the diagnosis, and the tests of
     its residuals against noise.
 
-    By the curvature of the cost there, widened for correlated residuals and a misfit above the noise, as those of a fit are;
-    the parameters of the effects are unknowns too. Both empty where an experiment has unknowns of its own.
+    By the curvature of the cost there, widened for correlated residuals, and without intervals where what is left is more than noise, as
+    those of a fit are; the parameters of the effects are unknowns too. Both empty where an experiment has unknowns of its own.
     """
     nothing: dict[str, Any] = {"estimates_after": {}, "residual_tests_after": {}}
     model = found.augmented
@@ -105,7 +105,7 @@ def _estimates(
     spans = np.array([u.span for u in problem.unknowns])
     known = uncertainty(blocks, problem.names, spans, problem.noise_source, None, problem.noise_dof)
     known = known.widened(adequacy(problem, blocks, sources, known.effective, known.rho).widening)
-    estimates = estimates_of(problem, problem.start, blocks, known, known)
+    estimates = estimates_of(problem, problem.start, blocks, known, known, systematic=found.beyond_noise)
     return {
         "estimates_after": {n: _estimate(found, n, plain(estimates[n])) for n in fitted if n in estimates},
         "residual_tests_after": residual_tests(blocks, problem.fitted_experiments),
