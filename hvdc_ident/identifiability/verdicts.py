@@ -68,11 +68,14 @@ class Verdict:
         return replace(self, reason=" ".join([self.reason, *(n for n in notes if n)]))
 
     def under_misfit(self) -> Verdict:
-        """Return the verdict without interval and standard deviation, what it says of them made conditional on the model."""
+        """Return the verdict without interval and standard deviation, what it says of them made conditional on the model.
+
+        The scatter over experiments stays: it is a finding whatever the model lacks.
+        """
         if self.ci95 is None:
             return self
         reason = f"If nothing else is missing, {self.reason[:1].lower()}{self.reason[1:]}"
-        return replace(self, reason=reason, ci95=None, std=None, relative_std=None, ci95_experiments=None)
+        return replace(self, reason=reason, ci95=None, std=None, relative_std=None)
 
     def scattered(self, interval: tuple[float, float], over: Bootstrap) -> Verdict:
         """Return the verdict with the interval from experiments drawn anew, and a remark where that is much the wider."""

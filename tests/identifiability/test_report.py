@@ -103,5 +103,5 @@ def test_a_wider_scatter_is_remarked() -> None:
     slopes = 2 + 0.15 * np.random.default_rng(1).normal(size=9)
     data = [e.with_(noise={}) for e in runs(slopes, 0.05)]
     b = identifiability(LINE, data, FREE, starts=1).parameters["b"]
-    assert np.ptp(b.ci95_experiments) > 1.5 * np.ptp(b.ci95)
+    assert np.ptp(b.ci95_experiments) > 1.5 * np.ptp(b.profile.ci95)
     assert "the 9 experiments scatter it wider" in b.reason
