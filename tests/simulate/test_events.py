@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError
+from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.model import Delay, Model, Sampled, State
 from hvdc_ident.simulate import Tolerance, simulate
 
@@ -203,19 +203,6 @@ def test_a_current_limit_closed_by_the_other_axis_is_passed():
     )
     assert result["Irorder2"].max() == pytest.approx(1.1) and result.statistics.forced < 50
     assert np.isfinite(result.gradients).all()
-
-
-def test_a_delay_of_nothing_is_refused():
-    model = Model(
-        "zero",
-        parameters={"T": 0.0},
-        inputs={"u": 0.0},
-        states={"x": "ud - x"},
-        delays={"ud": Delay(u, T)},
-        outputs={"x": "x"},
-    )
-    with pytest.raises(ModelError, match="not above 0"):
-        simulate(model, experiment("zero", [0.0, 1.0]))
 
 
 def test_many_structures_leave_no_memory_behind():
