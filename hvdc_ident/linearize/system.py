@@ -28,7 +28,7 @@ def evaluate(graph: Graph, roots: Iterable[int], leaves: Mapping[int, Any], size
     wanted = list(roots)
     values: dict[int, Any] = {}
     with np.errstate(all="ignore"):
-        for n in graph.reachable([*wanted, *graph.switches]):
+        for n in graph.reachable(wanted):
             values[n] = _node(graph, n, values, leaves)
     return [np.broadcast_to(np.asarray(values[r], dtype=complex), (size,)) for r in wanted]
 
