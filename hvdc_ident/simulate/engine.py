@@ -225,6 +225,20 @@ class Engine:
                 self._explicit = bool(fastest * span < 3e3)
         return self._explicit
 
+    def fastest(self, p: Array, inputs: Sequence[Any], time: Array, tolerance: Tolerance, model: Model) -> float:
+        """Return the largest modulus of an eigenvalue at the start, rad/s; infinite where one cannot be told.
+
+        Arguments as in `run`.
+        """
+        s = self.structure.sizes
+        u, *_ = _tables(tuple(inputs), float(time[0]), float(time[-1]))
+        y, w = self.start(p, u, float(time[0]), search=tolerance.search, model=model)
+        jac = self.jacobian(p, y, w)
+        if not np.isfinite(jac).all() or np.linalg.matrix_rank(jac[s.nx :, s.nx :]) < s.nz:
+            return np.inf
+        unknowns = np.linalg.solve(jac[s.nx :, s.nx :], jac[s.nx :, : s.nx])
+        return float(np.abs(np.linalg.eigvals(jac[: s.nx, : s.nx] - jac[: s.nx, s.nx :] @ unknowns)).max(initial=0.0))
+
     def jacobian(self, p: Array, y: Array, w: Array) -> Array:
         """d[f; g]/d[x; z], (n, n), at y and w with modes as the values say."""
         return next(self._jacobians(p, y, w))

@@ -1,11 +1,11 @@
 """Runs of models whose delays may be 0 or shorter than any step that a run can afford.
 
-No step of the integrators is longer than a delay. So a delay T below s, a `SHORTEST`-th of the run, is not simulated: the
-run is interpolated between T = 0, where the delayed signal is the signal itself, and T = s, by the parabola in T through the
+No step of the integrators is longer than a delay. So a delay T below s, a small share of the run, is not simulated: the run
+is interpolated between T = 0, where the delayed signal is the signal itself, and T = s, by the parabola in T through the
 values at both and the derivative by T at s. Values and derivatives are so continuous in T from 0 on, and the derivative is that
 of the values. Of a component of angular frequency w, the parabola is off by at most (w s)^3/40 of its size, and its slope by
-(w s)^2/6: with a record of a thousand rows by 1e-4 and 4e-3 at the highest frequency that it shows, and by a thousandth and a
-hundredth of that at a tenth of this frequency.
+(w s)^2/6. s is 0.1/w or less for the fastest mode w of the model without its delays, so that these are 3e-5 and 2e-3, as far as
+`FINEST` steps in a run allow.
 """
 
 from __future__ import annotations
@@ -24,8 +24,15 @@ from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate.engine import Engine, Method, Tolerance, engine_of
 from hvdc_ident.simulate.simulation import Statistics
 
-SHORTEST = 20_000
-"""Steps that the shortest simulated delay makes of a run; with some microseconds a step it takes a tenth of a second."""
+COARSEST = 2_500
+"""Delays that go fewer times into a run are always simulated: so many steps take some milliseconds."""
+FINEST = 20_000
+"""Those that go more times into it never: so many steps take up to a second of a model with a dozen states and some
+sensitivities."""
+OVER = 0.1
+"""The delay that is interpolated from is at most so much of the time constant of the fastest mode."""
+PER_BREAK = 5
+"""It goes so many times between two breaks of an input, whose waveform may be faster than the model."""
 
 COUNTS = ("accepted", "rejected", "events", "evaluations", "segments", "forced")
 
@@ -62,16 +69,23 @@ def run(
         out, statistics = code.run(values, inputs, time, tolerance, method, scale, model=of)
         return _answer(code, out, statistics)
 
-    short = _short_delays(engine, p, time, tolerance) if model.delays else {}
+    span = float(time[-1] - time[0])
+    times, by_parameters = engine.delay_times(p) if model.delays else (np.zeros(0), np.zeros((0, 0)))
+    shortest = 0.0
+    if (times < span / COARSEST).any():
+        plain = _without(model, tuple(model.delays))
+        fastest = engine_of(plain, sensitivities, outputs).fastest(p, inputs, time, tolerance, plain)
+        shortest = span / _steps(span * fastest, inputs, tolerance)
+    lengths = zip(model.delays, times.tolist(), by_parameters, strict=True)
+    short = {name: (length, rows) for name, length, rows in lengths if length == 0.0 or length < shortest}
     if not short:
         return answer(model, sensitivities, p)
-    found = answer(without(model, tuple(short)), sensitivities, p)
+    found = answer(_without(model, tuple(short)), sensitivities, p)
     base, cost = found, [found.statistics]
-    shortest = _shortest(time, tolerance)
     for name, (length, rows) in short.items():
         if shortest == 0.0 or not (length or rows.any()):
             continue
-        longer, parameter = with_time(model, name, tuple(n for n in short if n != name))
+        longer, parameter = _with_time(model, name, tuple(n for n in short if n != name))
         end = answer(longer, (*sensitivities, parameter), np.append(p, shortest))
         found = _between(found, base, end, length / shortest, shortest, rows)
         cost.append(end.statistics)
@@ -84,27 +98,26 @@ def _answer(code: Engine, out: Array, statistics: Statistics) -> Answer:
     return Answer(out[:, : s.no], slopes, statistics)
 
 
-def _shortest(time: Array, tolerance: Tolerance) -> float:
-    """Return the shortest delay that is simulated, s: half the steps of a run are left for what else there is."""
-    return float(time[-1] - time[0]) / min(SHORTEST, max(tolerance.max_steps // 2, 1))
+def _steps(turns: float, inputs: Sequence[Any], tolerance: Tolerance) -> int:
+    """Return how many times the shortest simulated delay goes into a run; half the steps of a run are left for what else there is.
 
-
-def _short_delays(engine: Engine, p: Array, time: Array, tolerance: Tolerance) -> dict[str, tuple[float, Array]]:
-    """Return time, s, and its derivatives by the sensitivity parameters of each delay that is not simulated itself."""
-    times, rows = engine.delay_times(p)
-    shortest = _shortest(time, tolerance)
-    named = zip(engine.structure.model.delays, times, rows, strict=True)
-    return {n: (float(t), row) for n, t, row in named if t == 0.0 or t < shortest}
+    turns: the length of the run times the fastest mode, rad. The number is of a few, so that it rarely changes with parameters.
+    """
+    needed = max(turns / OVER, PER_BREAK * max((i.breaks.size for i in inputs), default=0))
+    steps = COARSEST
+    while steps < needed and steps < FINEST:
+        steps *= 2
+    return min(steps, max(tolerance.max_steps // 2, 1))
 
 
 @lru_cache(maxsize=64)
-def without(model: Model, names: tuple[str, ...]) -> Model:
+def _without(model: Model, names: tuple[str, ...]) -> Model:
     """Return the model without these delays, kept for later runs."""
     return without_delays(model, names)
 
 
 @lru_cache(maxsize=64)
-def with_time(model: Model, name: str, others: tuple[str, ...]) -> tuple[Model, str]:
+def _with_time(model: Model, name: str, others: tuple[str, ...]) -> tuple[Model, str]:
     """Return the model without the other delays in which the named one has a time of its own, and that last parameter's name."""
     parameter = fresh(model, f"{name}_time")
     model = without_delays(model, others)

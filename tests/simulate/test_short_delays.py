@@ -13,11 +13,11 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Delay, Model, State
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
-from hvdc_ident.simulate.short_delays import SHORTEST
+from hvdc_ident.simulate.short_delays import COARSEST
 
 TIME = np.linspace(0.0, 8.0, 161) + 0.0125
 STEP = experiment("step", TIME, {"u": InputSignal.step(1.0, 0.0, 1.0)})
-SEAM = float(np.ptp(TIME)) / SHORTEST
+SEAM = float(np.ptp(TIME)) / COARSEST
 SHORT = [0.0, 1e-14, 1e-9, 0.3 * SEAM, 0.9 * SEAM, 1.1 * SEAM, 3.0 * SEAM]
 
 
@@ -40,7 +40,7 @@ def test_a_plant_behind_a_short_delay_is_the_closed_form_with_its_derivatives(de
     left = np.exp(-1.3 * since)
     np.testing.assert_allclose(run["x"], 1.0 - left, atol=2e-9)
     np.testing.assert_allclose(run.gradient("x")[:, 0], np.where(since > 0, -1.3 * left, 0.0), atol=2e-5)
-    np.testing.assert_allclose(run.gradient("x")[:, 1], since * left, atol=2e-7)
+    np.testing.assert_allclose(run.gradient("x")[:, 1], since * left, atol=4e-6)
     np.testing.assert_allclose(run["late"], TIME > 1.0, atol=1e-12)
 
 
@@ -119,7 +119,8 @@ def test_two_short_delays_after_each_other_are_one_of_their_sum():
     since = np.maximum(TIME - 1.0 - 0.4 * SEAM, 0.0)
     by_time = np.where(since > 0, -1.3 * np.exp(-1.3 * since), 0.0)
     np.testing.assert_allclose(run["x"], 1.0 - np.exp(-1.3 * since), atol=2e-9)
-    np.testing.assert_allclose(run.gradient("x"), np.column_stack([by_time, by_time]), atol=4e-4)
+    # Their joint effect beyond the sum of each is not in the derivatives: a^2 T1 of them.
+    np.testing.assert_allclose(run.gradient("x"), np.column_stack([by_time, by_time]), atol=2.0 * 1.3**2 * 0.4 * SEAM)
 
 
 def test_a_delay_effect_of_0_leaves_the_link_as_it_is():
