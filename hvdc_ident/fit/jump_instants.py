@@ -317,8 +317,8 @@ class PlacedInstant:
 def placed_instants(problem: Problem, theta: Array, rise: float) -> dict[str, PlacedInstant]:
     """Return what the records tell of each parameter that moves an instant, around the optimum theta, (p,).
 
-    rise: of the cost, the other unknowns found again, at the ends of an interval. Left out is a parameter whose instant may pass
-    any row, for the jump is lost in the noise, so that no passing ends its range on either side.
+    rise: of the cost, the other unknowns found again, at the ends of an interval. Left out is a parameter of which the smooth part
+    of the cost tells more than the rows, and one whose instant may pass any row, for the jump is lost in the noise.
     """
     found = {}
     for name in moving_parameters(problem):
@@ -359,11 +359,11 @@ def _placed(problem: Problem, theta: Array, place: int, rise: float) -> PlacedIn
             for _ in range(BISECTIONS):
                 middle = 0.5 * (good + far)
                 good, far = (middle, far) if at(middle, near) < rise else (good, middle)
-            sides.append((good, edge, True))
+            sides.append((good, edge, "smooth"))
         else:
-            sides.append((edge, edge, excluded))
+            sides.append((edge, edge, "jump" if excluded else "open"))
     (low, low_edge, below), (high, high_edge, above) = sides
-    if not (below and above):
+    if "open" in (below, above) or "jump" not in (below, above):
         return None
     points.sort(key=lambda point: point[0])
     return PlacedInstant(unknown.name, low, high, (low_edge, high_edge), tuple(points))
@@ -377,16 +377,20 @@ def search_instants(problem: Problem, best: LocalMinimum, method: Optimiser) -> 
     places = moving(problem)
     if not places:
         return best
-    best = _refined(problem, _joint(problem, best, places), method)
+    best = _joint(problem, best, places)
     for _ in range(ROUNDS):
         theta = best.theta
         for k in places:
             theta = _best_stretch(problem, theta, k, places)
+        if np.array_equal(theta, best.theta):
+            break
         found = _refined(problem, LocalMinimum(theta, best.cost), method)
-        if np.array_equal(theta, best.theta) or not found.cost < best.cost:
+        if not found.cost < best.cost:
             break
         best = found
-    return _centred(problem, best, places)
+    if not moving_parameters(problem):
+        return best
+    return _centred(problem, _refined(problem, best, method), places)
 
 
 def _centred(problem: Problem, best: LocalMinimum, places: Sequence[int]) -> LocalMinimum:

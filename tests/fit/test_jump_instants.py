@@ -178,6 +178,20 @@ def test_an_instant_that_the_slope_after_it_tells_is_known_better_than_the_rows(
     assert low < 11.13 < high and high - low == pytest.approx(2 * 1.96 * std, rel=0.05)
 
 
+def test_the_begin_of_a_ramp_is_no_jump_and_is_judged_like_any_parameter():
+    """y = A (t - t0) from t0 on: the derivative by t0 is -A there, and all is smooth."""
+    model = decay("A*(time - t0)")
+    y = np.where(ROWS < 11.13, 0.0, 0.5 * (ROWS - 11.13)) + 0.01 * np.random.default_rng(3).standard_normal(ROWS.size)
+    report = hi.identify(model, hi.Experiment(ROWS, outputs={"y": y}, noise={"y": 0.01}), ["t0", "A"])
+    verdict = report.parameters["t0"]
+    low, high = verdict.ci95
+    since = ROWS[ROWS > 11.13] - 11.13
+    columns = np.column_stack([np.full(since.size, -0.5), since]) / 0.01
+    std = float(np.sqrt(np.linalg.inv(columns.T @ columns)[0, 0]))
+    assert verdict.verdict == "identifiable" and "row" not in verdict.reason
+    assert low < 11.13 < high and high - low == pytest.approx(2 * 1.96 * std, rel=0.1)
+
+
 def test_a_jump_that_the_noise_hides_leaves_the_instant_to_the_other_verdicts():
     y = 0.01 * np.random.default_rng(5).standard_normal(ROWS.size)
     model = hi.Model(
