@@ -205,6 +205,24 @@ def test_a_current_limit_closed_by_the_other_axis_is_passed():
     assert np.isfinite(result.gradients).all()
 
 
+@pytest.mark.parametrize("condition", ["time > at", "clock > at"])
+def test_a_switch_seen_through_a_delay_alone_moves_what_comes_after_it(condition):
+    """x' = (t > at + T) - x: x = 1 - exp(-(t - at - T)), with the same derivative by the instant as by the delay."""
+    model = Model(
+        "late-switch",
+        parameters={"at": 0.305, "T": 0.2},
+        states={"clock": State(1, start=0), "x": "late - x"},
+        delays={"late": {"of": f"where({condition}, 1, 0)", "time": "T"}},
+        outputs={"x": "x"},
+    )
+    time = np.linspace(0.0, 2.0, 101)
+    result = simulate(model, experiment("late", time), sensitivities=("at", "T"))
+    since = np.maximum(time - 0.505, 0.0)
+    slope = np.where(since > 0, -np.exp(-since), 0.0)
+    np.testing.assert_allclose(result["x"], 1.0 - np.exp(-since), atol=1e-8)
+    np.testing.assert_allclose(result.gradients[:, 0], np.column_stack([slope, slope]), atol=1e-7)
+
+
 def test_many_structures_leave_no_memory_behind():
     import gc
     import resource
