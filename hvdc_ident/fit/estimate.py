@@ -1,12 +1,12 @@
 """The verb `fit`: a multistart of least squares, and the result at its best optimum.
 
-The search itself is in `multistart`. Here its optima become a status, estimates with intervals, tests of the residuals and
+The search itself is in `search`. Here its optima become a status, estimates with intervals, tests of the residuals and
 the table of starts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +17,7 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.descent import predicted_reduction
+from hvdc_ident.fit.jump_instants import PlacedInstant, placed_instants, search_instants, within_stretches
 from hvdc_ident.fit.noise_model import source_text
 from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
@@ -30,13 +31,11 @@ from hvdc_ident.fit.search import (
     LocalMinimum,
     cost_at,
     distinct,
-    has_clocks,
     local_minima,
     prewhitened,
     reweighted,
     same_place,
     search,
-    search_clock_offsets,
     whitened_by_residuals,
 )
 from hvdc_ident.fit.simulator import unknown_of
@@ -102,7 +101,9 @@ def _result(
             threshold = threshold_of(problem, residual_at(problem, best.theta))
             rivals = [end for end in rivals if not trend.holds(end.theta, threshold)]
     blocks = problem.blocks(best.theta)
-    inner, everything = (u.on_trend(trend, problem.names) for u in _uncertainties(problem, best.theta, blocks))
+    rise = threshold_of(problem, np.concatenate([b.residual for b in blocks]))
+    placed = placed_instants(problem, best.theta, rise) if trend is None else {}
+    inner, everything = (u.on_trend(trend, problem.names) for u in _uncertainties(problem, best.theta, blocks, placed))
     samples = sum(b.residual.size for b in blocks)
     effective_share = min(1.0, sum(inner.effective.values()) / samples)
     optima = [best] if inner.singular else distinct(problem, [best, *rivals], effective_share)
@@ -114,10 +115,11 @@ def _result(
     noise = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
     judged = adequacy(problem, blocks, noise, inner.effective, inner.rho)
     jump = 0.0 if trend is None else LUCK * trend.roughness
-    doubt = _doubt(problem, outcomes, samples, effective_share, jump)
+    doubt = _doubt(problem, best, outcomes, samples, effective_share, jump)
     message = f"{doubt}; {message}" if doubt else message
     inner, everything = inner.widened(judged.widening), everything.widened(judged.widening)
     estimates = estimates_of(problem, best.theta, blocks, inner, everything, systematic=judged.systematic)
+    estimates = _with_placed(problem, best.theta, estimates, placed)
     estimates = _with_rivals(problem, estimates, near)
     squares = sum(float(b.residual @ b.residual) for b in blocks)
     in_time = blocks if problem.band is None else problem.blocks(best.theta, derivatives=False, in_time=True)
@@ -163,16 +165,22 @@ def _in_final_weights(
     """Return the problem in its final weights and noise model, its best optimum and the other candidates."""
     local = TrustRegion()
     problem, best, rivals = reweighted(problem, ends, local)
-    if has_clocks(problem):
-        best = search_clock_offsets(problem, best, local)
+    found = search_instants(problem, best, local)
+    if found is not best:
+        problem, best, rivals = reweighted(problem, [found, *rivals], local)
         rivals = [r for r in rivals if r.cost >= best.cost]
     if whiten == "residual":
         problem, best, rivals = whitened_by_residuals(problem, best, rivals, local)
     return problem, best, rivals
 
 
-def _uncertainties(problem: Problem, theta: Array, blocks: Sequence[ResidualBlock]) -> tuple[Uncertainty, Uncertainty]:
-    """Return the uncertainty of the unknowns inside their bounds, the others held there, and that of all."""
+def _uncertainties(
+    problem: Problem, theta: Array, blocks: Sequence[ResidualBlock], placed: Collection[str]
+) -> tuple[Uncertainty, Uncertainty]:
+    """Return the uncertainty of the unknowns inside their bounds, the others held there, and that of all.
+
+    placed: unknowns that are held as well, for no curvature tells their interval.
+    """
     if not problem.loss.linear:  # samples have less information under a robust loss
         share = {
             o: problem.loss.efficiency(np.concatenate([b.residual for b in blocks if b.output == o]))
@@ -184,7 +192,11 @@ def _uncertainties(problem: Problem, theta: Array, blocks: Sequence[ResidualBloc
         ]
     names = problem.names
     spans = np.array([u.span for u in problem.unknowns])
-    inside = [i for i, (u, v) in enumerate(zip(problem.unknowns, theta, strict=True)) if not u.on_bound(v)]
+    inside = [
+        i
+        for i, (u, v) in enumerate(zip(problem.unknowns, theta, strict=True))
+        if not u.on_bound(v) and u.name not in placed
+    ]
     _, prior = problem.prior(theta)
     everything = uncertainty(blocks, names, spans, problem.noise_source, prior, problem.noise_dof)
     if len(inside) == len(names):
@@ -234,7 +246,8 @@ def _status(
     arrived = _arrived(problem, best, outcomes, effective_share, jump)
     if not refitted and trend is None and all(o.status == "flat" for o in arrived):
         return "not-converged", f"the start with the lowest cost did not move: {arrived[0].message}"
-    if refitted and trend is None and predicted_reduction(problem, best.theta) > SETTLED:
+    smooth = within_stretches(problem, best.theta)
+    if refitted and trend is None and predicted_reduction(smooth, best.theta) > SETTLED:
         return "not-converged", (
             "the cost still falls where the best run used up its evaluations: bounds, a nearer start or more of [fit] starts help"
         )
@@ -275,9 +288,16 @@ def _arrived(
 
 
 def _doubt(
-    problem: Problem, outcomes: Sequence[StartOutcome], samples: int, effective_share: float, jump: float
+    problem: Problem,
+    optimum: LocalMinimum,
+    outcomes: Sequence[StartOutcome],
+    samples: int,
+    effective_share: float,
+    jump: float,
 ) -> str:
     """Return in words that one start alone reached the lowest cost of several; "" where another did, or none disagrees.
+
+    Nor is there doubt of the starts where the optimum was found beyond where all of them ended, by a search over instants.
 
     Then the starts say nothing of how likely a still lower cost is. The size of the residual is the unit of cost, whether or not the
     noise is known: costs that differ by less lead to the same estimates. samples: number of residuals.
@@ -288,6 +308,8 @@ def _doubt(
     lowest, first = ends[0]
     spread = max(1.0, 2.0 * lowest / max(samples - len(problem.unknowns), 1))
     slack = max(1e-6 * lowest, spread * SAME / effective_share) + jump
+    if optimum.cost < lowest - slack:
+        return ""
     best = LocalMinimum(_end(problem, first), lowest)
     others = [
         cost for cost, o in ends[1:] if cost > lowest + slack and not same_place(problem, best.theta, _end(problem, o))
@@ -322,6 +344,39 @@ def _is_optimum(problem: Problem, best: LocalMinimum, arrived: Sequence[StartOut
     if any(o.status == "converged" for o in arrived) or predicted_reduction(problem, best.theta) <= SETTLED:
         return True
     return sum(o.status == "stalled" and same_place(problem, best.theta, _end(problem, o)) for o in arrived) > 1
+
+
+def _with_placed(
+    problem: Problem, theta: Array, estimates: Mapping[str, Estimate], placed: Mapping[str, PlacedInstant]
+) -> dict[str, Estimate]:
+    """Return the estimates with the intervals of instants between rows, and those of the others over all of these.
+
+    An interval of another parameter reaches from its lowest end to its highest where the instant moves over its own.
+    """
+    found = dict(estimates)
+    for name, instant in placed.items():
+        for other, e in estimates.items():
+            if other == name or other in placed or e.ci95 is None or None in e.ci95:
+                continue
+            k = problem.names.index(other)
+            moved = [float(x[k] - theta[k]) for v, _, x in instant.points if instant.low <= v <= instant.high]
+            low, high = found[other].ci95 or e.ci95
+            assert low is not None and high is not None
+            reason = f"it moves with {name}, which the rows leave open between {instant.low:.6g} and {instant.high:.6g}"
+            wider = max(moved) - min(moved) > SAME * (high - low)
+            found[other] = replace(
+                found[other],
+                ci95=(low + min(moved), high + max(moved)),
+                reason="; ".join(filter(None, [found[other].reason, reason if wider else ""])),
+            )
+        found[name] = replace(
+            found[name],
+            std=None,
+            ci95=(instant.low, instant.high),
+            method="between-rows",
+            reason=f"{instant.text[0].lower()}{instant.text[1:]}",
+        )
+    return found
 
 
 def _with_rivals(

@@ -1,7 +1,7 @@
 """The search for the optimum: a multistart, made once for a problem, whatever optimiser runs from each start.
 
-The ends of all runs are refined by least squares, told apart, moved over the clock offsets that a descent cannot reach, and
-found again in the weights and the noise model that the misfit gives.
+The ends of all runs are refined by least squares, told apart, and found again in the weights and the noise model that the
+misfit gives.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import MAD_TO_STD, Array, Experiment
+from hvdc_ident.data import MAD_TO_STD, Array
 from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import MATTERS
@@ -25,7 +25,7 @@ from hvdc_ident.fit.optimisers import optimiser as named
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import StartOutcome
-from hvdc_ident.fit.simulator import TIME_SHIFT, approximate, unknown_of
+from hvdc_ident.fit.simulator import approximate
 from hvdc_ident.fit.uncertainty import TWO_SIDED
 from hvdc_ident.immutable import FrozenMap
 
@@ -45,10 +45,6 @@ DISTINCT = TWO_SIDED
 """Costs that differ by less are as good: half the 95 % quantile of chi-square with one degree of freedom."""
 TIE = 1e-6
 """Costs that differ by this share differ by what no number of rows makes a likelihood notice (half of it a row)."""
-MOST_OFFSETS = 80
-"""Stretches of clock offsets that are tried in an experiment; of more, every so many."""
-ROUNDS = 6
-"""Rounds of finding the other unknowns again between two searches over the clock offsets."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,56 +315,6 @@ def _one_basin(problem: Problem, a: LocalMinimum, b: LocalMinimum, effective_sha
         return all(problem.cost(space.unscaled(x + s * (y - x))) < barrier for s in np.linspace(0.0, 1.0, 9)[1:-1])
     except SimulationError:
         return False
-
-
-# --- clock offsets ---
-# An output that jumps with an input makes the cost jump in the offset of the clock, each time a row passes the jump:
-# between two rows the cost is smooth, and a descent never leaves the stretch it begins in. So the stretches are tried.
-
-
-def has_clocks(problem: Problem) -> bool:
-    """Return whether any experiment has a clock of unknown offset."""
-    return any(TIME_SHIFT in e.nuisance for e in problem.fitted_experiments)
-
-
-def search_clock_offsets(problem: Problem, best: LocalMinimum, method: Optimiser) -> LocalMinimum:
-    """Return the best optimum over the stretches of all clocks: search, fit again, until no other stretch is better."""
-    for _ in range(ROUNDS):
-        theta = best.theta.copy()
-        for e in problem.fitted_experiments:
-            if TIME_SHIFT in e.nuisance:
-                theta[problem.names.index(unknown_of(e.name, TIME_SHIFT))] = _best_offset(problem, e, theta)
-        if np.array_equal(theta, best.theta):
-            return best
-        run = method.run(problem, theta)
-        if run.status == "failed" or run.cost is None or not run.cost < best.cost:
-            return best
-        best = LocalMinimum(run.theta, run.cost)
-    return best
-
-
-def _best_offset(problem: Problem, e: Experiment, theta: Array) -> float:
-    """Return the offset of one clock, s, at which its experiment's cost is least, the other unknowns as they are.
-
-    Tried are the present offset and the middle of each stretch of offsets within which no row passes a break of an input.
-    """
-    alone = replace(problem, experiments=(e,), priors=problem.priors.without(*problem.priors))
-    trial = np.array([theta[problem.names.index(n)] for n in alone.names])
-    place = alone.names.index(unknown_of(e.name, TIME_SHIFT))
-    present, low, high = float(trial[place]), alone.unknowns[place].min, alone.unknowns[place].max
-    breaks = np.unique([b for signal in e.inputs.values() for b in signal.breaks.tolist()])
-    passing = np.unique(np.subtract.outer(e.time, breaks))
-    ends = np.concatenate([[low], passing[(passing > low) & (passing < high)], [high]])
-    middles = 0.5 * (ends[1:] + ends[:-1])
-    offsets = [present, *map(float, middles[:: max(1, -(-middles.size // MOST_OFFSETS))])]
-    costs = []
-    for offset in offsets:
-        trial[place] = offset
-        try:
-            costs.append(alone.cost(trial))
-        except SimulationError:
-            costs.append(np.inf)  # only compared: an offset that cannot be simulated is not chosen
-    return offsets[int(np.argmin(costs))]
 
 
 # --- weights and noise models from the misfit ---

@@ -246,6 +246,7 @@ def estimates_of(
     """Return the estimate of every unknown by name. systematic: the residual is more than noise; no estimate has an interval then.
 
     inner: about the unknowns inside their bounds, the others held there; everything: about all of them.
+    An unknown that neither knows gets its value alone.
     An unknown inside gets value, std and the t interval, as far as the parameter may go by its nature; the only one on a
     bound gets its one-sided limit; several on bounds get none, for their limits are not independent.
     """
@@ -259,7 +260,9 @@ def estimates_of(
     estimates = {}
     for unknown, value, slope in zip(problem.unknowns, theta, gradient, strict=True):
         name = unknown.name
-        if name not in bound:
+        if name not in bound and name not in inner.names:
+            estimate = Estimate(float(value))
+        elif name not in bound:
             parameter = parameters.get(name)
             limits = (-math.inf, math.inf) if parameter is None else (parameter.min, parameter.max)
             estimate = _inside(unknown, float(value), inner, limits)

@@ -19,6 +19,7 @@ from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
+from hvdc_ident.fit.jump_instants import moving_parameters
 from hvdc_ident.fit.noise_model import unknown_noise
 from hvdc_ident.fit.partial_fits import Group, part_of
 from hvdc_ident.fit.profile_path import ProfileOptions
@@ -36,6 +37,7 @@ from hvdc_ident.identifiability.practical import (
     Assessment,
     hold_structural,
     profile_remaining,
+    with_placed_instants,
     without_insensitive,
     without_null_directions,
 )
@@ -80,7 +82,7 @@ def identifiability(
     _check(assessment)
     assessment.report_stage("structure")
     model = subject.model if isinstance(subject, WithResponses) else subject
-    structure = structural_analysis(model if isinstance(model, Model) else None, problem, seed)
+    structure = _structure(model if isinstance(model, Model) else None, problem, seed)
     hold_structural(assessment, structure)
     free = tuple(f for f in problem.free if f.name not in assessment.held)
     if free:
@@ -92,7 +94,7 @@ def identifiability(
     _data_notes(assessment, first, result)
     assessment.ends = tuple((o.end, o.cost) for o in result.starts if o.cost is not None)
     assessment.thresholds = thresholds(first)
-    last = without_insensitive(assessment, first) if free else None
+    last = without_insensitive(assessment, with_placed_instants(assessment, first)) if free else None
     last = without_null_directions(assessment, last) if last else None
     last = profile_remaining(assessment, last, executor) if last else None
     report = _assembled(assessment, structure, first, last, result, executor)
@@ -100,6 +102,22 @@ def identifiability(
         return replace(report, pair=pair_of(last, report.parameters, pair))
     note = f"No common profile of {' and '.join(pair)}: not both are fitted." if pair else ""
     return replace(report, notes=(*report.notes, note)) if note else report
+
+
+def _structure(model: Model | None, problem: Problem, seed: int) -> StructuralAnalysis:
+    """Return the structure of the parameters beside those that move the instant of a jump.
+
+    Of the instant itself the jump tells, which no derivative between jumps sees; what the records tell of it, their rows say.
+    """
+    instants = moving_parameters(problem)
+    others = tuple(f for f in problem.free if f.name not in instants)
+    if not instants:
+        return structural_analysis(model, problem, seed)
+    if not others:
+        return StructuralAnalysis("decided", "instants of jumps", instants)
+    given = {f.name: f.given for f in problem.free if f.name in instants}
+    found = structural_analysis(model, replace(problem, free=others, held=problem.held | given), seed)
+    return replace(found, admissible=tuple(f.name for f in problem.free if f.name in {*instants, *found.admissible}))
 
 
 def _check(assessment: Assessment) -> None:

@@ -13,11 +13,14 @@ from functools import partial
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter, Problem
+from hvdc_ident.fit.jump_instants import PlacedInstant, placed_instants, within
 from hvdc_ident.fit.nonsmooth import LUCK, roughness, trend_of
 from hvdc_ident.fit.profile import Profile, profiles, trend_profiles
-from hvdc_ident.fit.profile_path import ProfileOptions
+from hvdc_ident.fit.profile_path import ProfileOptions, Side
+from hvdc_ident.fit.uncertainty import TWO_SIDED
 from hvdc_ident.identifiability.likelihood_intervals import (
     OtherOptimum,
     bounded,
@@ -31,7 +34,7 @@ from hvdc_ident.identifiability.likelihood_intervals import (
     thresholds,
     undetermined,
 )
-from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
+from hvdc_ident.identifiability.pilot_fit import HALF_95, LocalAnalysis
 from hvdc_ident.identifiability.structural import (
     Combination,
     StructuralAnalysis,
@@ -66,7 +69,7 @@ class Assessment:
     problem: all candidates free. verdicts: the first on each. held: reason by parameter. held_at: the value of a held one
     where that is not its start. remark: said of every parameter. quiet: no input moves. unmoved: parameters that show only
     where an input is moved that was not. ends: where the starts of the pilot fit ended, with their costs. optima: others
-    as good as the last one.
+    as good as the last one. placed: instants of jumps that lie between two rows, by the parameter that sets them.
     """
 
     problem: Problem
@@ -84,6 +87,7 @@ class Assessment:
     unmoved: tuple[str, ...] = ()
     ends: tuple[tuple[Mapping[str, float], float], ...] = ()
     optima: tuple[OtherOptimum, ...] = ()
+    placed: dict[str, PlacedInstant] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.free: dict[str, FitParameter] = {f.name: f for f in self.problem.free}
@@ -142,6 +146,47 @@ def hold_structural(assessment: Assessment, structure: StructuralAnalysis) -> No
         assessment.notes.append(f"Structure {structure.status}: {structure.note}.")
 
 
+def with_placed_instants(assessment: Assessment, optimum: LocalAnalysis) -> LocalAnalysis:
+    """Return the optimum whose parameters that move the instant of a jump are bounded by the rows on either side of it.
+
+    The cost jumps where the instant passes a row. So the stages that follow, whose verdicts rest on derivatives or on a
+    continuous cost, see it between these rows alone, and leave the parameters themselves to `_profile_of_instant`.
+    """
+    limits = assessment.thresholds
+    rise = max((limits[n] for n in optimum.names), default=TWO_SIDED)
+    assessment.placed = placed_instants(optimum.problem, optimum.theta, rise) if optimum.trend is None else {}
+    ranges = {n: instant.passes for n, instant in assessment.placed.items()}
+    return replace(optimum, problem=within(optimum.problem, optimum.theta, ranges)) if ranges else optimum
+
+
+def _beside_instants(assessment: Assessment, optimum: LocalAnalysis) -> LocalAnalysis:
+    """Return the analysis of the other parameters, with those that place an instant held where they are; itself where all are such."""
+    placed = [n for n in optimum.names if n in assessment.placed]
+    if not placed or len(placed) == len(optimum.names):
+        return optimum
+    problem = replace(
+        optimum.problem,
+        free=tuple(f for f in optimum.problem.free if f.name not in placed),
+        held=optimum.problem.held | {n: optimum.value(n) for n in placed},
+    )
+    kept = [i for i, n in enumerate(optimum.problem.names) if n not in placed]
+    return LocalAnalysis(problem, optimum.theta[kept], optimum.trend)
+
+
+def _thresholds(assessment: Assessment, optimum: LocalAnalysis) -> dict[str, float]:
+    """Return the rise of the cost at the ends of each interval; of one that places an instant the largest of the others'."""
+    limits = thresholds(_beside_instants(assessment, optimum))
+    widest = max((v for n, v in limits.items() if n not in assessment.placed), default=TWO_SIDED * optimum.excess)
+    return {n: widest if n in assessment.placed else limits[n] for n in optimum.names}
+
+
+def _profile_of_instant(instant: PlacedInstant, theta: Array, i: int, threshold: float) -> Profile:
+    """Return the profile of a parameter that moves an instant: it ends where the instant passes a row, or before."""
+    values, rises, thetas = (np.array(column) for column in zip(*instant.points, strict=True))
+    lower, upper = Side("closed", instant.low), Side("closed", instant.high)
+    return Profile(instant.name, float(theta[i]), lower, upper, values, rises, thetas, threshold)
+
+
 def without_insensitive(assessment: Assessment, optimum: LocalAnalysis) -> LocalAnalysis | None:
     """Return the optimum without the parameters whose whole range changes nothing, confirmed by refits at both ends.
 
@@ -150,6 +195,8 @@ def without_insensitive(assessment: Assessment, optimum: LocalAnalysis) -> Local
     matrix, names = optimum.information.matrix, optimum.names
     out: dict[str, str] = {}
     for i, n in enumerate(names):
+        if n in assessment.placed:
+            continue
         limit, free = assessment.thresholds[n], assessment.free[n]
         ends = range_of(free, optimum.value(n), assessment.profile_options.reach)
         unbounded = not math.isfinite(free.max - free.min)
@@ -169,14 +216,15 @@ def without_insensitive(assessment: Assessment, optimum: LocalAnalysis) -> Local
 
 def without_null_directions(assessment: Assessment, optimum: LocalAnalysis) -> LocalAnalysis | None:
     """Return the optimum with the fewest parameters held so that no direction is invisible in these data."""
-    k = len(optimum.names)
-    null = parameter_directions(optimum.columns, k, optimum.error)
+    seen = _beside_instants(assessment, optimum)
+    k = len(seen.names)
+    null = parameter_directions(seen.columns, k, seen.error)
     if not null.size:
         return optimum
-    logs = [u.min > 0 for u in optimum.problem.free]
-    combos = combinations_of(null, optimum.names, logs, optimum.theta[:k].tolist(), "practical")
-    kept = {optimum.names[i] for i in independent(optimum.information.matrix, optimum.error)}
-    members = [n for n in optimum.names if any(n in c.members for c in combos)]
+    logs = [u.min > 0 for u in seen.problem.free]
+    combos = combinations_of(null, seen.names, logs, seen.theta[:k].tolist(), "practical")
+    kept = {seen.names[i] for i in independent(seen.information.matrix, seen.error)}
+    members = [n for n in seen.names if any(n in c.members for c in combos)]
     out = {n: "" for n in members if n not in kept}
     assessment.combinations += [replace(c, held=tuple(n for n in c.members if n in out)) for c in combos]
     for n in members:
@@ -238,9 +286,9 @@ def _profiles(
     trend = trend_of(problem, optimum.theta, rough)
     if trend is not None:
         optimum = LocalAnalysis(problem, trend.theta, trend)
-    limits = thresholds(optimum)
+    limits = _thresholds(assessment, optimum)
     assessment.thresholds |= limits
-    physical = physical_bounds(problem)
+    physical = physical_bounds(problem) | dict.fromkeys(assessment.placed, (True, True))
     if trend is not None:
         note = f"{trend.text}."
         assessment.notes += [note] if note not in assessment.notes else []
@@ -265,14 +313,20 @@ def _profiles(
         executor=executor,
         progress=assessment.progress,
     )
-    found = walked(optimum.theta, optimum.names, threshold=limits)
+    names = [n for n in optimum.names if n not in assessment.placed]
+    found = walked(optimum.theta, names, threshold=limits)
     assessment.notes += [f"A better optimum was found: {r}." for r in found.restarts]
     optimum = LocalAnalysis(problem, found.theta)
+    instants = {
+        n: _profile_of_instant(assessment.placed[n], found.theta, i, limits[n])
+        for i, n in enumerate(optimum.names)
+        if n in assessment.placed
+    }
 
     def walk_again(to: Mapping[str, float]) -> FrozenMap[Profile]:
         return walked(found.theta, list(to), threshold=to).by_name
 
-    return optimum, joint_limits(optimum, found.by_name, limits, walk_again, seed=assessment.seed)
+    return optimum, joint_limits(optimum, found.by_name, limits, walk_again, seed=assessment.seed) | instants
 
 
 def _open_combination(assessment: Assessment, optimum: LocalAnalysis, opened: Sequence[str]) -> Combination | None:
@@ -294,20 +348,29 @@ def _open_combination(assessment: Assessment, optimum: LocalAnalysis, opened: Se
 
 def _judge_closed(assessment: Assessment, optimum: LocalAnalysis, by_name: Mapping[str, Profile]) -> None:
     """Add the verdicts on the set whose profiles are closed."""
-    index = inflation_index(optimum.information.matrix)
+    seen = _beside_instants(assessment, optimum)
+    index = inflation_index(seen.information.matrix)
     shares = optimum.information.shares()
-    spread = spreads(optimum)
+    spread = spreads(seen)
     physical = physical_bounds(optimum.problem)
     conditional = partners(assessment.combinations, assessment.held)
-    for i, n in enumerate(optimum.names):
+    for n in optimum.names:
         profile, free, unit = by_name[n], assessment.free[n], assessment.units[n]
+        if n in assessment.placed:
+            instant = assessment.placed[n]
+            std = (instant.high - instant.low) / math.sqrt(12.0)
+            judged = closed_verdict(profile, free, std, 1.0, "", "the rows on either side of its jump", unit)
+            assessment.judge(judged.noted(f"{instant.text}."))
+            continue
+        i = seen.names.index(n)
         if profile.one_sided:
             assessment.judge(at_bound_verdict(profile, free, physical[n][int(profile.value >= free.max)], unit))
             continue
         best = max(shares, key=lambda e: shares[e][n])
-        verdict = closed_verdict(profile, free, spread[n].std, float(index[i]), partner(optimum, i), f"'{best}'", unit)
         low, high = profile.lower.limit, profile.upper.limit
         assert low is not None and high is not None
+        std = spread[n].std if not assessment.placed else max(spread[n].std, 0.5 * (high - low) / HALF_95)
+        verdict = closed_verdict(profile, free, std, float(index[i]), partner(seen, i), f"'{best}'", unit)
         rivals = [o for o in assessment.optima if o.rise < profile.threshold and not low <= o.values[n] <= high]
         if rivals:
             verdict = local_verdict(verdict, [o.values[n] for o in rivals], rivals[0].rise)

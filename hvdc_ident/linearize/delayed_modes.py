@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hvdc_ident.errors import LinearizationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.characteristic import Part
 from hvdc_ident.linearize.delays import DelayFree
@@ -31,6 +32,14 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     """
     core = model.delay_free
     assert core is not None
+    zero_delays = [c.name for c in core.channels if c.total == 0.0]
+    if zero_delays:
+        raise LinearizationError(
+            "modes have no computed derivative by a delay of 0 s",
+            where=f"linear model '{model.name}'",
+            got=", ".join(zero_delays),
+            hint="leave its parameters out of the sensitivities, or take a small delay",
+        )
     equation = model.characteristic
     found_roots = equation.roots
     roots = found_roots.values if found_roots.averaged is None else found_roots.averaged

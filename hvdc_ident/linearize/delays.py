@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from math import factorial
 
 import numpy as np
@@ -159,20 +160,32 @@ def channels(model: Model, s: CompiledSystem, p: Array) -> tuple[Channel, ...]:
     return tuple(found)
 
 
-def _order(size: Layout, inputs: list[int]) -> tuple[list[int], list[int]]:
+def _order(size: Layout, inputs: list[int], closed: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Return the Jacobian's rows [x', outputs, delayed, eliminated] and columns, the closed delays among the eliminated."""
+    open_ = [k for k in range(size.ne) if k not in closed]
     rows = [
         *range(size.nx),
         *range(size.n + size.ne, size.main),
-        *range(size.n, size.n + size.ne),
+        *(size.n + k for k in (*open_, *closed)),
         *range(size.nx, size.n),
     ]
     columns = [
         *range(size.nx),
         *(size.n + k for k in inputs),
-        *range(size.n + size.nu, size.columns),
+        *(size.n + size.nu + k for k in (*open_, *closed)),
         *range(size.nx, size.n),
     ]
     return rows, columns
+
+
+def _core(size: Layout, jac: Array, inputs: list[int], closed: Sequence[int]) -> Eliminated:
+    """Return the Jacobian over [x, inputs, delays' outputs], unknowns and delays of 0 s eliminated."""
+    rows, columns = _order(size, inputs, closed)
+    jac = jac.copy()
+    for k in closed:  # the delayed signal is the signal itself
+        jac[size.n + k, size.n + size.nu + k] -= 1.0
+    count = size.ne - len(closed)
+    return eliminate(jac[np.ix_(rows, columns)], size.nx + size.no + count, size.nx + len(inputs) + count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,23 +199,40 @@ class DelayFree:
     channels: tuple[Channel, ...]
 
     @classmethod
-    def of(cls, size: Layout, jac: Array, inputs: list[int], found: tuple[Channel, ...]) -> DelayFree:
-        """Return the core of a Jacobian (main rows, columns)."""
-        rows, columns = _order(size, inputs)
-        n_r, n_c = size.nx + size.no + size.ne, size.nx + len(inputs) + size.ne
-        reduced = eliminate(jac[np.ix_(rows, columns)], n_r, n_c)
+    def of(
+        cls, size: Layout, jac: Array, inputs: list[int], found: tuple[Channel, ...], closed: Sequence[int] = ()
+    ) -> DelayFree:
+        """Return the core of a Jacobian (main rows, columns). closed: delays of 0 s by their place, which are none."""
+        reduced = _core(size, jac, inputs, closed)
         if not np.isfinite(reduced.condition):
             raise LinearizationError("the algebraic part is singular", got="no solution for its unknowns")
-        return cls(reduced.result, size.nx, size.no, len(inputs), found)
+        kept = tuple(c for k, c in enumerate(found) if k not in closed)
+        return cls(reduced.result, size.nx, size.no, len(inputs), kept)
 
     @staticmethod
-    def derivative(size: Layout, jac: Array, djac: Array, inputs: list[int]) -> Array:
-        """Return (directions, ...) the derivative of the core's matrix."""
-        rows, columns = _order(size, inputs)
-        r, c = size.nx + size.no + size.ne, size.nx + len(inputs) + size.ne
-        reduced = eliminate(jac[np.ix_(rows, columns)], r, c)
+    def derivative(size: Layout, jac: Array, djac: Array, inputs: list[int], closed: Sequence[int] = ()) -> Array:
+        """Return (directions, ...) the derivative of the core's matrix. closed: as in `of`."""
+        rows, columns = _order(size, inputs, closed)
+        count = size.ne - len(closed)
+        r, c = size.nx + size.no + count, size.nx + len(inputs) + count
         d = djac[:, np.array(rows)[:, None], columns]
-        return reduced.derivative(d[:, :r, :c], d[:, :r, c:], d[:, r:, :c], d[:, r:, c:])
+        return _core(size, jac, inputs, closed).derivative(d[:, :r, :c], d[:, :r, c:], d[:, r:, :c], d[:, r:, c:])
+
+    def without_zero_delays(self) -> DelayFree:
+        """Return the core in which what a delay of 0 s gives is what it gets. Raises LinearizationError for a loop of gain 1."""
+        closed = [k for k, c in enumerate(self.channels) if c.total == 0.0]
+        if not closed:
+            return self
+        kept = [k for k in range(len(self.channels)) if k not in closed]
+        r, c = self.nx + self.no, self.nx + self.nu
+        matrix = self.matrix.copy()
+        matrix[[r + k for k in closed], [c + k for k in closed]] -= 1.0
+        rows = [*range(r), *(r + k for k in (*kept, *closed))]
+        columns = [*range(c), *(c + k for k in (*kept, *closed))]
+        reduced = eliminate(matrix[np.ix_(rows, columns)], r + len(kept), c + len(kept))
+        if not np.isfinite(reduced.condition):
+            raise LinearizationError("the loop through a delay of 0 s is singular", got="no solution for its signals")
+        return replace(self, matrix=reduced.result, channels=tuple(self.channels[k] for k in kept))
 
     def response(self, s: Array) -> Array:
         """Return (frequencies, outputs, inputs) exact transfer matrix at complex frequencies s, rad/s."""
@@ -212,7 +242,7 @@ class DelayFree:
             if not (s == 0).any():
                 raise
         # A sliding mean is 0/0 at s = 0: the even part of the response beside it is its limit there, to 1e-10.
-        beside = 1e-5j / max(c.total for c in self.channels)
+        beside = 1e-5j / (max(c.total for c in self.channels) or 1.0)
         found = self._solve(np.where(s == 0, beside, s), None, ())
         found[s == 0] = found[s == 0].real
         return found
@@ -268,7 +298,9 @@ class Blocks:
     def __init__(self, s: CompiledSystem, found: tuple[Channel, ...], order: int) -> None:
         self.size, self.channels, self.order = s.layout, found, order
         self.pade = pade(order) if found else (np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0)
-        self.n_pade = order * len(found)
+        self.closed = tuple(k for k, c in enumerate(found) if c.total == 0.0)
+        self.approximated = tuple(k for k, c in enumerate(found) if c.total > 0.0)
+        self.n_pade = order * len(self.approximated)
         self.n = self.size.nx + self.n_pade
         self.rows, self.columns = self.n + self.size.no, self.n + self.size.nu
 
@@ -296,36 +328,45 @@ class Blocks:
         """Return the matrix to reduce: rows [x', Pade', outputs | g, delays], columns [x, Pade, u | z, e]."""
         total = self.spread(jac)
         if self.channels:
-            a, _, c, through = self.pade
-            z, sources = self.size, self.sources(jac)
-            self._add_sources(total, sources, through)
-            for i, channel in enumerate(self.channels):
-                block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
-                total[block, block] += a / channel.total
+            a, _, c, _ = self.pade
+            z = self.size
+            self._add_sources(total, self.sources(jac))
+            for i, block in self._blocks():
+                total[block, block] += a / self.channels[i].total
                 total[-z.ne + i, block] += c
+            for i in range(z.ne):
                 total[-z.ne + i, -z.ne + i] -= 1.0
         return total
 
-    def _add_sources(self, total: Array, sources: Array, through: float) -> None:
-        z, b = self.size, self.pade[1]
-        for i, channel in enumerate(self.channels):
-            block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
-            total[..., block, :] += b[:, None] / channel.total * sources[..., i : i + 1, :]
-            total[..., total.shape[-2] - z.ne + i, :] += through * sources[..., i, :]
+    def _blocks(self) -> list[tuple[int, slice]]:
+        """Return each approximated delay or sampled block by its place, and its Pade states."""
+        firsts = range(self.size.nx, self.n, self.order)
+        return [(i, slice(first, first + self.order)) for i, first in zip(self.approximated, firsts, strict=True)]
+
+    def _add_sources(self, total: Array, sources: Array) -> None:
+        ends = total.shape[-2] - self.size.ne
+        _, b, _, through = self.pade
+        for i in self.closed:
+            total[..., ends + i, :] += sources[..., i, :]
+        for i, block in self._blocks():
+            total[..., block, :] += b[:, None] / self.channels[i].total * sources[..., i : i + 1, :]
+            total[..., ends + i, :] += through * sources[..., i, :]
 
     def matrix_along(self, djac: Array, jac: Array, dtime: Array) -> Array:
-        """Return the derivative of `matrix`, (directions, ...); djac: of the Jacobian; dtime: (channels, directions)."""
+        """Return the derivative of `matrix`, (directions, ...); djac: of the Jacobian; dtime: (channels, directions).
+
+        It is not a number along a delay of 0 s: -s of what is delayed is no derivative of A, B, C and D.
+        """
         total = self.spread(djac)
         if self.channels:
-            a, b, _, through = self.pade
-            z = self.size
-            self._add_sources(total, self.sources(djac), through)
+            a, b, _, _ = self.pade
+            self._add_sources(total, self.sources(djac))
             sources = self.sources(jac)
-            for i, channel in enumerate(self.channels):
-                block = slice(z.nx + i * self.order, z.nx + (i + 1) * self.order)
-                change = -dtime[i] / channel.total**2
+            for i, block in self._blocks():
+                change = -dtime[i] / self.channels[i].total ** 2
                 total[:, block, block] += change[:, None, None] * a
                 total[:, block, :] += change[:, None, None] * b[:, None] * sources[i]
+            total[(dtime[list(self.closed)] != 0.0).any(axis=0)] = np.nan
         return total
 
     def split(self, total: Array, inputs: list[int]) -> tuple[Array, Array, Array, Array]:

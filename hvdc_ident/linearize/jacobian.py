@@ -69,8 +69,18 @@ def linearize(
             got=f"condition number {reduced.condition:.2g}",
             hint="choose another pade_order, or open the loop at a signal in it",
         )
-    gradient = _gradient(s, at, parts, jac, modes, reduced, sensitivities, chosen) if sensitivities and not keep else {}
-    return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side)
+    names = sensitivities if not keep else ()
+    closed = _closed(s, at.p, parts, names)
+    gradient = _gradient(s, at, parts, jac, modes, reduced, names, chosen, closed) if names else {}
+    return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side, closed)
+
+
+def _closed(s: CompiledSystem, p: Array, parts: Blocks, names: Sequence[str]) -> tuple[int, ...]:
+    """Return the places of the delays of 0 s that none of the named parameters changes: they are no delays."""
+    if not parts.closed or not names:
+        return parts.closed
+    by_p = s.timing_by_parameters(p)[:, [s.parameters.index(n) for n in names]]
+    return tuple(k for k in parts.closed if not by_p[list(parts.channels[k].places)].any())
 
 
 def _eliminated(
@@ -112,7 +122,9 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
     if not np.isfinite(jac).all():
         raise _not_finite(s, jac, model.name)
     _refuse_flat_roots(s, y, w, p, modes, model.name)
-    return Characteristic.of(DelayFree.of(s.layout, jac, list(range(s.layout.nu)), channels(model, s, p)))
+    found = channels(model, s, p)
+    closed = [k for k, c in enumerate(found) if c.total == 0.0]
+    return Characteristic.of(DelayFree.of(s.layout, jac, list(range(s.layout.nu)), found, closed))
 
 
 def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:
@@ -221,8 +233,9 @@ def _gradient(
     reduced: Eliminated,
     names: Sequence[str],
     chosen: list[int],
+    closed: Sequence[int],
 ) -> dict[str, Gradient]:
-    """Return the total derivatives of A, B, C, D by parameters."""
+    """Return the total derivatives of A, B, C, D by parameters. closed: delays of 0 s that none of them changes."""
     which = [s.parameters.index(n) for n in names]
     directions = shift(s, at, which)
     djac = s.jacobian_along(at.y, at.w, at.p, modes, directions)
@@ -233,12 +246,13 @@ def _gradient(
     along = parts.matrix_along(djac, jac, dtime)
     r, c = parts.rows, parts.columns
     changes = reduced.derivative(along[:, :r, :c], along[:, :r, c:], along[:, r:, :c], along[:, r:, c:])
-    core = DelayFree.derivative(s.layout, jac, djac, chosen) if parts.channels else None
+    kept = [ch for k, ch in enumerate(parts.channels) if k not in closed]
+    core = DelayFree.derivative(s.layout, jac, djac, chosen, closed) if kept else None
     found = {}
     for k, name in enumerate(names):
         a, b, c_, d = parts.split(changes[k], chosen)
         free = None if core is None else core[k]
-        found[name] = Gradient(a, b, c_, d, free, tuple(by_p[list(ch.places), k] for ch in parts.channels))
+        found[name] = Gradient(a, b, c_, d, free, tuple(by_p[list(ch.places), k] for ch in kept))
     return found
 
 
@@ -281,8 +295,10 @@ def _model(
     keep: bool,
     gradient: dict[str, Gradient],
     side: Side,
+    closed: Sequence[int],
 ) -> LinearModel:
-    names = [*s.states, *(f"{c.name}.pade{k + 1}" for c in parts.channels for k in range(parts.order))]
+    approximated = [parts.channels[k] for k in parts.approximated]
+    names = [*s.states, *(f"{c.name}.pade{k + 1}" for c in approximated for k in range(parts.order))]
     units = [model.states[n].unit for n in s.states] + [""] * parts.n_pade
     if keep:
         z = s.layout
@@ -301,8 +317,8 @@ def _model(
         "algebraic part": "kept, descriptor" if keep else "eliminated" if s.layout.nz else "none",
         "limits": "held as at the point" if side == "refuse" else f"one-sided: {side} the limit",
     }
-    if parts.channels:
-        kinds = {c.kind for c in parts.channels}
+    if approximated:
+        kinds = {c.kind for c in approximated}
         notes["delays"] = f"Pade of order {parts.order} in A, B, C, D; exact in the frequency response"
         if "sampled" in kinds:
             notes["sampled blocks"] = (
@@ -323,7 +339,9 @@ def _model(
         name=model.name,
         provenance=FrozenMap(notes),
         gradients=FrozenMap(gradient),
-        delay_free=DelayFree.of(s.layout, jac, chosen, parts.channels) if parts.channels else None,
+        delay_free=DelayFree.of(s.layout, jac, chosen, parts.channels, closed)
+        if len(parts.channels) > len(closed)
+        else None,
     )  # fmt: skip
 
 

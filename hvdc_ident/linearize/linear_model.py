@@ -250,7 +250,7 @@ class LinearModel(Shown):
         from hvdc_ident.linearize.stability import Characteristic as Equation
 
         assert self.delay_free is not None
-        return Equation.of(self.delay_free)
+        return Equation.of(self.delay_free.without_zero_delays())
 
     def poles(self) -> Array:
         """Return (states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor.

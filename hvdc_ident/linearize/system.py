@@ -28,7 +28,7 @@ def evaluate(graph: Graph, roots: Iterable[int], leaves: Mapping[int, Any], size
     wanted = list(roots)
     values: dict[int, Any] = {}
     with np.errstate(all="ignore"):
-        for n in graph.reachable([*wanted, *graph.switches]):
+        for n in graph.reachable(wanted):
             values[n] = _node(graph, n, values, leaves)
     return [np.broadcast_to(np.asarray(values[r], dtype=complex), (size,)) for r in wanted]
 
@@ -253,12 +253,14 @@ class CompiledSystem:
         zero = self._zero
         t = self._run("timing", nd + 2 * nq, zero, zero, p, zero)
         for name, value in zip((*model.delays, *model.sampled), t[: nd + nq], strict=True):
-            if not value > 0.0:
+            if not (value > 0.0 or (value == 0.0 and name in model.delays)):
                 raise TimingError(
-                    f"the delay or sampling period of '{name}' is not above 0",
+                    f"the delay of '{name}' is negative"
+                    if name in model.delays
+                    else f"the sampling period of '{name}' is not above 0",
                     where=f"model '{model.name}'",
                     got=f"{value:g} s",
-                    hint="give it a positive time, or leave the effect out; where it is estimated, `min` above 0",
+                    hint="bounds within which its time is not negative, and a sampling period above 0",
                 )
         return t
 

@@ -1,7 +1,7 @@
 """Models, their text form, and models made from models."""
 
 from hvdc_ident.model.card import parse_card, read_card, save_card, write_card
-from hvdc_ident.model.check import coerced, dependency_order, ordered_signals
+from hvdc_ident.model.check import coerced, dependency_order, ordered_signals, used_names
 from hvdc_ident.model.definition import (
     Algebraic,
     AnyModel,
@@ -24,6 +24,7 @@ from hvdc_ident.model.transform import (
     insertion_point_of,
     rewritten,
     with_derivative_signal,
+    without_delays,
 )
 
 __all__ = [
@@ -51,6 +52,8 @@ __all__ = [
     "recording",
     "rewritten",
     "save_card",
+    "used_names",
     "with_derivative_signal",
+    "without_delays",
     "write_card",
 ]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, cast
 
@@ -42,7 +42,8 @@ def coerced(model: Model) -> dict[str, FrozenMap[Any]]:
 
     A number becomes a Parameter or Input; a text of the grammar, a sympy expression or a number a State (its
     derivative), Signal, Algebraic or Output; a dict is taken by the names of the object's fields. Symbols become the
-    models' real ones. A state with a free start adds the parameter NAME_start. Coercing twice changes nothing.
+    models' real ones. A state with a free start adds the parameter NAME_start. A parameter that is the time of a delay is
+    bounded by 0 from below. Coercing twice changes nothing.
 
     Raises ModelError, UnknownNameError or ExpressionError with the place.
     """
@@ -52,7 +53,23 @@ def coerced(model: Model) -> dict[str, FrozenMap[Any]]:
     missing = {n: p for n, p in free.items() if n not in result["parameters"]}
     if missing:
         result["parameters"] = result["parameters"] | missing
+    times = {d.time.name for d in result["delays"].values() if isinstance(d.time, sp.Symbol)}
+    below_zero = {n: p for n, p in result["parameters"].items() if n in times and p.min < 0.0}
+    if below_zero:
+        result["parameters"] = result["parameters"] | {n: _not_negative(n, p, place) for n, p in below_zero.items()}
     return result
+
+
+def _not_negative(name: str, parameter: Parameter, place: str) -> Parameter:
+    """Return the parameter with 0 as its lower bound. Raises ModelError where its value is below."""
+    if parameter.value < 0.0:
+        raise ModelError(
+            "the time of a delay is negative",
+            where=f"{place}, parameter '{name}'",
+            expected="0 s or more",
+            got=f"{parameter.value:g}",
+        )
+    return replace(parameter, min=0.0)
 
 
 def _section(items: object, section: str, place: str) -> FrozenMap[Any]:
@@ -265,6 +282,11 @@ def _expressions(model: Model) -> Iterator[tuple[str, str, str, sp.Expr, bool]]:
         yield "sampled", name, "compute", sampled.compute, True
 
 
+def used_names(model: Model) -> frozenset[str]:
+    """Return the names that stand in any expression of the model."""
+    return frozenset().union(*(_used(e) for _, _, _, e, _ in _expressions(model)))
+
+
 def _check_symbols(model: Model) -> None:
     names = {*model.names, "time"}
     for section, name, part, expression, only_parameters in _expressions(model):
@@ -301,7 +323,7 @@ def _unknown(model: Model, name: str, place: str) -> UnknownNameError:
 
 def _check_constants(model: Model) -> None:
     for name, delay in model.delays.items():
-        _bounded(delay.time, True, _place(model, "delays", name, "time"))
+        _bounded(delay.time, False, _place(model, "delays", name, "time"))
     for name, sampled in model.sampled.items():
         _bounded(sampled.period, True, _place(model, "sampled", name, "period"))
         _bounded(sampled.compute, False, _place(model, "sampled", name, "compute"))

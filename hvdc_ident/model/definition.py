@@ -67,7 +67,10 @@ class Output:
 
 @dataclass(frozen=True)
 class Delay:
-    """d(t) = of(t - time), a true delay; `time` is an expression of parameters in s, above 0."""
+    """d(t) = of(t - time), a true delay; `time` is an expression of parameters in s, 0 or above; at 0 d is `of` itself.
+
+    A parameter that is the time gets 0 as its lower bound, where it has no higher one.
+    """
 
     of: sp.Expr
     time: sp.Expr

@@ -11,7 +11,7 @@ import sympy as sp
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model.definition import Model, ModelOrigin, Signal
+from hvdc_ident.model.definition import Algebraic, Model, ModelOrigin, Signal
 from hvdc_ident.parameters import Input, Parameter
 
 Renaming = Mapping[sp.Symbol, sp.Symbol]
@@ -105,6 +105,20 @@ def rewritten(model: Model, name: str, label: str, rewrite: Callable[[Model, sp.
     )
     model, y = rewrite(model, symbol(before))
     return replace(model, algebraic=model.algebraic | {name: replace(unknown, equation=y)}, origin=origin)
+
+
+def without_delays(model: Model, names: Collection[str]) -> Model:
+    """Return the model in which these delayed signals are the signals themselves, as with a time of 0.
+
+    Where a delay alone opened a circle its signal is an algebraic unknown.
+    """
+    unknowns = {n: Algebraic(model.delays[n].of) for n in names}
+    return replace(
+        model,
+        delays=FrozenMap({n: d for n, d in model.delays.items() if n not in unknowns}),
+        algebraic=model.algebraic | unknowns,
+        origin=model.origin or ModelOrigin(model),
+    )
 
 
 def with_derivative_signal(model: Model, state: str) -> tuple[Model, str]:

@@ -74,10 +74,17 @@ class Engine:
             m = self.structure.model
             names = [*m.delays, *m.sampled]
             for k, name in enumerate(names):
-                if not values[k] > 0.0:
-                    kind = "delay" if k < s.nd else "sampling period"
+                if k < s.nd and not values[k] >= 0.0:
                     raise TimingError(
-                        f"the {kind} of '{name}' is not above 0",
+                        f"the delay of '{name}' is negative",
+                        where=f"model '{m.name}'",
+                        expected="0 s or more",
+                        got=f"{values[k]:g} s",
+                        hint="bounds within which the expression of its time is not negative",
+                    )
+                if k >= s.nd and not values[k] > 0.0:
+                    raise TimingError(
+                        f"the sampling period of '{name}' is not above 0",
                         where=f"model '{m.name}'",
                         got=f"{values[k]:g} s",
                         hint="give it a positive time, or leave the effect out; where it is estimated, `min` above 0",
@@ -93,17 +100,16 @@ class Engine:
                     )
         return values
 
-    def _check_steps(self, delays: Array, span: float, most: int) -> None:
-        """Raise SimulationError where a delay is so short that the run cannot end: no step is longer than a delay."""
-        for name, delay in zip(self.structure.model.delays, delays, strict=True):
-            if delay * most < span:
-                raise SimulationError(
-                    f"the delay of '{name}' is too short to be simulated over {span:g} s",
-                    where=f"model '{self.structure.model.name}'",
-                    expected=f"at least {span / most:.3g} s, for no step is longer than a delay and a run has {most} at most",
-                    got=f"{delay:.6g} s",
-                    hint="leave the delay out; where it is estimated, a `min` well above this",
-                )
+    def delay_times(self, p: Array) -> tuple[Array, Array]:
+        """Return the time of each delay, (nd,) s, and its derivatives by the sensitivity parameters, (nd, np).
+
+        Raises TimingError for a negative one.
+        """
+        s = self.structure.sizes
+        constants = self.constants(p)
+        first = s.nd + 2 * s.nq
+        rows = constants[first : first + s.nd * s.width].reshape(s.nd, s.width)
+        return constants[: s.nd], rows[:, : s.np]
 
     # --- the run ---
 
@@ -121,6 +127,7 @@ class Engine:
         """Outputs at the times, (n, outputs (1 + width)): values, then rows; and what it cost.
 
         inputs: one InputSignal an input. first: where the run starts, s (default: the first time). model: as in `start`.
+        No step is longer than a delay: `short_delays.run` is for models with delays that may be short.
         """
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
@@ -128,7 +135,6 @@ class Engine:
         u, *tables = _tables(tuple(inputs), begin, end)
         y, w = self.start(p, u, begin, search=tolerance.search, model=model)
         constants = self.constants(p)
-        self._check_steps(constants[: s.nd], end - begin, tolerance.max_steps)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
         sizes = np.ones(max(s.np, 1)) if scale is None else np.ascontiguousarray(scale, dtype=float)
         allowed = np.array([tolerance.rtol, tolerance.atol])
@@ -218,6 +224,20 @@ class Engine:
                 # work of one of the other's, which needs some hundreds to follow a waveform.
                 self._explicit = bool(fastest * span < 3e3)
         return self._explicit
+
+    def fastest(self, p: Array, inputs: Sequence[Any], time: Array, tolerance: Tolerance, model: Model) -> float:
+        """Return the largest modulus of an eigenvalue at the start, rad/s; infinite where one cannot be told.
+
+        Arguments as in `run`.
+        """
+        s = self.structure.sizes
+        u, *_ = _tables(tuple(inputs), float(time[0]), float(time[-1]))
+        y, w = self.start(p, u, float(time[0]), search=tolerance.search, model=model)
+        jac = self.jacobian(p, y, w)
+        if not np.isfinite(jac).all() or np.linalg.matrix_rank(jac[s.nx :, s.nx :]) < s.nz:
+            return np.inf
+        unknowns = np.linalg.solve(jac[s.nx :, s.nx :], jac[s.nx :, : s.nx])
+        return float(np.abs(np.linalg.eigvals(jac[: s.nx, : s.nx] - jac[: s.nx, s.nx :] @ unknowns)).max(initial=0.0))
 
     def jacobian(self, p: Array, y: Array, w: Array) -> Array:
         """d[f; g]/d[x; z], (n, n), at y and w with modes as the values say."""

@@ -173,19 +173,23 @@ def switch(r, event):  # type: ignore[no-untyped-def]
 
 @kernel()
 def _jump(r, event, speed):  # type: ignore[no-untyped-def]
-    """The jump condition, where the right-hand side jumps at all: r.jump_p, the sensitivities, the unknowns' too."""
+    """The jump condition: r.jump_p, and where the right-hand side jumps at all the sensitivities, the unknowns' too.
+
+    What jumps may be the source of a delay alone, whose jump comes back later with the same r.jump_p.
+    """
     width = r.width
     evaluate(r, r.do_f, r.y, r.f_after)
     before, after = vector(r.f_before, r.nx), vector(r.f_after, r.nx)
     biggest = 0.0
     for i in range(r.nx):
         biggest = max(biggest, abs(before[i] - after[i]) / (1e-9 + abs(before[i]) + abs(after[i])))
-    if biggest > 1e-7 and speed != 0.0:
+    if speed != 0.0:
         jump, row = vector(r.jump_p, width), vector(r.sws + 8 * (r.ns + event * width), width)
         for c in range(width):
             jump[c] = -row[c] / speed
-        shift_rows(r, r.f_before, r.f_after, r.jump_p)
-        consistent(r, False)
+        if biggest > 1e-7:
+            shift_rows(r, r.f_before, r.f_after, r.jump_p)
+            consistent(r, False)
 
 
 # --- the algebraic unknowns ---

@@ -20,7 +20,8 @@ from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, State, fresh, rewritten
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.simulate.engine import Method, Tolerance, engine_of
+from hvdc_ident.simulate.engine import Method, Tolerance
+from hvdc_ident.simulate.short_delays import run
 from hvdc_ident.simulate.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ class ModelSimulator:
     ) -> Simulation:
         """Return a run of the experiment.
 
-        Raises SimulationError; values without a steady state, or with a delay of 0, are a run that failed.
+        Raises SimulationError; values without a steady state, or with a negative delay, are a run that failed.
         """
         try:
             return simulate(
@@ -160,8 +161,8 @@ def simulate(
     if not isinstance(model, Model):
         chosen = tuple(model.outputs) if outputs is None else outputs
         ending = {"partial": True} if partial else {}
-        found: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol, **ending)
-        return found
+        own: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol, **ending)
+        return own
     plant = with_recording(model, experiment)
     given = {**experiment.values, **(values or {})}
     where = f"experiment '{experiment.name}'"
@@ -173,7 +174,6 @@ def simulate(
     names = tuple(n for n in (*plant.inputs, *plant.states) if n in shifts or n in sensitivities)
     plant, parameter = _with_offsets_and_starts(plant, names) if names else (plant, FrozenMap())
     given |= {parameter[n]: v for n, v in shifts.items()}
-    code = engine_of(plant, [parameter.get(n, n) for n in sensitivities], outputs)
     p = [float(given.get(n, q.value)) for n, q in plant.parameters.items()]
     if not all(map(math.isfinite, p)):
         bad = [n for n, v in zip(plant.parameters, p, strict=True) if not math.isfinite(v)]
@@ -183,16 +183,12 @@ def simulate(
             hint="an effect at an infinite neutral value is left out: do not set it",
         )
     signals = [experiment.inputs.get(n) or _constant(float(given.get(n, i.value))) for n, i in plant.inputs.items()]
-    scale = np.array([plant.parameters[n].size for n in code.structure.sensitivities]) if sensitivities else None
+    wanted = tuple(parameter.get(n, n) for n in sensitivities)
+    seen = tuple(plant.outputs if outputs is None else outputs)
     try:
-        out, statistics = code.run(np.array(p), signals, experiment.time, tol, method, scale, model=plant)
+        found = run(plant, wanted, seen, np.array(p), signals, experiment.time, tol, method)
     except (SimulationError, SteadyStateError) as e:
         raise e.at(where) from None
-    s, rows = code.structure.sizes, experiment.time.size
-    units = tuple(plant.outputs[n].unit if n in plant.outputs else "" for n in code.structure.outputs)
-    return Simulation(
-        Trajectory(experiment.time, out[:, : s.no], code.structure.outputs, units),
-        tuple(sensitivities),
-        out[:, s.no :].reshape(rows, s.no, s.width)[:, :, : s.np] if s.width else np.zeros((rows, s.no, 0)),
-        statistics,
-    )
+    units = tuple(plant.outputs[n].unit if n in plant.outputs else "" for n in seen)
+    trajectory = Trajectory(experiment.time, found.values, seen, units)
+    return Simulation(trajectory, tuple(sensitivities), found.slopes, found.statistics)

@@ -46,6 +46,11 @@ def zoo() -> Model:
     return parse_card(ZOO)
 
 
+def undelayed() -> Model:
+    """The same with a delay of 0."""
+    return zoo().with_values({"T": 0.0})
+
+
 def link() -> Model:
     """The shipped link."""
     return load_model("vsc-hvdc-link")

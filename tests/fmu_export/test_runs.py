@@ -8,7 +8,9 @@ from fmpy import simulate_fmu
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.fmu import read_fmu
+from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import simulate
+from tests.fmu_export.cases import ZOO
 from tests.fmu_export.driver import cosimulate
 
 # No row falls on an instant at which a sampled value changes.
@@ -124,6 +126,15 @@ def test_model_exchange_under_another_solver(fmu, name, version):
         assert settled.mean() > 0.9
         found, expected = found[settled], expected[settled]
     assert worst(found, expected) < 2e-5
+
+
+def test_a_delay_of_0_is_left_out_with_its_parameter(fmu):
+    f = fmu("undelayed")
+    assert "T" not in {v.name for v in f.description.modelVariables}
+    outputs = list(f.model.outputs)
+    found = cosimulate(f, TIME, RAMPS["zoo"], fmi_names(outputs), tolerance=1e-10)
+    plain = parse_card(ZOO.replace('[delays]\nlate = {of = "x + 0.5*q", time = "T"}', '[signals]\nlate = "x + 0.5*q"'))
+    assert worst(found, engine_run(plain, RAMPS["zoo"], outputs)) < 1e-6
 
 
 def test_parameters_and_inputs_set_before_the_start_move_it(fmu):

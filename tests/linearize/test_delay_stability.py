@@ -5,7 +5,9 @@ import pytest
 from scipy.special import lambertw
 
 import hvdc_ident as hi
+from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.delays import Channel
+from hvdc_ident.linearize.frequency import sensitivity
 from hvdc_ident.linearize.stability import Characteristic, stability
 
 
@@ -228,3 +230,60 @@ def test_the_limits_of_a_late_integrator_along_its_gain():
     assert [x.direction for x in found.limits] == ["lost", "lost"]
     np.testing.assert_array_equal(found.stable, found.values < np.pi)
     assert found.to_dict()["unstable_roots"][-1] == 4
+
+
+# --- delays of 0 ---
+
+
+def two_delays(first, length, k=3.0):
+    """An integrator with a lag, its error late, and a second delay within the loop."""
+    return hi.Model(
+        name="two-delays",
+        parameters={"T": {"value": first, "unit": "s"}, "length": length, "speed": 2.0, "k": k},
+        inputs={"u": 0.0},
+        states={"x": "late - x"},
+        signals={"e": "u - k*x - 0.3*later"},
+        delays={"late": {"of": "e", "time": "T"}, "later": {"of": "late", "time": "length/speed"}},
+        outputs={"x": "x"},
+    )
+
+
+OMEGA = np.array([0.5, 3.0, 20.0])
+
+
+def two_delays_response(first, second, k=3.0):
+    """x/u = D/((s + 1)(1 + D (k/(s + 1) + 0.3 E))), D and E the two delays."""
+    s = 1j * OMEGA
+    d, e = np.exp(-s * first), np.exp(-s * second)
+    return d / (1.0 + d * (k / (s + 1.0) + 0.3 * e)) / (s + 1.0)
+
+
+def test_a_delay_of_0_is_none_beside_one_that_is():
+    linear = hi.linearize(two_delays(0.0, 0.2))
+    assert linear.state_names == ("x", *(f"later.pade{k}" for k in range(1, 6)))
+    np.testing.assert_allclose(linear.response(OMEGA)[:, 0, 0], two_delays_response(0.0, 0.1), rtol=1e-12)
+    # Rightmost root of (s + 1)(1 + 0.3 exp(-0.1 s)) + 3 = 0, real.
+    pole = linear.poles()[0]
+    assert abs((pole + 1.0) * (1.0 + 0.3 * np.exp(-0.1 * pole)) + 3.0) < 1e-9
+
+
+def test_a_model_all_whose_delays_are_0_has_the_matrices_of_the_loop_without_them():
+    """late = (u - 3 x)/1.3, so x' = -x - 3 x/1.3 + u/1.3."""
+    linear = hi.linearize(two_delays(0.0, 0.0))
+    np.testing.assert_allclose(linear.A, [[-1.0 - 3.0 / 1.3]], rtol=1e-12)
+    np.testing.assert_allclose(linear.B, [[1.0 / 1.3]], rtol=1e-12)
+    assert linear.delay_free is None and linear.state_names == ("x",)
+
+
+def test_the_response_has_its_derivative_by_a_delay_at_0():
+    linear = hi.linearize(two_delays(0.0, 0.2), sensitivities=("T", "k"))
+    found = sensitivity(linear, OMEGA)
+    h = 1e-5
+    ahead = [two_delays_response(n * h, 0.1) for n in range(3)]
+    by_delay = (-3.0 * ahead[0] + 4.0 * ahead[1] - ahead[2]) / (2.0 * h)
+    by_gain = (two_delays_response(0.0, 0.1, 3.0 + h) - two_delays_response(0.0, 0.1, 3.0 - h)) / (2.0 * h)
+    np.testing.assert_allclose(found["T"][:, 0, 0], by_delay, rtol=1e-7)
+    np.testing.assert_allclose(found["k"][:, 0, 0], by_gain, rtol=1e-7)
+    assert np.isnan(linear.gradients["T"].A).all() and np.isfinite(linear.gradients["k"].A).all()
+    with pytest.raises(LinearizationError, match="no computed derivative by a delay of 0 s"):
+        linear.modes()

@@ -116,7 +116,7 @@ def test_a_factored_expression_is_stored_as_it_reads_back() -> None:
         ({"outputs": {"y": [1]}}, ModelError, "this is no expression"),
         ({"outputs": {"y": "z"}}, UnknownNameError, "output 'y': no variable 'z'"),
         ({"outputs": {"y": "w", "z": "y"}}, UnknownNameError, "an output cannot be read"),
-        ({"delays": {"d": {"of": "w", "time": 0}}}, ModelError, "delay 'd', time: the time is wrong"),
+        ({"delays": {"d": {"of": "w", "time": -1}}}, ModelError, "delay 'd', time: the time is wrong"),
         ({"delays": {"d": {"of": "w", "time": "w"}}}, ModelError, "delay 'd', time: 'w' is no parameter"),
         ({"delays": {"d": "w"}}, ModelError, "delay 'd': has no time"),
         ({"sampled": {"q": {"value": "w", "period": -1}}}, ModelError, "sampled 'q', period: the time is wrong"),

@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError
+from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.model import Delay, Model, Sampled, State
 from hvdc_ident.simulate import Tolerance, simulate
 
@@ -205,17 +205,22 @@ def test_a_current_limit_closed_by_the_other_axis_is_passed():
     assert np.isfinite(result.gradients).all()
 
 
-def test_a_delay_of_nothing_is_refused():
+@pytest.mark.parametrize("condition", ["time > at", "clock > at"])
+def test_a_switch_seen_through_a_delay_alone_moves_what_comes_after_it(condition):
+    """x' = (t > at + T) - x: x = 1 - exp(-(t - at - T)), with the same derivative by the instant as by the delay."""
     model = Model(
-        "zero",
-        parameters={"T": 0.0},
-        inputs={"u": 0.0},
-        states={"x": "ud - x"},
-        delays={"ud": Delay(u, T)},
+        "late-switch",
+        parameters={"at": 0.305, "T": 0.2},
+        states={"clock": State(1, start=0), "x": "late - x"},
+        delays={"late": {"of": f"where({condition}, 1, 0)", "time": "T"}},
         outputs={"x": "x"},
     )
-    with pytest.raises(ModelError, match="not above 0"):
-        simulate(model, experiment("zero", [0.0, 1.0]))
+    time = np.linspace(0.0, 2.0, 101)
+    result = simulate(model, experiment("late", time), sensitivities=("at", "T"))
+    since = np.maximum(time - 0.505, 0.0)
+    slope = np.where(since > 0, -np.exp(-since), 0.0)
+    np.testing.assert_allclose(result["x"], 1.0 - np.exp(-since), atol=1e-8)
+    np.testing.assert_allclose(result.gradients[:, 0], np.column_stack([slope, slope]), atol=1e-7)
 
 
 def test_many_structures_leave_no_memory_behind():

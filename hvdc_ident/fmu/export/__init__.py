@@ -7,16 +7,20 @@ import re
 import uuid
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
+
+import numpy as np
 
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import write_bytes
 from hvdc_ident.fmu.compile import binary_folder, compiled, compiler, library_suffix
 from hvdc_ident.fmu.export.c_code import CModel, tableau
 from hvdc_ident.fmu.export.model_description import KINDS, ExportedVariables, build_description, description
-from hvdc_ident.model import Model
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import Model, used_names, without_delays
+from hvdc_ident.simulate import engine_of
 
 VERSIONS = ("2.0", "3.0")
 _RUNTIME = (
@@ -61,7 +65,8 @@ def export_fmu(
     stop: end of the default experiment, s.
 
     The FMU starts from the steady state of the inputs and parameters given to it before its initialisation ends (states
-    with a start of their own from that), with exact derivatives of that start. Raises ModelError for options that are
+    with a start of their own from that), with exact derivatives of that start. A delay that is 0 at the model's values is left
+    out, with the parameters that nothing else uses. Raises ModelError for options that are
     not known and for True without a compiler, ComputationError where the compiler refuses the sources.
     """
     chosen = tuple(k for k in KINDS if k in kinds)
@@ -77,7 +82,7 @@ def export_fmu(
             expected="cc, gcc, clang or what CC names",
             hint="leave the binary out",
         )
-    code = model if isinstance(model, CModel) else CModel(model)
+    code = model if isinstance(model, CModel) else CModel(_without_zero_delays(model))
     identifier = identifier_of(code.model.name)
     content = _content(code, version, chosen, identifier, stop)
     folder = None
@@ -88,6 +93,22 @@ def export_fmu(
         content[f"binaries/{folder}/{identifier}{library_suffix()}"] = compiled(command, sources)
         note = f"binary for {folder}, and sources"
     return FmuFile(write_bytes(Path(path), _zipped(content)), version, chosen, folder, note)
+
+
+def _without_zero_delays(model: Model) -> Model:
+    """Return the model without the delays that are 0 at its values and the parameters that stood in their times alone.
+
+    The runtime keeps a delayed signal's history, which a delay of 0 has none of.
+    """
+    if not model.delays:
+        return model
+    times, _ = engine_of(model).delay_times(np.array(list(model.values.values())))
+    zero = [n for n, t in zip(model.delays, times, strict=True) if t == 0.0]
+    if not zero:
+        return model
+    made = without_delays(model, zero)
+    gone = {s.name for n in zero for s in model.delays[n].time.free_symbols} - used_names(made)
+    return replace(made, parameters=FrozenMap({n: p for n, p in made.parameters.items() if n not in gone}))
 
 
 def identifier_of(name: str) -> str:

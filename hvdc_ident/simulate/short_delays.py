@@ -1,0 +1,143 @@
+"""Runs of models whose delays may be 0 or shorter than any step that a run can afford.
+
+No step of the integrators is longer than a delay. So a delay T below s, a small share of the run, is not simulated: the run
+is interpolated between T = 0, where the delayed signal is the signal itself, and T = s, by the parabola in T through the
+values at both and the derivative by T at s. Values and derivatives are so continuous in T from 0 on, and the derivative is that
+of the values. Of a component of angular frequency w, the parabola is off by at most (w s)^3/40 of its size, and its slope by
+(w s)^2/6. s is 0.1/w or less for the fastest mode w of the model without its delays, so that these are 3e-5 and 2e-3, as far as
+`FINEST` steps in a run allow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.data import Array
+from hvdc_ident.expression import symbol
+from hvdc_ident.model import Model, fresh, without_delays
+from hvdc_ident.parameters import Parameter
+from hvdc_ident.simulate.engine import Engine, Method, Tolerance, engine_of
+from hvdc_ident.simulate.simulation import Statistics
+
+COARSEST = 2_500
+"""Delays that go fewer times into a run are always simulated: so many steps take some milliseconds."""
+FINEST = 20_000
+"""Those that go more times into it never: so many steps take up to a second of a model with a dozen states and some
+sensitivities."""
+OVER = 0.1
+"""The delay that is interpolated from is at most so much of the time constant of the fastest mode."""
+PER_BREAK = 5
+"""It goes so many times between two breaks of an input, whose waveform may be faster than the model."""
+
+COUNTS = ("accepted", "rejected", "events", "evaluations", "segments", "forced")
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Outputs of a run, (n, outputs), their derivatives by the asked parameters, (n, outputs, parameters), and what it cost."""
+
+    values: Array
+    slopes: Array
+    statistics: Statistics
+
+
+def run(
+    model: Model,
+    sensitivities: Sequence[str],
+    outputs: Sequence[str] | None,
+    p: Array,
+    inputs: Sequence[Any],
+    time: Array,
+    tolerance: Tolerance,
+    method: Method = "auto",
+) -> Answer:
+    """Return a run of the model, in which every delay may be 0 or short.
+
+    p: (parameters,) values in the model's order. inputs: one InputSignal an input. Raises TimingError for a negative delay, and as
+    `Engine.run` does.
+    """
+    engine = engine_of(model, sensitivities, outputs)
+
+    def answer(of: Model, parameters: Sequence[str], values: Array) -> Answer:
+        code = engine if of is model else engine_of(of, parameters, outputs)
+        scale = np.array([of.parameters[n].size for n in parameters]) if parameters else None
+        out, statistics = code.run(values, inputs, time, tolerance, method, scale, model=of)
+        return _answer(code, out, statistics)
+
+    span = float(time[-1] - time[0])
+    times, by_parameters = engine.delay_times(p) if model.delays else (np.zeros(0), np.zeros((0, 0)))
+    shortest = 0.0
+    if (times < span / COARSEST).any():
+        plain = _without(model, tuple(model.delays))
+        fastest = engine_of(plain, sensitivities, outputs).fastest(p, inputs, time, tolerance, plain)
+        shortest = span / _steps(span * fastest, inputs, tolerance)
+    lengths = zip(model.delays, times.tolist(), by_parameters, strict=True)
+    short = {name: (length, rows) for name, length, rows in lengths if length == 0.0 or length < shortest}
+    if not short:
+        return answer(model, sensitivities, p)
+    found = answer(_without(model, tuple(short)), sensitivities, p)
+    base, cost = found, [found.statistics]
+    for name, (length, rows) in short.items():
+        if shortest == 0.0 or not (length or rows.any()):
+            continue
+        longer, parameter = _with_time(model, name, tuple(n for n in short if n != name))
+        end = answer(longer, (*sensitivities, parameter), np.append(p, shortest))
+        found = _between(found, base, end, length / shortest, shortest, rows)
+        cost.append(end.statistics)
+    return replace(found, statistics=_sum(cost))
+
+
+def _answer(code: Engine, out: Array, statistics: Statistics) -> Answer:
+    s = code.structure.sizes
+    slopes = out[:, s.no :].reshape(len(out), s.no, s.width)[:, :, : s.np] if s.width else np.zeros((len(out), s.no, 0))
+    return Answer(out[:, : s.no], slopes, statistics)
+
+
+def _steps(turns: float, inputs: Sequence[Any], tolerance: Tolerance) -> int:
+    """Return how many times the shortest simulated delay goes into a run; half the steps of a run are left for what else there is.
+
+    turns: the length of the run times the fastest mode, rad. The number is of a few, so that it rarely changes with parameters.
+    """
+    needed = max(turns / OVER, PER_BREAK * max((i.breaks.size for i in inputs), default=0))
+    steps = COARSEST
+    while steps < needed and steps < FINEST:
+        steps *= 2
+    return min(steps, max(tolerance.max_steps // 2, 1))
+
+
+@lru_cache(maxsize=64)
+def _without(model: Model, names: tuple[str, ...]) -> Model:
+    """Return the model without these delays, kept for later runs."""
+    return without_delays(model, names)
+
+
+@lru_cache(maxsize=64)
+def _with_time(model: Model, name: str, others: tuple[str, ...]) -> tuple[Model, str]:
+    """Return the model without the other delays in which the named one has a time of its own, and that last parameter's name."""
+    parameter = fresh(model, f"{name}_time")
+    model = without_delays(model, others)
+    delays = model.delays | {name: replace(model.delays[name], time=symbol(parameter))}
+    return replace(model, parameters=model.parameters | {parameter: Parameter(0.0, "s")}, delays=delays), parameter
+
+
+def _between(found: Answer, base: Answer, end: Answer, share: float, shortest: float, rows: Array) -> Answer:
+    """Return `found` with what a delay adds. base: all short ones at 0. end: this one at `shortest` s, its time the last parameter.
+
+    share: its time over `shortest`. rows: (parameters,) derivatives of its time.
+    """
+    by_time = end.slopes[:, :, -1] * shortest
+    rise = end.values - base.values
+    first, second = 2.0 * rise - by_time, by_time - rise
+    slope = (first + 2.0 * share * second) / shortest
+    slopes = share * (end.slopes[:, :, :-1] - base.slopes) + slope[:, :, None] * rows
+    return replace(found, values=found.values + share * (first + share * second), slopes=found.slopes + slopes)
+
+
+def _sum(runs: Sequence[Statistics]) -> Statistics:
+    """Return the counts of several runs together, with the status and the method of the last."""
+    return replace(runs[-1], **{count: sum(getattr(r, count) for r in runs) for count in COUNTS})
