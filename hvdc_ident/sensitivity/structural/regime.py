@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,7 +19,7 @@ Start = Literal["steady", "free", "given"]
 class Equations:
     """Nodes of one graph: derivatives, residuals of the algebraic unknowns, outputs, and what is 0 at the start.
 
-    starts: per state the node that is 0 at the start, or None where the start is free.
+    starts: per state the node that is 0 at the start, or None where the start is free. holds: whether each condition holds.
     """
 
     graph: Graph
@@ -27,6 +27,24 @@ class Equations:
     residuals: tuple[int, ...]
     outputs: tuple[int, ...]
     starts: tuple[int | None, ...]
+    holds: Mapping[int, bool]
+
+    def arguments(self, node: int) -> tuple[int, ...]:
+        """The nodes a node is computed from; of a choice the branch that is taken."""
+        key = self.graph.nodes[node]
+        if key[0] == "select":
+            return (key[2] if self.holds[key[1]] else key[3],)
+        return self.graph.arguments(node)
+
+    def behind(self, roots: Iterable[int], known: Container[int] = ()) -> list[int]:
+        """Every node the roots depend on, roots included, in an order of evaluation; not what is known, nor behind it."""
+        seen, stack = set[int](), list(roots)
+        while stack:
+            n = stack.pop()
+            if n not in seen and n not in known:
+                seen.add(n)
+                stack.extend(self.arguments(n))
+        return sorted(seen)
 
 
 class EquationSource:
@@ -41,7 +59,6 @@ class EquationSource:
         self.graph = self.structure.graph
         self.p = np.array([x.value for x in model.parameters.values()])
         self.u = np.array([x.value for x in model.inputs.values()])
-        self.smooth = Graph()  # of every regime, so that equal parts are equal nodes
         try:
             n = len(self.structure.states) + len(self.structure.unknowns)
             self.point = engine_of(model).start(self.p, self.u, model=model)[0][:n]
@@ -51,152 +68,66 @@ class EquationSource:
             guesses = [1.0 if s.guess is None else s.guess for s in model.states.values()]
             self.point = np.array([*guesses, *(model.algebraic[n].start for n in self.structure.unknowns)])
 
-    def leaves(self) -> dict[int, float]:
-        """{leaf: value} at the operating point."""
-        g = self.graph
-        y = self.point
-        values = {g.leaf("p", k): float(v) for k, v in enumerate(self.p)}
-        values |= {g.leaf("y", k): float(v) for k, v in enumerate(y)}
-        values |= {g.leaf("w", 1 + k): float(v) for k, v in enumerate(self.u)}
-        values[g.leaf("w", 0)] = 0.0
-        return values
+        self.holds = self._conditions()
 
     def equations(self, regime: Mapping[str, str]) -> Equations:
         """The equations with the limiters of the named signals on the given branches, all others as at the operating point."""
-        s = self.structure
-        forced = {self._limiter(name): (name, mode) for name, mode in regime.items()}
-        conditions = self._conditions()
-        branch = _Branches(self, conditions, {n: self._branch(n, *m) for n, m in forced.items()})
-        take = branch.take
-        derivatives = [take(n) for n in s.derivatives]
-        starts = [self._start(k, name, derivatives, branch) for k, name in enumerate(s.states)]
-        return Equations(
-            branch.graph,
-            tuple(derivatives),
-            tuple(take(n) for n in s.residuals),
-            tuple(take(n) for n in s.observed),
-            tuple(starts),
-        )
+        s, holds = self.structure, dict(self.holds)
+        for name, mode in regime.items():
+            holds |= self._branch(name, mode)
+        starts = tuple(self._start(k, name) for k, name in enumerate(s.states))
+        return Equations(s.graph, tuple(s.derivatives), tuple(s.residuals), tuple(s.observed), starts, holds)
 
-    def _start(self, k: int, name: str, derivatives: list[int], branch: _Branches) -> int | None:
-        g, s = branch.graph, self.structure
+    def _start(self, k: int, name: str) -> int | None:
+        g, s = self.graph, self.structure
         if self.start[name] == "free":
             return None
-        given, rest = s.starts[k], s.rests[k]
-        fixed = given if self.start[name] == "given" else rest
-        return derivatives[k] if fixed is None else g.sub(g.leaf("y", k), branch.take(fixed))
+        fixed = s.starts[k] if self.start[name] == "given" else s.rests[k]
+        return s.derivatives[k] if fixed is None else g.sub(g.leaf("y", k), fixed)
 
     # --- limiters ---
 
     def active(self) -> tuple[str, ...]:
         """ "NAME: low | high" for each named signal whose limiter holds it at the operating point."""
-        if not self.graph.switches:
-            return ()
-        conditions, found = self._conditions(), []
+        found = []
         for name in self.model.signals:
             key = self.graph.nodes[self.structure.nodes[name]]
-            if key[0] != "select":
-                continue
-            low = conditions[key[1]]
-            inner = self.graph.nodes[key[3]]
-            if self._is_clip(key):
-                high = not low and conditions[inner[1]]
+            if key[0] == "select" and self._is_clip(key):
+                low, high = self.holds[key[1]], self.holds[self.graph.nodes[key[3]][1]]
                 found += [f"{name}: {'low' if low else 'high'}"] if low or high else []
         return tuple(found)
 
     def _conditions(self) -> dict[int, bool]:
         """Return {condition: True where it holds} at the operating point."""
         g = self.graph
-        if not g.switches:
-            return {}
-        signs = [v < 0 for v in g.evaluate(g.switches, self.leaves())]
-        holds: dict[int, bool] = {}
-        for n, (op, *a) in enumerate(g.nodes):
-            if op == "switch":
-                holds[n] = signs[a[0]]
-            elif op == "bool":
-                holds[n] = bool(a[0])
-            elif op == "not":
-                holds[n] = not holds[a[0]]
-            elif op in ("and", "or"):
-                holds[n] = all(holds[x] for x in a) if op == "and" else any(holds[x] for x in a)
-        return holds
+        values = {g.leaf("p", k): float(v) for k, v in enumerate(self.p)}
+        values |= {g.leaf("y", k): float(v) for k, v in enumerate(self.point)}
+        values |= {g.leaf("w", k): float(v) for k, v in enumerate([0.0, *self.u])}
+        conditions = {key[1] for key in g.nodes if key[0] == "select"}
+        return dict(zip(conditions, map(bool, g.evaluate(conditions, values)), strict=True))
 
     def _is_clip(self, key: tuple) -> bool:
         inner = self.graph.nodes[key[3]]
         return inner[0] == "select" and key[2] != inner[3]
 
-    def _limiter(self, name: str) -> int:
+    def _branch(self, name: str, mode: str) -> dict[int, bool]:
+        """Return the conditions that put the limiter of a signal on a branch."""
+        where = f"model '{self.model.name}', regime"
         if name not in self.structure.nodes:
-            raise unknown_name("signal", name, list(self.structure.nodes), where=f"model '{self.model.name}', regime")
-        node = self.structure.nodes[name]
-        if self.graph.nodes[node][0] != "select":
+            raise unknown_name("signal", name, list(self.structure.nodes), where=where)
+        key = self.graph.nodes[self.structure.nodes[name]]
+        if key[0] != "select":
             raise InputError(
                 f"the signal '{name}' is not limited",
-                where=f"model '{self.model.name}', regime",
+                where=where,
                 expected="a signal that is a clip, min or max",
                 hint="name the signal whose own expression begins with the limiter",
             )
-        return node
-
-    def _branch(self, node: int, name: str, mode: str) -> int:
-        key = self.graph.nodes[node]
-        choices = {"first": key[2], "second": key[3]}
+        choices = {"first": {key[1]: True}, "second": {key[1]: False}}
         if self._is_clip(key):
-            inner = self.graph.nodes[key[3]]
-            choices = {"low": key[2], "high": inner[2], "inside": inner[3]}
+            low, high = key[1], self.graph.nodes[key[3]][1]
+            choices = {"low": {low: True}, "high": {low: False, high: True}, "inside": {low: False, high: False}}
         if mode not in choices:
-            raise InputError(
-                f"the limiter of '{name}' has no mode '{mode}'",
-                where=f"model '{self.model.name}', regime",
-                expected=f"one of {', '.join(choices)}",
-            )
+            expected = f"one of {', '.join(choices)}"
+            raise InputError(f"the limiter of '{name}' has no mode '{mode}'", where=where, expected=expected)
         return choices[mode]
-
-
-class _Branches:
-    """A graph made again with one branch of every limiter."""
-
-    def __init__(self, source: EquationSource, holds: Mapping[int, bool], forced: Mapping[int, int]) -> None:
-        self.source, self.graph = source.graph, source.smooth
-        self.holds, self.forced = holds, forced
-        self.known: dict[int, int] = {}
-
-    def take(self, node: int) -> int:
-        """The node's counterpart."""
-        for n in self._needed(node):
-            if n not in self.known:
-                self.known[n] = self._make(n)
-        return self.known[node]
-
-    def _chosen(self, n: int) -> tuple[int, ...]:
-        key = self.source.nodes[n]
-        if n in self.forced:
-            return (self.forced[n],)
-        if key[0] == "select":
-            return (key[2] if self.holds[key[1]] else key[3],)
-        return self.source.arguments(n)
-
-    def _needed(self, root: int) -> list[int]:
-        seen, stack = set(), [root]
-        while stack:
-            n = stack.pop()
-            if n not in seen and n not in self.known:
-                seen.add(n)
-                stack.extend(self._chosen(n))
-        return sorted(seen)
-
-    def _make(self, n: int) -> int:
-        g, (op, *a) = self.graph, self.source.nodes[n]
-        if op == "leaf":
-            return g.leaf(*a)
-        if op == "const":
-            return g.constant(a[0])
-        x = [self.known[k] for k in self._chosen(n)]
-        if op == "select" or n in self.forced:
-            return x[0]
-        if op in ("add", "sub", "mul", "div", "neg"):
-            return getattr(g, op)(*x)
-        if op == "pow":
-            return g.call("exp", g.mul(x[1], g.call("log", x[0])))
-        return g.call("sqrt" if op == "sqrt0" else op, *x)

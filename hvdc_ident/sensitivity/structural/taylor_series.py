@@ -18,7 +18,6 @@ import mpmath  # type: ignore[import-untyped]
 import numpy as np
 
 from hvdc_ident.sensitivity.structural.regime import Equations
-from hvdc_ident.simulate import Graph
 
 Array: TypeAlias = np.ndarray[Any, Any]
 ZERO, ONE = Decimal(0), Decimal(1)
@@ -33,7 +32,10 @@ ARITHMETIC: Mapping[str, Callable[..., Decimal]] = {
     "mul": operator.mul,
     "div": operator.truediv,
     "inverse": lambda x: ONE / x,
+    "select": lambda x: x,
 }
+CALLED = {"sqrt0": "sqrt", "pow": "power"}
+"""Names of functions of the graph where they are others."""
 
 
 class Unclear(ArithmeticError):
@@ -123,7 +125,9 @@ def _function(name: str, arguments: Sequence[Decimal]) -> Decimal:
     prec = getcontext().prec
     with mpmath.workdps(prec + 5):
         try:
-            return Decimal(mpmath.nstr(getattr(mpmath, name)(*(mpmath.mpf(str(x)) for x in arguments)), prec))
+            return Decimal(
+                mpmath.nstr(getattr(mpmath, CALLED.get(name, name))(*(mpmath.mpf(str(x)) for x in arguments)), prec)
+            )
         except ValueError as e:
             raise InvalidOperation(f"{name} has no value: {e}") from None
 
@@ -136,17 +140,17 @@ def _number(value: float) -> Decimal:
     return Decimal(near.numerator) / near.denominator if float(near) == value else Decimal(repr(value))
 
 
-def values(graph: Graph, nodes: Iterable[int], leaves: Mapping[int, Decimal]) -> dict[int, Decimal]:
+def values(equations: Equations, nodes: Iterable[int], leaves: Mapping[int, Decimal]) -> dict[int, Decimal]:
     """{node: value} of nodes in an order of evaluation. Raises ArithmeticError where one has none."""
     found: dict[int, Decimal] = {}
     for n in nodes:
-        op, *a = graph.nodes[n]
+        op, *a = equations.graph.nodes[n]
         if op == "leaf":
             found[n] = leaves[n]
         elif op == "const":
             found[n] = _number(a[0])
         else:
-            x = [found[k] for k in a]
+            x = [found[k] for k in equations.arguments(n)]
             found[n] = ARITHMETIC[op](*x) if op in ARITHMETIC else _function(op, x)
     return found
 
@@ -176,11 +180,11 @@ class TaylorSeries:
         self.at = {n: i for i, n in enumerate(self.nodes)}
         self.static = self._static(point)
         self.moving = [n for n in self.nodes if n not in self.static and g.nodes[n][0] != "leaf"]
-        self.loop = [n for n in g.reachable(e.residuals) if n in set(self.moving)]
+        self.loop = [n for n in e.behind(e.residuals) if n in set(self.moving)]
         self.order = -1
         width = next(iter(directions.values())).size if directions else 0
         self.c = zeros(len(self.nodes), order + 1, 1 + width)
-        found = values(g, self.nodes, {n: series[0] for n, series in point.items()})
+        found = values(e, self.nodes, {n: series[0] for n, series in point.items()})
         self.c[:, 0, 0] = [found[n] for n in self.nodes]
         for n, series in point.items():
             if n in self.at:
@@ -193,12 +197,18 @@ class TaylorSeries:
         """The nodes behind the roots and behind the derivatives of the functions among them."""
         g, pending, found = self.graph, list(roots), set[int]()
         while pending:
-            new = g.reachable(pending, known=found)
+            new = self.equations.behind(pending, known=found)
             found.update(new)
             functions = [n for n in new if g.nodes[n][0] not in (*ARITHMETIC, "leaf", "const")]
-            self.slopes |= {n: g.slopes(n) for n in functions}
+            self.slopes |= {n: self._power(n) if g.nodes[n][0] == "pow" else g.slopes(n) for n in functions}
             pending = [slope for n in functions for _, slope in self.slopes[n]]
         return sorted(found)
+
+    def _power(self, n: int) -> list[tuple[int, int]]:
+        """(argument, derivative of n = x**a with respect to it) pairs, written with n itself, so that they come to an end."""
+        g, (_, x, a) = self.graph, self.graph.nodes[n]
+        by_base = (x, g.div(g.mul(a, n), x))
+        return [by_base] if g.value(a) is not None else [by_base, (a, g.mul(n, g.call("log", x)))]
 
     def _static(self, point: Mapping[int, Sequence[Decimal]]) -> set[int]:
         """The nodes that do not change in time."""
@@ -208,7 +218,7 @@ class TaylorSeries:
             if op == "leaf":
                 still = a[0] == "p" or (a[0] == "w" and len(point[n]) == 1)
             else:
-                still = all(k in static for k in self.graph.arguments(n))
+                still = all(k in static for k in self.equations.arguments(n))
             if still:
                 static.add(n)
         return static
@@ -250,6 +260,8 @@ class TaylorSeries:
                 row = x + y if op == "add" else x - y
             elif op == "neg":
                 row = -self.c[at[a[0]], k]
+            elif op == "select":
+                row = self.c[at[self.equations.arguments(n)[0]], k]
             elif op == "mul":
                 row = self._product(*a)
             elif op in ("div", "inverse"):

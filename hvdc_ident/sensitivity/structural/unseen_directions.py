@@ -140,10 +140,10 @@ class _Start:
             return
         g = e.graph
         slopes = [[g.gradient(z).get(g.leaf("y", k), g.zero) for k in unknown] for z in zeros]
-        nodes = g.reachable([*zeros, *chain(*slopes)])
+        nodes = e.behind([*zeros, *chain(*slopes)])
         close = Decimal(1).scaleb(-(getcontext().prec // 2) - 2)  # the step after it would be below the last digit
         for _ in range(STEPS):
-            found = values(g, nodes, {n: v[0] for n, v in self._leaves(e, y, [[v] for v in w]).items()})
+            found = values(e, nodes, {n: v[0] for n, v in self._leaves(e, y, [[v] for v in w]).items()})
             matrix, right = np.array([[found[d] for d in row] for row in slopes]), [[found[z]] for z in zeros]
             step = solve(matrix, np.array(right))[:, 0]
             for k, d in zip(unknown, step, strict=True):
