@@ -84,7 +84,7 @@ class Combination:
 
 
 def in_words(direction: Array, names: Sequence[str], logs: Sequence[bool], values: Sequence[float]) -> tuple[str, ...]:
-    """Return the combinations that a null direction at one point leaves unchanged: products of simple powers, else sums.
+    """Return the combinations that a null direction at one point leaves unchanged: simple products, else sums, else what fits there.
 
     direction: (p,) in scaled coordinates. logs: which coordinates are relative. values: of the parameters.
     """
@@ -93,22 +93,18 @@ def in_words(direction: Array, names: Sequence[str], logs: Sequence[bool], value
     found = []
     for i in members[1:]:
         ratio = float(direction[i] / direction[pivot])
-        power = round(-2.0 * ratio) / 2.0
-        if logs[i] and logs[pivot] and power and abs(power + ratio) < NEAR:
-            found.append(_product(names[pivot], names[i], power))
-            continue
         slope = ratio * (values[i] if logs[i] else 1.0) / ((values[pivot] if logs[pivot] else 1.0) or 1.0)
-        found.append(_sum(names[pivot], names[i], slope))
+        power, both = round(-2.0 * ratio) / 2.0, logs[i] and logs[pivot]
+        if both and power and abs(power + ratio) < NEAR:
+            found.append(_product(names[pivot], names[i], power))
+        elif abs(abs(slope) - 1.0) < NEAR:
+            found.append(f"{names[i]} - {names[pivot]}" if slope > 0 else f"{names[pivot]} + {names[i]}")
+        elif both:
+            found.append(_product(names[pivot], names[i], -ratio))
+        else:
+            sign = "-" if slope > 0 else "+"
+            found.append(f"{names[i]} {sign} {abs(slope):.3g}*{names[pivot]} (near these values)")
     return tuple(found)
-
-
-def _sum(pivot: str, name: str, slope: float) -> str:
-    """Return name - slope*pivot as people write it."""
-    if abs(slope + 1.0) < NEAR:
-        return f"{pivot} + {name}"
-    if abs(slope - 1.0) < NEAR:
-        return f"{name} - {pivot}"
-    return f"{name} {'-' if slope > 0 else '+'} {abs(slope):.3g}*{pivot} (near these values)"
 
 
 def _product(pivot: str, name: str, power: float) -> str:
