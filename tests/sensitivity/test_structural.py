@@ -142,6 +142,16 @@ def test_a_free_integrator_has_no_single_rest() -> None:
     assert ask(model, inputs=steps("u"), start="steady").identifiable == ("a", "b")
 
 
+def test_a_state_that_rests_at_zero() -> None:
+    """A phase-locked loop: its integrator rests at 0, which Newton's method gives to the last digit only."""
+    signals = {"vq": Signal(parse("V*sin(u - th) - R*x*cos(th)"))}
+    states = {"th": "kp*vq + w", "w": "ki*vq", "x": "(1 - x*cos(th)**2 - x)/T"}
+    model = make(states, {"y": "th"}, "V kp ki T R", signals=signals)
+    result = ask(model, inputs=steps("u"), start="steady")
+    assert result.identifiable == ("T",)
+    assert [c.words for c in result.combinations] == ["only V*ki, kp*R and ki*R are seen"]
+
+
 def test_inputs_that_ramp_or_move_freely() -> None:
     model = make({"x": "-a*x + b*u"}, {"y": "c*x"}, "a b c")
     for kind in ("ramp", "free", "step"):

@@ -188,8 +188,9 @@ class _Pair:
         for precision in precisions:
             with digits(precision):
                 self.starts.append(_Start(question, seed, spread))
-        first, nx = self.starts[0], len(question.rest.derivatives)
-        self.scales = np.array([*(v or Decimal(1) for v in first.y[:nx]), *(first.p[k] for k in question.parameters)])
+        # of parameters the logarithms; a state may rest at 0, which rounding makes almost 0
+        states, p = [Decimal(1)] * len(question.rest.derivatives), self.starts[0].p
+        self.scales = np.array([*states, *(p[k] for k in question.parameters)])
         self.directions = np.array([np.diag(self.scales)] * 2)
         self.directions[self.directions == 0] = ZERO
 
