@@ -152,6 +152,16 @@ def test_a_state_that_rests_at_zero() -> None:
     assert [c.words for c in result.combinations] == ["only V*ki, kp*R and ki*R are seen"]
 
 
+@pytest.mark.parametrize("start", ["1", "1e-30", "free"])
+def test_information_that_is_small_is_no_less_sure(start: str) -> None:
+    """y = A exp(-a t) + b c/a + B exp((c - d) t), A unknown, shows a, b*c and c - d, however small B is; at rest it is 0."""
+    z = State(parse("(c - d)*z"), start=None if start == "free" else parse(start))
+    model = make({"x": "-a*x + b*c", "z": z}, {"y": "z + x"}, "a b c d")
+    result = ask(model, inputs={}, start={"x": "free", "z": "free" if start == "free" else "given"})
+    assert result.identifiable == ("a",)
+    assert [c.words for c in result.combinations] == ["only b*c and c - d are seen"]
+
+
 def test_inputs_that_ramp_or_move_freely() -> None:
     model = make({"x": "-a*x + b*u"}, {"y": "c*x"}, "a b c")
     for kind in ("ramp", "free", "step"):

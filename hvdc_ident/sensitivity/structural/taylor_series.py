@@ -69,29 +69,32 @@ def _significant(pair: Array, rounding: Array) -> Array:
 def eliminate(pair: Array, rounding: Array) -> tuple[list[int], list[int], Array]:
     """Return (pivots, others, block): a matrix, (2, m, n) in few and in more digits, reduced to 1 in each pivot's column.
 
-    Its null space is v[pivots] = -block @ v[others], block: (2, pivots, others). Gauss and Jordan with the largest pivot.
-    rounding: the error of the numbers in few digits, for each column or each element.
+    Its null space is v[pivots] = -block @ v[others], block: (2, pivots, others). Gauss and Jordan with the largest pivot, which
+    no rounding in its row may hide. rounding: the error of the numbers in few digits, for each column or each element.
     """
     a, error, pivots = pair.copy(), np.broadcast_to(rounding, pair.shape[1:]).copy(), list[int]()
     while len(pivots) < min(a.shape[1:]):
         row = len(pivots)
-        size = np.abs(a[1, row:]) * _significant(a[:, row:], error[row:])
+        sure = _significant(a[:, row:], error[row:])
+        size, rest = np.abs(a[1, row:]) * sure, np.abs(a[1, row:]) * ~sure
         k, column = (int(i) for i in np.unravel_index(np.argmax(size), size.shape))
         if not size[k, column]:
             break
+        if size[k, column] <= max(error[row + k].max() * LEFT, rest[k].max()):
+            raise Unclear("the rounding of one direction hides what is seen of another")
         a[:, [row, row + k]], error[[row, row + k]] = a[:, [row + k, row]], error[[row + k, row]]
         pivot = a[:, row, column][:, None]
         a[:, row] = a[:, row] / pivot
         error[row] = (error[row] + np.abs(a[1, row]) * error[row, column]) / abs(pivot[1])
-        rest = np.arange(a.shape[1]) != row
-        factor = a[:, rest, column][..., None]
-        a[:, rest] = a[:, rest] - factor * a[:, [row]]
-        error[rest] = error[rest] + np.abs(factor[1]) * error[row] + error[rest, column][:, None] * np.abs(a[1, row])
-        a[:, rest, column] = ZERO
+        others = np.arange(a.shape[1]) != row
+        factor = a[:, others, column][..., None]
+        error[others] += np.abs(factor[1]) * error[row] + error[others, column][:, None] * np.abs(a[1, row])
+        a[:, others] = a[:, others] - factor * a[:, [row]]
+        a[:, others, column] = ZERO
         pivots.append(column)
-    others = [c for c in range(a.shape[2]) if c not in pivots]
-    block = a[:, : len(pivots)][..., others]
-    return pivots, others, block * _significant(block, error[: len(pivots)][:, others])
+    left = [c for c in range(a.shape[2]) if c not in pivots]
+    block = a[:, : len(pivots)][..., left]
+    return pivots, left, block * _significant(block, error[: len(pivots)][:, left])
 
 
 def solve(matrix: Array, right: Array) -> Array:

@@ -40,6 +40,8 @@ DIGITS = ((40, 60), (80, 120), (160, 240), (320, 480))
 """Few digits and more, then as many again where they do not tell rounding from information."""
 MANY = 10**6 + 3
 """A prime: its fractions fill all digits, so that every operation rounds."""
+TINY = 1e-9
+"""A free start below this is one of rest at 0, and taken elsewhere."""
 STEPS = 60
 """Newton steps; they double the digits once they are near."""
 Series = list[Decimal]
@@ -87,7 +89,8 @@ def unseen_at_random(question: Question, seed: int) -> Point:
     """Return the directions that the outputs do not show at a random point.
 
     Everything is computed twice, in few digits and in more: what only rounding gives falls with the digits (J. Vignes, "Discrete
-    stochastic arithmetic for validating results of numerical software", Numerical Algorithms 37 (2004) 377-390).
+    stochastic arithmetic for validating results of numerical software", Numerical Algorithms 37 (2004) 377-390). What is 40 decades
+    smaller than the terms it stands beside is below the last digit, and not reliably counted.
     Raises OutOfTime; NotReached where no start is found near the operating point, or no number of digits makes it clear.
     """
     why = ""
@@ -113,7 +116,7 @@ class _Start:
         self.q, self.random = question, Random(seed)
         source = question.source
 
-        def near(value: float) -> Decimal:
+        def near(value: float | Decimal) -> Decimal:
             return Decimal(repr(float(value))) * (1 + spread * self.random.randrange(-MANY, MANY) / MANY)
 
         self.p = [
@@ -124,7 +127,7 @@ class _Start:
         self.y = [Decimal(repr(float(v))) for v in source.point]
         free = [k for k, s in enumerate(question.rest.starts) if s is None]
         for k in free:
-            self.y[k] = near(float(self.y[k]) or 0.1)
+            self.y[k] = near(self.y[k] if abs(self.y[k]) > TINY else 0.1)
         self.fixed = [s for s in question.rest.starts if s is not None]
         unknown = [k for k in range(len(self.y)) if k not in free]
         self._newton(question.rest, [*self.fixed, *question.rest.residuals], unknown, self.y, self.w)
