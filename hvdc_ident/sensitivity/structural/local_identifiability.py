@@ -89,7 +89,7 @@ class StructuralResult:
     status: "decided" or "not decided"; then `reason` says why, and nothing is claimed: identifiable, unidentifiable and
     combinations are empty. rank: how many combinations of the parameters are seen. unseen: (parameters - rank, parameters)
     a sparse basis of the directions in the parameters' logarithms that are not seen at one random point. out_of_reach: not
-    decided because the model has parts that no more time would help with (delays, sampling).
+    decided because no more time would help (delays, sampling, no operating point).
     """
 
     parameters: tuple[str, ...]
@@ -151,7 +151,7 @@ def structural_identifiability(
     (unknown) or "given" (as the model says), for all states or by name; None: as the model says. regime: {signal: branch
     of its limiter after the event}, a clip's "low", "inside" or "high", a min's or max's "first" or "second"; all
     others stay as they are at the operating point. Inputs and known parameters have the model's values. time_limit in s, the
-    search for the operating point not counted: where it is reached the result says "not decided".
+    search for the operating point not counted: where it is reached, or there is no operating point, the result says "not decided".
 
     Raises UnknownNameError for a name the model lacks, InputError for a class or branch there is none of.
     """
