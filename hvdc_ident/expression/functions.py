@@ -1,7 +1,7 @@
 """The table of the grammar's functions, which every back end reads, and the one kind of symbol that models are made of.
 
 A new function is one entry of `FUNCTIONS`: cards read and write it, models run in machine code with its derivatives,
-and linearisation, Modelica export and rank analysis know it.
+and linearisation, Modelica export and structural identifiability know it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def where(condition: Any, a: Any, b: Any) -> sp.Expr:
 
 
 class Algebra(Protocol):
-    """Arithmetic on the nodes of a graph, in which derivatives and series are written."""
+    """Arithmetic on the nodes of a graph, in which derivatives are written."""
 
     one: int
 
@@ -75,8 +75,7 @@ class GrammarFunction:
     has none. arity: least and largest number of arguments. Without `slopes` the back ends write the function as a
     choice between its arguments; with them it is elementary, and these are needed:
     array: the function of NumPy, real and complex. slopes: its derivatives. intrinsic: True where LLVM has an
-    instruction for it; else it is called in the C library. series: the function of one argument written with functions
-    that rank analysis has Taylor series of; None for one that is among them.
+    instruction for it; else it is called in the C library.
     """
 
     name: str
@@ -86,7 +85,6 @@ class GrammarFunction:
     array: Callable[..., Any] | None = None
     slopes: Slopes | None = None
     intrinsic: bool = False
-    series: Callable[[Algebra, int], int] | None = None
 
 
 MANY = 32
@@ -107,10 +105,6 @@ def _atan2_slopes(g: Algebra, n: int, y: int, x: int) -> tuple[int, ...]:
     return g.div(x, square), g.neg(g.div(y, square))
 
 
-def _asin_series(g: Algebra, x: int) -> int:
-    return g.call("atan", g.div(x, _cosine_of(g, x)))
-
-
 _TABLE = (
     GrammarFunction("abs", sp.Abs, abs),
     GrammarFunction("sign", sp.sign, lambda x: float((x > 0) - (x < 0))),
@@ -129,7 +123,6 @@ _TABLE = (
         math.asin,
         array=np.arcsin,
         slopes=lambda g, n, x: (g.div(g.one, _cosine_of(g, x)),),
-        series=_asin_series,
     ),
     GrammarFunction(
         "acos",
@@ -137,7 +130,6 @@ _TABLE = (
         math.acos,
         array=np.arccos,
         slopes=lambda g, n, x: (g.neg(g.div(g.one, _cosine_of(g, x))),),
-        series=lambda g, x: g.sub(g.constant(math.pi / 2), _asin_series(g, x)),
     ),
     GrammarFunction(
         "atan", sp.atan, math.atan, array=np.arctan, slopes=lambda g, n, x: (g.div(g.one, g.add(g.one, g.mul(x, x))),)

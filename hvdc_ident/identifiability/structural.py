@@ -1,14 +1,14 @@
 """Structural identifiability: the parameters that no data of these outputs could tell, and the combinations seen of them.
 
-From the equations where there are any that the symbolic test reaches; else from the rank of the sensitivities at random points,
-which asks the simulator for nothing but runs with sensitivities (exact ones, or differences whose error it states) and so serves
-models with delays and sampled parts, recordings played in, and models that have no equations here at all.
+From the Taylor series of the equations where there are any that these reach; else from the rank of the sensitivities along the
+records' runs at random points, which asks the simulator for nothing but runs with sensitivities (exact ones, or differences whose
+error it states) and so serves models with delays and sampled parts, recordings played in, and models without equations here.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -24,23 +24,34 @@ from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import (
     SENSITIVITY_ERROR,
     StructuralCombination,
+    StructuralResult,
     identifiable_subset,
     null_directions,
     structural_identifiability,
 )
+from hvdc_ident.sensitivity.information import leading
+from hvdc_ident.sensitivity.structural.combinations import SMALL, Point, combinations_seen, held_of
 from hvdc_ident.simulate import ModelEquations
 from hvdc_ident.text import listed
 
 SECONDS = 10.0
-"""Time that the symbolic test may take; the shipped link takes 3 s."""
+"""Time that the Taylor series may take; the shipped link takes 2 s."""
 METHOD = "numerical, local"
+INSTEAD = "from the sensitivities at random points, because"
 POINTS = 5
+MOST = 12
+"""Number of points from which on no more are drawn for a combination of many parameters."""
 WIDE = 8
 """Number of points of which one lies in each eighth of every parameter's range."""
+NEAR = 0.02
+"""Distance of a power from a half of a whole number, and of a coefficient from 1, that counts as none."""
+ASIDE = 1e-3
+"""Share of the way to a random point by which the start is left: at round values a delayed jump may meet a row of the record, where the
+derivative by the delay has two values."""
 INSIDE = (0.2, 0.8)
 """Share of the bounds that the points are drawn from: at a bound a parameter may do nothing that does else."""
-SMALL = 1e-2
-"""Parts of a direction below this share of its largest are not members."""
+CONSTANT = 1e-3
+"""Share of itself by which a direction found from runs may differ from one point to the next and still be the same."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +84,7 @@ class Combination:
 
 
 def in_words(direction: Array, names: Sequence[str], logs: Sequence[bool], values: Sequence[float]) -> tuple[str, ...]:
-    """Return the combinations that a null direction leaves unchanged: products of powers where all members are positive.
+    """Return the combinations that a null direction at one point leaves unchanged: simple products, else sums, else what fits there.
 
     direction: (p,) in scaled coordinates. logs: which coordinates are relative. values: of the parameters.
     """
@@ -82,10 +93,15 @@ def in_words(direction: Array, names: Sequence[str], logs: Sequence[bool], value
     found = []
     for i in members[1:]:
         ratio = float(direction[i] / direction[pivot])
-        if logs[i] and logs[pivot]:
+        slope = ratio * (values[i] if logs[i] else 1.0) / ((values[pivot] if logs[pivot] else 1.0) or 1.0)
+        power, both = round(-2.0 * ratio) / 2.0, logs[i] and logs[pivot]
+        if both and power and abs(power + ratio) < NEAR:
+            found.append(_product(names[pivot], names[i], power))
+        elif abs(abs(slope) - 1.0) < NEAR:
+            found.append(f"{names[i]} - {names[pivot]}" if slope > 0 else f"{names[pivot]} + {names[i]}")
+        elif both:
             found.append(_product(names[pivot], names[i], -ratio))
         else:
-            slope = ratio * (values[i] if logs[i] else 1.0) / ((values[pivot] if logs[pivot] else 1.0) or 1.0)
             sign = "-" if slope > 0 else "+"
             found.append(f"{names[i]} {sign} {abs(slope):.3g}*{names[pivot]} (near these values)")
     return tuple(found)
@@ -93,8 +109,6 @@ def in_words(direction: Array, names: Sequence[str], logs: Sequence[bool], value
 
 def _product(pivot: str, name: str, power: float) -> str:
     """Return name * pivot^power as people write it."""
-    near = round(2.0 * power) / 2.0
-    power = near if abs(power - near) < 0.02 and near else power
     if abs(power) == 1.0:
         return f"{pivot}*{name}" if power > 0 else f"{name}/{pivot}"
     return f"{name}*{pivot}^{power:.3g}"
@@ -125,24 +139,6 @@ def combinations_of(
     return tuple(found)
 
 
-def held_of(null: Array) -> frozenset[int]:
-    """Return the indices of the parameters to hold so that the others can be estimated: one a direction, the last listed that will do.
-
-    null: (k, p) independent directions. Any set of columns in which they stay independent would do; the equations' route
-    keeps the earlier listed, and how strongly each is seen must not make the two routes differ.
-    """
-    rest, held = null.copy(), set()
-    for i in reversed(range(null.shape[1])):
-        if not rest.shape[0]:
-            break
-        rest = rest / np.abs(rest[:, : i + 1]).max(axis=1, keepdims=True)
-        row = int(np.argmax(np.abs(rest[:, i])))
-        if abs(rest[row, i]) > SMALL:
-            held.add(i)
-            rest = np.delete(rest - np.outer(rest[:, i] / rest[row, i], rest[row]), row, axis=0)
-    return frozenset(held)
-
-
 def partners(combinations: Sequence[Combination], held: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     """Return the held members of its combinations for each member that is not held."""
     found: dict[str, tuple[str, ...]] = {}
@@ -158,8 +154,8 @@ def partners(combinations: Sequence[Combination], held: Mapping[str, str]) -> di
 class StructuralAnalysis:
     """The structural verdict on the candidates.
 
-    status: decided, or not decided. method: "prime field" or "numerical, local". admissible: the most that can be estimated
-    together once the others are held; the earlier listed where there is a choice. combinations: what is seen of others.
+    status: decided, or not decided. method: "Taylor series at random points" or "numerical, local". admissible: the most that can
+    be estimated together once the others are held; the earlier listed where there is a choice. combinations: what is seen of others.
     note: why it is not decided, or what the method cannot see. unmoved: parameters that show only where an input is
     moved that was not, or in another regime. moving: parameters that move the outputs along the records by more than the
     sensitivities' error. points: how many points of the numerical method could be simulated.
@@ -190,118 +186,179 @@ def scaled_slope(problem: Problem, theta: Array) -> Array:
     return np.array([v if u.min > 0 else u.span for u, v in zip(problem.unknowns, theta, strict=True)], dtype=float)
 
 
-def rank_analysis(problem: Problem, seed: int = 0, *, wide: bool = False) -> StructuralAnalysis:
+class _Runs:
+    """Whitened sensitivities along the records' runs: at the start and at random points in the bounds.
+
+    points: values of the unknowns, parameters first, with the (n, unknowns) sensitivities in scaled coordinates. failures: why
+    some of the first POINTS could not be simulated. simulated: number of points before any were added. error: of the
+    sensitivities, relative.
+    """
+
+    def __init__(self, problem: Problem, seed: int, wide: bool = False) -> None:
+        """wide: at a Latin hypercube of points up to the bounds too."""
+        self.problem, self.error = problem, sensitivity_error(problem.simulator)
+        self.names = tuple(f.name for f in problem.free)
+        self.points: list[tuple[Array, Array]] = []
+        self._random = np.random.default_rng(seed)
+        drawn = self._drawn(POINTS)
+        self.failures = [f for f in map(self._run, drawn) if f]
+        start = (1.0 - ASIDE) * problem.start + ASIDE * drawn[0]
+        for theta in (start, *(starting_points(problem.unknowns, (), WIDE, seed) if wide else [])):
+            self._run(theta)
+        self.simulated = len(self.points)
+
+    def _drawn(self, count: int) -> list[Array]:
+        """Return random points."""
+        unknowns = self.problem.unknowns
+        shares = self._random.uniform(*INSIDE, (count, len(unknowns))).tolist()
+        return [np.array([u.draw(s) for u, s in zip(unknowns, row, strict=True)]) for row in shares]
+
+    def _run(self, theta: Array) -> str:
+        """Add a point; return why it cannot be simulated, if so."""
+        try:
+            jacobian = self.problem.residual(theta)[1]
+        except SimulationError as e:
+            return e.what
+        self.points.append((theta, jacobian * scaled_slope(self.problem, theta)))
+        return ""
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Parameters that move the outputs at any point by more than the sensitivities' error."""
+        lengths = [np.linalg.norm(j, axis=0) for _, j in self.points]
+        seen = np.any([n > self.error * n.max(initial=0.0) for n in lengths], axis=0)
+        return tuple(n for n, e in zip(self.names, seen, strict=False) if e)
+
+    def unseen(self, members: Sequence[int]) -> list[Point]:
+        """The directions among some parameters, the others known, that are not seen, where there are fewest; points that agree."""
+        found = [self._unseen_at(theta, jacobian, members) for theta, jacobian in self.points]
+        fewest = min((len(p.directions) for p in found), default=0)
+        alike = [p for p in found if len(p.directions) == fewest]
+        return max(([q for q in alike if q.groups == p.groups] for p in alike), key=len, default=[])
+
+    def _unseen_at(self, theta: Array, jacobian: Array, members: Sequence[int]) -> Point:
+        columns = [*members, *range(len(self.names), theta.size)]
+        null = parameter_directions(jacobian[:, columns], len(members), self.error)
+        null[np.abs(null) <= SMALL * np.abs(null).max(axis=1, keepdims=True, initial=0.0)] = 0.0
+        values, slope = theta[list(members)], scaled_slope(self.problem, theta)[list(members)]
+        return Point(values, null * slope / np.where(values == 0, 1.0, values))
+
+    def combinations(self, members: Sequence[int]) -> tuple[tuple[Combination, ...], frozenset[str]]:
+        """Return what is seen of the directions among some parameters, and the fewest of these to hold."""
+        points, names = self.unseen(members), [self.names[k] for k in members]
+        if not points:
+            return (), frozenset()
+
+        def more() -> Point | None:
+            for theta in self._drawn(POINTS) if len(self.points) < MOST else ():
+                if not self._run(theta):
+                    point = self._unseen_at(*self.points[-1], members)
+                    if point.pattern == points[0].pattern:
+                        return point
+            return None
+
+        start = [self.problem.free[k].start for k in members]
+        found = combinations_seen(names, points, start, more, CONSTANT)
+        held = frozenset(names[k] for k in held_of(points[0].directions))
+        nearest = min(points, key=lambda p: float(np.abs(p.theta - start).max()))
+        return tuple(_combination(c) if c.seen else _local(c, names, nearest) for c in found), held
+
+    @property
+    def note(self) -> str:
+        """What the numbers leave open."""
+        parts = []
+        if self.failures:
+            first, number = self.failures[0], len(self.failures)
+            parts.append(f"{number} of {POINTS} random points could not be simulated ({first})")
+        if self.error > SENSITIVITY_ERROR:
+            parts.append(
+                f"the sensitivities are differences, good to {self.error:.1g}: "
+                "what is seen more weakly counts as not seen"
+            )
+        return "; ".join(parts)
+
+
+def rank_analysis(problem: Problem, seed: int = 0) -> StructuralAnalysis:
     """Return the structure from the rank of the whitened sensitivities at the start and at five random points in the bounds.
 
-    For anything that can be simulated; local. wide: whether to look for other regimes too, at a Latin hypercube of points
-    up to the bounds. Points that cannot be simulated are passed over; those of the five are counted in the note. A parameter
-    without any effect stands among the admissible ones: the data's verdict on it says more.
+    For anything that can be simulated; local. Points that cannot be simulated are passed over; those of the five are counted in
+    the note. A parameter without any effect stands among the admissible ones: the data's verdict on it says more.
     """
-    names = tuple(f.name for f in problem.free)
-    error = sensitivity_error(problem.simulator)
-    jacobians, failures = [], []
-    random = np.random.default_rng(seed).uniform(*INSIDE, (POINTS, len(problem.unknowns)))
-    points = [np.array([u.draw(s) for u, s in zip(problem.unknowns, row, strict=True)]) for row in random.tolist()]
-    others = starting_points(problem.unknowns, (), WIDE, seed) if wide else []
-    for k, theta in enumerate([*points, problem.start, *others]):
-        try:
-            jacobian = problem.residual(theta)[1]
-        except SimulationError as e:
-            failures += [e.what] if k < POINTS else []
-            continue
-        jacobians.append(jacobian * scaled_slope(problem, theta))
-    if not jacobians:
+    return _from_runs(_Runs(problem, seed))
+
+
+def _from_runs(runs: _Runs, status: str = "decided", why: str = "") -> StructuralAnalysis:
+    """Return the structure that the runs show. why: the equations do not tell it."""
+    names = runs.names
+    if not runs.points:
         return StructuralAnalysis("not decided", METHOD, names, note="no random point could be simulated")
-    lengths = [np.linalg.norm(j, axis=0) for j in jacobians]
-    effective = np.any([n[: len(names)] > error * n.max(initial=0.0) for n in lengths], axis=0)
-    null = _common_null(jacobians, len(names), error)
-    logs = [f.min > 0 for f in problem.free]
-    combos = combinations_of(null, names, logs, [f.start for f in problem.free], "structural")
-    held = held_of(null)
-    return StructuralAnalysis(
-        "decided",
-        METHOD,
-        tuple(n for i, n in enumerate(names) if i not in held),
-        combos,
-        _note(failures, error),
-        moving=tuple(n for n, e in zip(names, effective, strict=True) if e),
-        points=len(jacobians),
-    )
-
-
-def _note(failures: Sequence[str], error: float) -> str:
-    parts = []
-    if failures:
-        parts.append(f"{len(failures)} of {POINTS} random points could not be simulated ({failures[0]})")
-    if error > SENSITIVITY_ERROR:
-        parts.append(
-            f"the sensitivities are differences, good to {error:.1g}: what is seen more weakly counts as not seen"
-        )
-    return "; ".join(parts)
-
-
-def _common_null(jacobians: Sequence[Array], count: int, error: float) -> Array:
-    """Return the directions without effect at every point, (k, count), the nuisances left out."""
-    ranks = [null_directions(j, error).shape[0] for j in jacobians]
-    if min(ranks) == 0:
-        return np.zeros((0, count))
-    together = np.vstack([j / np.maximum(np.linalg.norm(j), 1e-300) for j in jacobians])
-    null = parameter_directions(together, count, error)
-    # where the direction turns from point to point, it is taken where there are fewest
-    return null if null.size else parameter_directions(jacobians[int(np.argmin(ranks))], count, error)
+    combos, held = runs.combinations(range(len(names)))
+    note = "; ".join(filter(None, (why, runs.note)))
+    admissible = tuple(n for n in names if n not in held)
+    return StructuralAnalysis(status, METHOD, admissible, combos, note, moving=runs.moving, points=runs.simulated)
 
 
 def structural_analysis(model: Model | None, problem: Problem, seed: int = 0) -> StructuralAnalysis:
-    """Return the structure from the model's equations where there are any and the test comes to an end, else from numbers.
+    """Return the structure from the model's equations where there are any and these come to an end, else from runs.
 
-    Numbers decide, locally, where there are no equations, or the equations have parts that the test does not reach
-    (delays, sampling, recordings played in, instruments); where it ran out of time they stand in, undecided.
+    Runs decide, locally, where there are no equations, or the equations have parts that Taylor series do not reach (delays,
+    sampling, recordings played in, instruments); where time ran out they stand in, undecided.
     The equations are asked in the regime of the start: every limiter on the branch it then has, every switch of time
-    where it then stands. What the records' own runs see beyond that, in other regimes or from several starts, counts: a
-    parameter whose derivative along them is more than its error is not lost, and a combination whose members no
-    direction without effect moves is told apart. A parameter of which nothing at all is seen with the inputs that were
-    moved is structural only where no other input would show it and no switch could; else it is left to the data's verdict.
+    where it then stands. What the records' own runs see beyond that, in other regimes or from several starts, counts: a direction
+    is lost where neither shows it. A parameter of which nothing at all is seen with the inputs that were moved is structural
+    only where no other input would show it and no switch could; else it is left to the data's verdict.
     """
-    numbers = rank_analysis(problem, seed)
+    runs = _Runs(problem, seed)
     if model is None:
-        return numbers
-
-    def by_numbers(why: str) -> StructuralAnalysis:
-        notes = [f"from the sensitivities at random points, because {why}", numbers.note]
-        return replace(numbers, note="; ".join(filter(None, notes)))
-
-    names = tuple(f.name for f in problem.free)
-    outputs = problem.outputs_in_time
+        return _from_runs(runs)
     recordings = in_time(problem.fitted_experiments)
     if not recordings:
-        return by_numbers("there are frequency responses only")
+        return _from_runs(runs, why=f"{INSTEAD} there are frequency responses only")
     if any(e.drive or e.instrument for e in recordings):
-        return by_numbers("insertion points are driven by recordings, or outputs seen through instruments")
+        driven = "insertion points are driven by recordings, or outputs seen through instruments"
+        return _from_runs(runs, why=f"{INSTEAD} {driven}")
+    names, outputs = runs.names, problem.outputs_in_time
     result = structural_identifiability(model, names, outputs, inputs=moves(recordings), seed=seed, time_limit=SECONDS)
     if result.out_of_reach:
-        return by_numbers(result.reason)
+        return _from_runs(runs, why=f"{INSTEAD} {result.reason}")
     if result.status != "decided":
         note = f"the equations did not decide ({result.reason}); the sensitivities at random points stand in for them"
-        return replace(numbers, status="not decided", note=note)
+        return _from_runs(runs, "not decided", note)
     switched = _behind_switches(model, outputs) if result.combinations else set()
     if switched:
-        numbers = rank_analysis(problem, seed, wide=True)
-    alone = [c.members[0] for c in result.combinations if len(c.members) == 1]
-    unseen = [n for n in alone if n not in numbers.moving]
+        runs = _Runs(problem, seed, wide=True)
+    unseen = [c.members[0] for c in result.combinations if len(c.members) == 1 and c.members[0] not in runs.moving]
     invisible: set[str] = set()  # whatever input were moved
     if unseen:
         wide = structural_identifiability(model, names, outputs, seed=seed, time_limit=SECONDS)
         invisible = {n for n in unseen if any(c.members == (n,) for c in wide.combinations)} - switched
-    together, separated = _confirmed([c for c in result.combinations if len(c.members) > 1], numbers)
-    kept = {*identifiable_subset(result), *alone, *separated}
-    note = ""
-    if separated:
-        apart = ", ".join(n for n in names if n in separated)
-        note = f"the equations at the start would not tell {apart} apart, but these experiments do"
-    single = tuple(Combination((n,), (), "structural", text=f"nothing is seen of {n}") for n in names if n in invisible)
-    admissible = tuple(n for n in names if n in kept and n not in invisible)
-    unmoved = tuple(n for n in alone if n not in invisible and n not in numbers.moving)
-    return StructuralAnalysis("decided", result.method, admissible, (*together, *single), note, unmoved, numbers.moving)
+    together, held, apart = _where_neither_sees(result, runs)
+    alone = [_combination(c) for c in result.combinations if c.members[0] in invisible and len(c.members) == 1]
+    note = (
+        f"the equations at the start would not tell {', '.join(apart)} apart, but these experiments do" if apart else ""
+    )
+    admissible = tuple(n for n in names if n not in held | invisible)
+    unmoved = tuple(n for n in unseen if n not in invisible)
+    return StructuralAnalysis("decided", result.method, admissible, (*together, *alone), note, unmoved, runs.moving)
+
+
+def _where_neither_sees(result: StructuralResult, runs: _Runs) -> tuple[list[Combination], set[str], list[str]]:
+    """Return the combinations that runs tell no further than the equations, what to hold, and the parameters that runs tell."""
+    found: list[Combination] = []
+    held, apart = set[str](), set[str]()
+    for c in result.combinations:
+        if len(c.members) == 1:
+            continue
+        members = [result.parameters.index(n) for n in c.members]
+        if all(len(p.directions) >= c.free for p in runs.unseen(members)):
+            found.append(_combination(c))
+            held |= set(c.members) - set(identifiable_subset(result, c.members))
+            continue
+        parts, stuck = runs.combinations(members)
+        found += parts
+        held |= stuck
+        apart |= set(c.members) - {n for part in parts for n in part.members} or set(c.members)
+    return found, held, [n for n in result.parameters if n in apart]
 
 
 def moves(experiments: Sequence[Experiment]) -> dict[str, Literal["step", "free"]]:
@@ -314,26 +371,6 @@ def moves(experiments: Sequence[Experiment]) -> dict[str, Literal["step", "free"
             jumps = bool((np.diff(signal.values)[np.diff(signal.times) > 0] == 0).all())
             found[name] = "step" if jumps and found.get(name, "step") == "step" else "free"
     return found
-
-
-def _confirmed(
-    found: Sequence[StructuralCombination], numbers: StructuralAnalysis
-) -> tuple[tuple[Combination, ...], set[str]]:
-    """Return the combinations that the numbers lose too, and the parameters that the numbers tell apart.
-
-    Of a combination that the numbers lose in part only, that part stands, in the numbers' words.
-    """
-    lost = set(numbers.unidentifiable)
-    stand: dict[tuple[str, ...], Combination] = {}
-    separated: set[str] = set()
-    for c in found:
-        members = set(c.members)
-        if members <= lost:
-            stand[c.members] = _combination(c)
-            continue
-        separated |= (members - lost) | (members & set(numbers.admissible))
-        stand |= {part.members: part for part in numbers.combinations if members & set(part.members)}
-    return tuple(stand.values()), separated
 
 
 def _behind_switches(model: Model, outputs: Sequence[str]) -> set[str]:
@@ -362,3 +399,15 @@ def _combination(c: StructuralCombination) -> Combination:
         FrozenMap(zip(c.members, c.directions[0], strict=True)) if c.directions else FrozenMap()
     )
     return Combination(c.members, c.seen, "structural", direction, text="" if c.seen else c.words)
+
+
+def _local(c: StructuralCombination, names: Sequence[str], at: Point) -> Combination:
+    """Return a combination without a simple form, with what is seen near a point."""
+    if len(c.members) == 1:
+        return _combination(c)
+    members = [names.index(n) for n in c.members]
+    rows = at.among(members).directions * at.theta[members]
+    seen = dict.fromkeys(w for row in rows for w in in_words(row, c.members, [False] * len(row), row))
+    text = f"{listed(c.members)} cannot be told apart, only {listed(seen)} {'is' if len(seen) == 1 else 'are'} seen"
+    largest = rows[0] / rows[0][leading(rows[0])]
+    return Combination(c.members, (), "structural", FrozenMap(zip(c.members, largest.tolist(), strict=True)), text=text)

@@ -344,7 +344,7 @@ class Graph:
                 {v: self.select(condition, g[yes].get(v, self.zero), g[no].get(v, self.zero)) for v in both}
             )
         total: dict[int, int] = {}
-        for argument, slope in self._slopes(n, op, a):
+        for argument, slope in self.slopes(n):
             for v, d in g[argument].items():
                 total[v] = self.add(total.get(v, self.zero), self.mul(slope, d))
         return self._clean(total)
@@ -352,8 +352,9 @@ class Graph:
     def _clean(self, gradient: dict[int, int]) -> dict[int, int]:
         return {v: d for v, d in gradient.items() if d != self.zero}
 
-    def _slopes(self, n: int, op: str, a: list[int]) -> list[tuple[int, int]]:
-        """(argument, derivative of n with respect to it) pairs."""
+    def slopes(self, n: int) -> list[tuple[int, int]]:
+        """(argument, derivative of n with respect to it) pairs of a product, a quotient, a power or a function."""
+        op, *a = self.nodes[n]
         x = a[0]
         self.mul(x, x)  # before anything else: operands stand in the order in which nodes are made
         if op == "mul":

@@ -34,15 +34,6 @@ def test_slopes_are_the_derivatives_that_sympy_takes(function: GrammarFunction) 
         assert slope[0] == pytest.approx(expected, rel=1e-14)
 
 
-@pytest.mark.parametrize("function", [f for f in ELEMENTARY if f.series], ids=lambda f: f.name)
-def test_the_form_with_taylor_series_has_the_value_of_the_function(function: GrammarFunction) -> None:
-    graph = Graph()
-    x = graph.leaf("y", 0)
-    assert function.series is not None
-    [value] = graph.evaluate([function.series(graph, x)], {x: AT[0]})
-    assert value == pytest.approx(function.number(AT[0]), rel=1e-14)
-
-
 def test_a_new_function_is_one_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     sinh = GrammarFunction(
         "sinh",
@@ -50,7 +41,6 @@ def test_a_new_function_is_one_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: 
         math.sinh,
         array=np.sinh,
         slopes=lambda g, n, x: (g.call("sqrt", g.add(g.one, g.mul(n, n))),),
-        series=lambda g, x: g.div(g.sub(g.call("exp", x), g.call("exp", g.neg(x))), g.constant(2.0)),
     )
     monkeypatch.setitem(functions.FUNCTIONS, "sinh", sinh)  # type: ignore[arg-type]
     assert to_text(parse("2*sinh(x)")) == "2*sinh(x)"

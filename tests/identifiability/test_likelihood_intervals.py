@@ -81,7 +81,14 @@ def test_a_pair_profile_of_a_quadratic_is_its_ellipse() -> None:
 
 @pytest.mark.parametrize(
     ("direction", "words"),
-    [([1, -1, -1], ("b*kp", "b*ki")), ([1, 1, 0], ("kp/b",)), ([2, -1, 0], ("kp*b^0.5",))],
+    [
+        ([1, -1, -1], ("b*kp", "b*ki")),
+        ([1, 1, 0], ("kp/b",)),
+        ([2, -1, 0], ("kp*b^0.5",)),
+        ([1, 0, -1 / 3], ("b + ki",)),  # of values 1 and 3
+        ([0, 1, 2 / 3], ("ki - kp",)),
+        ([0, 1, -0.8], ("ki*kp^0.8",)),
+    ],
 )
 def test_null_directions_in_words(direction, words) -> None:
     assert in_words(np.array(direction, float), ["b", "kp", "ki"], [True] * 3, [1, 2, 3]) == words

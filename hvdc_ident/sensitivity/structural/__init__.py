@@ -1,6 +1,6 @@
 """Structural identifiability: the parameters that outputs can tell at all, whatever the data's quality."""
 
-from hvdc_ident.sensitivity.structural.invariants import StructuralCombination
+from hvdc_ident.sensitivity.structural.combinations import StructuralCombination
 from hvdc_ident.sensitivity.structural.local_identifiability import (
     StructuralResult,
     identifiable_subset,

@@ -1,413 +1,327 @@
-"""Taylor series in time of every node of a model's graph over any ring, order by order: one convolution a node.
+"""Taylor series in time of the nodes of a model's graph in decimals of any length, each with derivatives along directions.
 
-A coefficient is a row: its value, then its derivatives.
+The directions are changes of the start and of the parameters. Those that a watched quantity shows are taken out order by order,
+so that the work falls with what is left to decide.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+import operator
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from decimal import Context, Decimal, InvalidOperation, getcontext, localcontext
 from fractions import Fraction
-from random import Random
-from typing import Any
+from itertools import chain
+from typing import Any, TypeAlias
 
+import mpmath  # type: ignore[import-untyped]
 import numpy as np
 
-from hvdc_ident.sensitivity.structural.finite_field import Array, NoSuchNumber, NotRational, OutOfTime, Ring
-from hvdc_ident.simulate import Graph
+from hvdc_ident.sensitivity.structural.regime import Equations
+
+Array: TypeAlias = np.ndarray[Any, Any]
+ZERO, ONE = Decimal(0), Decimal(1)
+AGREEING = Decimal("1e-8")
+"""Share of itself by which a number differs at most when it is computed in more digits."""
+LEFT = Decimal("1e-15")
+"""Share of the rounding in few digits that may be left in more, of which there are at least 20 more."""
+ARITHMETIC: Mapping[str, Callable[..., Decimal]] = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "neg": operator.neg,
+    "mul": operator.mul,
+    "div": operator.truediv,
+    "inverse": lambda x: ONE / x,
+    "select": lambda x: x,
+}
+CALLED = {"sqrt0": "sqrt", "pow": "power"}
+"""Names of functions of the graph where they are others."""
 
 
-class Coefficients:
-    """The coefficients (order + 1, width) of the nodes in `c`; nodes in `static` have only the first.
+class Unclear(ArithmeticError):
+    """A number that is neither sure nor rounding: more digits may tell."""
 
-    known: {(function, argument): value} of the functions that have several values, chosen once for a point.
+
+def digits(count: int) -> Any:
+    """A context manager in which decimals carry so many digits."""
+    return localcontext(Context(prec=count))
+
+
+def zeros(*shape: int) -> Array:
+    """An array of the decimal 0."""
+    return np.full(shape, ZERO, object)
+
+
+def _significant(pair: Array, rounding: Array) -> Array:
+    """Where numbers, (2, m, n) computed in few and in more digits, are not 0. Raises Unclear.
+
+    rounding: (m, n) the error of those in few digits. A number that is not 0 agrees. What is left of one that is 0 is far smaller
+    than the rounding, for it falls by as many decades as there are digits more, unless the few digits happen to cancel.
     """
+    few, more = pair
+    size = np.abs(more)
+    agree = (size > 0) & (np.abs(more - few) <= size * AGREEING)
+    if not np.all(agree | (size <= rounding * LEFT) | (np.abs(few) <= size * AGREEING)):
+        raise Unclear("rounding and information are not told apart")
+    return np.asarray(agree, bool)
 
-    def __init__(
-        self,
-        graph: Graph,
-        ring: Ring,
-        nodes: Sequence[int],
-        static: Collection[int],
-        order: int,
-        width: int,
-        known: dict[tuple[str, Any], Any],
-        random: Random,
-    ) -> None:
-        self.graph, self.ring, self.static = graph, ring, static
-        self.order, self.width, self.known, self.random = order, width, known, random
-        self.c = {n: ring.zeros(order + 1, width) for n in nodes}
-        self.aux: dict[int, Any] = {}
 
-    def compute(self, nodes: Sequence[int], k: int) -> None:
-        """Set coefficient k of the nodes, which are in an order of evaluation."""
-        for n in nodes:
-            op, *a = self.graph.nodes[n]
-            self.c[n][k] = getattr(self, f"_{op}")(n, k, *a)
+def eliminate(pair: Array, rounding: Array) -> tuple[list[int], list[int], Array]:
+    """Return (pivots, others, block): a matrix, (2, m, n) in few and in more digits, reduced to 1 in each pivot's column.
 
-    def _times(self, a: Array, b: Array) -> Array:
-        """The product of two rows."""
-        reduce = self.ring.reduce
-        out = reduce(a[0] * b)
-        out[1:] += reduce(a[1:] * b[0])
-        return reduce(out)
+    Its null space is v[pivots] = -block @ v[others], block: (2, pivots, others). Gauss and Jordan with the largest pivot, which
+    no rounding in its row may hide. rounding: the error of the numbers in few digits, for each column or each element.
+    """
+    a, error, pivots = pair.copy(), np.broadcast_to(rounding, pair.shape[1:]).copy(), list[int]()
+    while len(pivots) < min(a.shape[1:]):
+        row = len(pivots)
+        sure = _significant(a[:, row:], error[row:])
+        size, rest = np.abs(a[1, row:]) * sure, np.abs(a[1, row:]) * ~sure
+        k, column = (int(i) for i in np.unravel_index(np.argmax(size), size.shape))
+        if not size[k, column]:
+            break
+        if size[k, column] <= max(error[row + k].max() * LEFT, rest[k].max()):
+            raise Unclear("the rounding of one direction hides what is seen of another")
+        a[:, [row, row + k]], error[[row, row + k]] = a[:, [row + k, row]], error[[row + k, row]]
+        pivot = a[:, row, column][:, None]
+        a[:, row] = a[:, row] / pivot
+        error[row] = (error[row] + np.abs(a[1, row]) * error[row, column]) / abs(pivot[1])
+        others = np.arange(a.shape[1]) != row
+        factor = a[:, others, column][..., None]
+        error[others] += np.abs(factor[1]) * error[row] + error[others, column][:, None] * np.abs(a[1, row])
+        a[:, others] = a[:, others] - factor * a[:, [row]]
+        a[:, others, column] = ZERO
+        pivots.append(column)
+    left = [c for c in range(a.shape[2]) if c not in pivots]
+    block = a[:, : len(pivots)][..., left]
+    return pivots, left, block * _significant(block, error[: len(pivots)][:, left])
 
-    def _sum(self, a: Array, b: Array) -> Array:
-        """The sum of the products of the rows of two blocks."""
-        reduce = self.ring.reduce
-        out = reduce(a[:, :1] * b).sum(axis=0)
-        out[1:] += reduce(a[:, 1:] * b[:, :1]).sum(axis=0)
-        return reduce(out)
 
-    def _convolve(self, a: Array, b: Array, k: int, first: int = 0, last: int | None = None) -> Array:
-        """The sum of a_i b_(k-i) over first <= i <= last."""
-        last = k if last is None else last
-        if last < first:
-            return self.ring.zeros(self.width)
-        stop = k - last - 1
-        return self._sum(a[first : last + 1], b[k - first : stop if stop >= 0 else None : -1])
+def solve(matrix: Array, right: Array) -> Array:
+    """The solution, (n, k), of a square linear system; unknowns that it leaves open are 0.
 
-    def _invert(self, a: Array) -> Array:
-        """1/a for a row."""
-        i = self.ring.inverse(a[0])
-        out = self.ring.reduce(self.ring.reduce(-a * i) * i)
-        out[0] = i
-        return out
+    Raises ArithmeticError where it has none. Pivots below the root of the last digit are 0.
+    """
+    n, least = len(matrix), ONE.scaleb(-(getcontext().prec // 2))
+    a = np.hstack([matrix, right])
+    size = np.abs(a[:, :n]).max(axis=1)
+    a[size > 0] = a[size > 0] / size[size > 0][:, None]
+    largest, pivots = np.abs(a[:, n:]).max(), list[int]()
+    for i in range(n):
+        k, column = (int(j) for j in np.unravel_index(np.argmax(np.abs(a[i:, :n])), (n - i, n)))
+        if abs(a[i + k, column]) < least:
+            break
+        a[[i, i + k]] = a[[i + k, i]]
+        a[i] = a[i] / a[i, column]
+        others = np.arange(n) != i
+        a[others] = a[others] - a[others, column][:, None] * a[i]
+        pivots.append(column)
+    if len(pivots) < n and np.abs(a[len(pivots) :, n:]).max() > least.sqrt() * largest:
+        raise ZeroDivisionError("the equations contradict each other")
+    result = zeros(*right.shape)
+    result[pivots] = a[: len(pivots), n:]
+    return result
 
-    def _add(self, n: int, k: int, a: int, b: int) -> Array:
-        return self.ring.reduce(self.c[a][k] + self.c[b][k])
 
-    def _sub(self, n: int, k: int, a: int, b: int) -> Array:
-        return self.ring.reduce(self.c[a][k] - self.c[b][k])
+def _function(name: str, arguments: Sequence[Decimal]) -> Decimal:
+    """The value of an elementary function; ArithmeticError where it has none that is real."""
+    prec = getcontext().prec
+    with mpmath.workdps(prec + 5):
+        try:
+            return Decimal(
+                mpmath.nstr(getattr(mpmath, CALLED.get(name, name))(*(mpmath.mpf(str(x)) for x in arguments)), prec)
+            )
+        except ValueError as e:
+            raise InvalidOperation(f"{name} has no value: {e}") from None
 
-    def _neg(self, n: int, k: int, a: int) -> Array:
-        return self.ring.reduce(-self.c[a][k])
 
-    def _mul(self, n: int, k: int, a: int, b: int) -> Array:
-        if a in self.static:
-            return self._times(self.c[a][0], self.c[b][k])
-        if b in self.static:
-            return self._times(self.c[b][0], self.c[a][k])
-        return self._convolve(self.c[a], self.c[b], k)
+def _number(value: float) -> Decimal:
+    """The fraction that a float stands for: of small terms if there is one, else its decimal text."""
+    if not math.isfinite(value):
+        raise InvalidOperation("a constant that is not finite")
+    near = Fraction(value).limit_denominator(10**6)
+    return Decimal(near.numerator) / near.denominator if float(near) == value else Decimal(repr(value))
 
-    def _div(self, n: int, k: int, a: int, b: int) -> Array:
-        if k == 0:
-            self.aux[n] = self._invert(self.c[b][0])
-        rest = self.c[a][k]
-        if b not in self.static:
-            rest = self.ring.reduce(rest - self._convolve(self.c[n], self.c[b], k, 0, k - 1))
-        return self._times(rest, self.aux[n])
 
-    def _inverse(self, n: int, k: int, a: int) -> Array:
-        if k == 0:
-            self.aux[n] = self._invert(self.c[a][0])
-            return self.aux[n]
-        return self._times(self.ring.reduce(-self._convolve(self.c[n], self.c[a], k, 0, k - 1)), self.aux[n])
-
-    def _sqrt(self, n: int, k: int, a: int) -> Array:
-        ring = self.ring
-        if k == 0:
-            root = self._value("sqrt", self.c[a][0, 0])
-            out = ring.reduce(self.c[a][0] * ring.inverse(ring.reduce(2 * root)))
-            out[0] = root
-            self.aux[n] = self._invert(ring.reduce(2 * out))
-            return out
-        return self._times(ring.reduce(self.c[a][k] - self._convolve(self.c[n], self.c[n], k, 1, k - 1)), self.aux[n])
-
-    # --- functions with a differential equation of their own ---
-
-    def _value(self, name: str, argument: Any) -> Any:
-        key = (name, argument)
-        if key not in self.known:
-            made = self.ring.sqrt(argument) if name == "sqrt" else self._transcendental(name, argument)
-            self.known[key] = made
-        return self.known[key]
-
-    def _transcendental(self, name: str, argument: Any) -> Any:
-        if not self.ring.p or name not in ("sin", "cos"):
-            return self.ring.transcendental(name, argument, self.random)
-        p = self.ring.p
-        if int(argument) % p == 0:
-            return int(name == "cos")
-        t = self.random.randrange(2, p - 1)  # both lie on the unit circle
-        inverse = self.ring.inverse(1 + t * t)
-        self.known["sin", argument], self.known["cos", argument] = 2 * t * inverse % p, (1 - t * t) * inverse % p
-        return self.known[name, argument]
-
-    def _weighted(self, a: Array, k: int, first: int = 1) -> Array:
-        """The rows a_1..a_k times their order: the coefficients of the derivative."""
-        orders = np.array([self.ring.number(Fraction(i)) for i in range(first, k + 1)], a.dtype)
-        return self.ring.reduce(a[first : k + 1] * orders[:, None])
-
-    def _integrate(self, slope: Array, a: int, k: int) -> Array:
-        """Coefficient k of the function whose derivative is slope times the argument's derivative."""
-        total = self._sum(self._weighted(self.c[a], k), slope[k - 1 :: -1][:k])
-        return self.ring.reduce(total * self.ring.number(Fraction(1, k)))
-
-    def _start(self, name: str, a: int, slope: Array) -> Array:
-        out = self.ring.reduce(self.c[a][0] * slope[0])
-        out[0] = self._value(name, self.c[a][0, 0])
-        return out
-
-    def _exp(self, n: int, k: int, a: int) -> Array:
-        if k == 0:
-            value = self.ring.zeros(self.width)
-            value[0] = self._value("exp", self.c[a][0, 0])
-            return self._start("exp", a, value)
-        return self._integrate(self.c[n], a, k)
-
-    def _log(self, n: int, k: int, a: int) -> Array:
-        return self._by_quotient(n, k, a, self.c[a])
-
-    def _by_quotient(self, n: int, k: int, a: int, bottom: Array) -> Array:
-        """Coefficient k of the function with n' bottom = a'."""
-        if k == 0:
-            self.aux[-n] = self._invert(bottom[0])
-            return self._start(self.graph.nodes[n][0], a, self.aux[-n])
-        ring = self.ring
-        rest = ring.reduce(self.c[a][k] * ring.number(Fraction(k)))
-        if k > 1:
-            rest = ring.reduce(rest - self._sum(self._weighted(self.c[n], k - 1), bottom[k - 1 : 0 : -1]))
-        return ring.reduce(self._times(rest, self.aux[-n]) * ring.number(Fraction(1, k)))
-
-    def _atan(self, n: int, k: int, a: int) -> Array:
-        square = self._helper(n)
-        square[k] = self._convolve(self.c[a], self.c[a], k)
-        if k == 0:
-            square[0, 0] = self.ring.reduce(square[0, 0] + 1)
-        return self._by_quotient(n, k, a, square)
-
-    def _helper(self, n: int) -> Array:
-        if n not in self.aux:
-            self.aux[n] = self.ring.zeros(self.order + 1, self.width)
-        return self.aux[n]
-
-    def _tan(self, n: int, k: int, a: int, sign: int = 1) -> Array:
-        slope, ring = self._helper(n), self.ring
-        if k == 0:
-            name = self.graph.nodes[n][0]
-            value = self._value(name, self.c[a][0, 0])
-            slope[0, 0] = ring.reduce(1 + sign * ring.reduce(value * value))
-            out = self._start(name, a, slope[0])
+def values(equations: Equations, nodes: Iterable[int], leaves: Mapping[int, Decimal]) -> dict[int, Decimal]:
+    """{node: value} of nodes in an order of evaluation. Raises ArithmeticError where one has none."""
+    found: dict[int, Decimal] = {}
+    for n in nodes:
+        op, *a = equations.graph.nodes[n]
+        if op == "leaf":
+            found[n] = leaves[n]
+        elif op == "const":
+            found[n] = _number(a[0])
         else:
-            out = self._integrate(slope, a, k)
-        self.c[n][k] = out
-        slope[k] = ring.reduce(sign * self._convolve(self.c[n], self.c[n], k))
-        if k == 0:
-            slope[0, 0] = ring.reduce(slope[0, 0] + 1)
-        return out
-
-    def _tanh(self, n: int, k: int, a: int) -> Array:
-        return self._tan(n, k, a, -1)
-
-    def _sin(self, n: int, k: int, a: int) -> Array:
-        return self._circle(n, k, a, "sin", "cos", 1)
-
-    def _cos(self, n: int, k: int, a: int) -> Array:
-        return self._circle(n, k, a, "cos", "sin", -1)
-
-    def _circle(self, n: int, k: int, a: int, name: str, other: str, sign: int) -> Array:
-        partner = self._helper(n)
-        if k == 0:
-            value, partner_value = (self._value(f, self.c[a][0, 0]) for f in (name, other))
-            out = self.ring.reduce(sign * self.c[a][0] * partner_value)
-            partner[0] = self.ring.reduce(-sign * self.c[a][0] * value)
-            out[0], partner[0, 0] = value, partner_value
-            return out
-        out = self.ring.reduce(sign * self._integrate(partner, a, k))
-        partner[k] = self.ring.reduce(-sign * self._integrate(self.c[n], a, k))
-        return out
+            x = [found[k] for k in equations.arguments(n)]
+            found[n] = ARITHMETIC[op](*x) if op in ARITHMETIC else _function(op, x)
+    return found
 
 
-TRANSCENDENTAL = ("exp", "log", "sin", "cos", "tan", "tanh", "atan")
+class TaylorSeries:
+    """Series of the nodes that equations need, from a start, along directions.
 
-
-class Taylor:
-    """The series of one stretch of an experiment: equations, parameters and inputs are given, the start varies.
-
-    p: every parameter's value. inputs: for each element of `w` its coefficients from order 0; one coefficient: constant.
-    unknown: positions in p of the parameters derivatives are taken by. Columns: value, start of each state, each unknown
-    parameter, each algebraic unknown (used at order 0 only).
+    c: (nodes, order + 1, 1 + directions) coefficients, each with its derivatives. point: of each leaf its coefficients from order
+    0 on; one coefficient: constant, or the start of a state or unknown. directions: {leaf: row of derivatives} of the starts
+    of states and of the parameters. watched: nodes beside the outputs.
     """
 
     def __init__(
         self,
         equations: Equations,
-        ring: Ring,
-        p: Sequence[Any],
-        unknown: Sequence[int],
-        seed: int,
-        deadline: float,
+        point: Mapping[int, Sequence[Decimal]],
+        directions: Mapping[int, Array],
+        order: int,
+        watched: Sequence[int] = (),
     ) -> None:
-        self.equations, self.ring, self.p, self.unknown = equations, ring, p, list(unknown)
-        self.nx, self.nz = len(equations.derivatives), len(equations.residuals)
-        self.width = 1 + self.nx + len(self.unknown) + self.nz
-        self.kept = self.width - self.nz
-        self.deadline, self.random = deadline, Random(seed)
-        self.known: dict[tuple[str, Any], Any] = {}
+        self.equations, self.graph = equations, equations.graph
+        e, g = equations, equations.graph
+        self.unknowns = [g.leaf("y", len(e.derivatives) + j) for j in range(len(e.residuals))]
+        self.jacobian = [[g.gradient(r).get(z, g.zero) for z in self.unknowns] for r in e.residuals]
+        self.slopes: dict[int, list[tuple[int, int]]] = {}
+        self.nodes = self._closed([*e.outputs, *watched, *e.derivatives, *e.residuals, *chain(*self.jacobian)])
+        self.at = {n: i for i, n in enumerate(self.nodes)}
+        self.static = self._static(point)
+        self.moving = [n for n in self.nodes if n not in self.static and g.nodes[n][0] != "leaf"]
+        self.loop = [n for n in e.behind(e.residuals) if n in set(self.moving)]
+        self.order = -1
+        width = next(iter(directions.values())).size if directions else 0
+        self.c = zeros(len(self.nodes), order + 1, 1 + width)
+        found = values(e, self.nodes, {n: series[0] for n, series in point.items()})
+        self.c[:, 0, 0] = [found[n] for n in self.nodes]
+        for n, series in point.items():
+            if n in self.at:
+                self.c[self.at[n], : len(series), 0] = series[: order + 1]
+        for n, row in directions.items():
+            if n in self.at:
+                self.c[self.at[n], 0, 1:] = row
 
-    def run(
-        self, y: Sequence[Any], w: Sequence[Sequence[Any]], order: int, roots: Sequence[int]
-    ) -> Mapping[int, Array]:
-        """{node: (order + 1, columns) coefficients} of the roots, from the start y = [states, unknowns]."""
-        g, e = self.equations.graph, self.equations
-        self._in_time()
-        slopes = [d for r in e.residuals for _, d in e.unknown_slopes(r)]
-        self.nodes = g.reachable([*roots, *e.derivatives, *e.residuals, *slopes])
-        self.order = order
-        self._check(self.nodes)
-        static = self._static(w)
-        self.moving = [n for n in self.nodes if n not in static and g.nodes[n][0] != "leaf"]
-        self.series = Coefficients(g, self.ring, self.nodes, static, order, self.width, self.known, self.random)
-        self.c = self.series.c
-        self._leaves(y, w)
-        self._first()
-        moving = set(self.moving)
-        loop = [n for n in g.reachable(e.residuals) if n in moving] if self.nz else []
-        for k in range(1, order + 1):
-            self._in_time()
-            step = self.ring.number(Fraction(1, k))
-            for i, d in enumerate(e.derivatives):
-                self._set(("y", i), k, self.ring.reduce(self.c[d][k - 1] * step))
-            if self.nz:
-                self.series.compute(loop, k)
-                self._unknowns(k)
-            self.series.compute(self.moving, k)
-        return {r: self.c[r][:, : self.kept] for r in roots}
+    def _closed(self, roots: Sequence[int]) -> list[int]:
+        """The nodes behind the roots and behind the derivatives of the functions among them."""
+        g, pending, found = self.graph, list(roots), set[int]()
+        while pending:
+            new = self.equations.behind(pending, known=found)
+            found.update(new)
+            functions = [n for n in new if g.nodes[n][0] not in (*ARITHMETIC, "leaf", "const")]
+            self.slopes |= {n: self._power(n) if g.nodes[n][0] == "pow" else g.slopes(n) for n in functions}
+            pending = [slope for n in functions for _, slope in self.slopes[n]]
+        return sorted(found)
 
-    def _in_time(self) -> None:
-        if time.thread_time() > self.deadline:
-            raise OutOfTime
+    def _power(self, n: int) -> list[tuple[int, int]]:
+        """(argument, derivative of n = x**a with respect to it) pairs, written with n itself, so that they come to an end."""
+        g, (_, x, a) = self.graph, self.graph.nodes[n]
+        by_base = (x, g.div(g.mul(a, n), x))
+        return [by_base] if g.value(a) is not None else [by_base, (a, g.mul(n, g.call("log", x)))]
 
-    # --- start ---
-
-    def _static(self, w: Sequence[Sequence[Any]]) -> set[int]:
+    def _static(self, point: Mapping[int, Sequence[Decimal]]) -> set[int]:
         """The nodes that do not change in time."""
         static: set[int] = set()
-        g = self.equations.graph
         for n in self.nodes:
-            key = g.nodes[n]
-            if key[0] == "leaf":
-                still = key[1] == "p" or (key[1] == "w" and len(w[key[2]]) == 1)
+            op, *a = self.graph.nodes[n]
+            if op == "leaf":
+                still = a[0] == "p" or (a[0] == "w" and len(point[n]) == 1)
             else:
-                still = all(a in static for a in g.arguments(n))
+                still = all(k in static for k in self.equations.arguments(n))
             if still:
                 static.add(n)
         return static
 
-    def _leaves(self, y: Sequence[Any], w: Sequence[Sequence[Any]]) -> None:
-        for n in self.nodes:
-            key = self.equations.graph.nodes[n]
-            if key[0] == "const":
-                self.c[n][0, 0] = self.ring.number(self.equations.fraction(key[1]))
-            elif key[0] == "leaf":
-                self._leaf(n, key[1], key[2], y, w)
-
-    def _leaf(self, n: int, group: str, index: int, y: Sequence[Any], w: Sequence[Sequence[Any]]) -> None:
-        c = self.c[n]
-        if group == "p":
-            c[0, 0] = self.p[index]
-            if index in self.unknown:
-                c[0, 1 + self.nx + self.unknown.index(index)] += 1
-        elif group == "w":
-            for k, value in enumerate(w[index][: self.order + 1]):
-                c[k, 0] = value
-        else:
-            c[0, 0] = y[index]
-            c[0, 1 + index if index < self.nx else self.kept + index - self.nx] += 1
-
-    def _set(self, leaf: tuple[str, int], k: int, row: Array) -> None:
-        n = self.equations.graph.leaf(*leaf)
-        if n in self.c:
-            self.c[n][k] = row
-
-    def _first(self) -> None:
-        g, e, ring = self.equations.graph, self.equations, self.ring
-        inner = [n for n in self.nodes if g.nodes[n][0] not in ("const", "leaf")]
-        self.series.compute(inner, 0)
-        if not self.nz:
+    def advance(self) -> None:
+        """Compute the coefficients of the next order. Raises ArithmeticError where one has no value."""
+        self.order += 1
+        k, c, g = self.order, self.c, self.graph
+        if k == 0:
+            self._compute([n for n in self.nodes if g.nodes[n][0] not in ("leaf", "const")], (slice(1, None),))
             return
-        jacobian = np.array([self.c[r][0, self.kept :] for r in e.residuals])
-        self._by_unknowns = inverse(ring, jacobian)
-        right = np.array([self.c[r][0, : self.kept] for r in e.residuals])
-        rows = ring.reduce(-ring.product(self._by_unknowns, right))
-        for j in range(self.nz):
-            n = g.leaf("y", self.nx + j)
-            if n in self.c:
-                self.c[n][0, 1 : self.kept] = rows[j, 1:]
-                self.c[n][0, self.kept :] = ring.zeros(self.nz)
-        self.series.compute(inner, 0)
+        for i, d in enumerate(self.equations.derivatives):
+            x = g.leaf("y", i)
+            if x in self.at:
+                c[self.at[x], k] = c[self.at[d], k - 1] / k
+        self._compute(self.moving, (slice(0, 1), slice(1, None)))
 
-    def _unknowns(self, k: int) -> None:
-        """Set the unknowns' coefficients of order k, in which the equations are linear."""
-        e, g, ring = self.equations, self.equations.graph, self.ring
-        right = np.array([self.c[r][k, : self.kept] for r in e.residuals])
-        z = ring.reduce(-ring.product(self._by_unknowns, right[:, :1]))[:, 0]
-        for i, r in enumerate(e.residuals):
-            for j, d in e.unknown_slopes(r):
-                right[i, 1:] = ring.reduce(right[i, 1:] + ring.reduce(self.c[d][0, 1 : self.kept] * z[j]))
-        rows = ring.reduce(-ring.product(self._by_unknowns, right))
-        for j in range(self.nz):
-            n = g.leaf("y", self.nx + j)
-            if n in self.c:
-                self.c[n][k, : self.kept] = rows[j]
+    def _compute(self, nodes: Sequence[int], parts: Sequence[slice]) -> None:
+        """Set a coefficient of the nodes; before that the unknowns', in which the equations are linear, value first."""
+        k, c = self.order, self.c
+        if self.unknowns:
+            loop = self.loop if k else nodes
+            at = [self.at[r] for r in self.equations.residuals]
+            for part in parts:
+                self._rows(loop)
+                jacobian = np.array([[c[self.at[d], 0, 0] for d in row] for row in self.jacobian])
+                step = solve(jacobian, c[at, k, part])
+                for z, row in zip(self.unknowns, step, strict=True):
+                    if z in self.at:
+                        c[self.at[z], k, part] = -row
+        self._rows(nodes)
 
-    def _check(self, nodes: Sequence[int]) -> None:
-        """Raise NotRational for functions whose values over a prime field could contradict one another."""
-        if not self.ring.p:
-            return
-        g = self.equations.graph
-        used = {
-            (("sin" if g.nodes[n][0] == "cos" else g.nodes[n][0]), g.nodes[n][1])
-            for n in nodes
-            if g.nodes[n][0] in TRANSCENDENTAL
-        }
-        if len(used) > 1:
-            raise NotRational("several functions beyond roots and fractions")
+    def _rows(self, nodes: Sequence[int]) -> None:
+        k, at = self.order, self.at
+        for n in nodes:
+            op, *a = self.graph.nodes[n]
+            if op in ("add", "sub"):
+                x, y = self.c[at[a[0]], k], self.c[at[a[1]], k]
+                row = x + y if op == "add" else x - y
+            elif op == "neg":
+                row = -self.c[at[a[0]], k]
+            elif op == "select":
+                row = self.c[at[self.equations.arguments(n)[0]], k]
+            elif op == "mul":
+                row = self._product(*a)
+            elif op in ("div", "inverse"):
+                row = self._quotient(n, *a)
+            else:
+                row = self._chained(n)
+            self.c[at[n], k] = row
+
+    def _product(self, a: int, b: int) -> Array:
+        """The coefficient of a product."""
+        k, x, y = self.order, self.c[self.at[a]], self.c[self.at[b]]
+        if a in self.static:
+            return _sum(x[:1], y[k : k + 1])
+        if b in self.static:
+            return _sum(x[k : k + 1], y[:1])
+        return _sum(x[: k + 1], y[k::-1])
+
+    def _quotient(self, n: int, *a: int) -> Array:
+        """The coefficient of n = a/b, or of 1/b where there is one argument, from a = n b."""
+        k, q, b = self.order, self.c[self.at[n]], self.c[self.at[a[-1]]]
+        rest = self.c[self.at[a[0]], k].copy() if len(a) > 1 else zeros(b.shape[1])
+        rest[0] += ONE if len(a) == 1 and k == 0 else ZERO
+        if a[-1] not in self.static and k:
+            rest = rest - _sum(q[:k], b[k:0:-1])
+        row = rest / b[0, 0]
+        row[1:] -= row[0] / b[0, 0] * b[0, 1:]
+        return row
+
+    def _chained(self, n: int) -> Array:
+        """The coefficient of a function, from its derivatives by its arguments: k n_k = sum of j a_j slope_(k-j)."""
+        k, c = self.order, self.c
+        if k == 0:
+            row = sum((c[self.at[s], 0, 0] * c[self.at[a], 0] for a, s in self.slopes[n]), zeros(c.shape[2]))
+            row[0] = c[self.at[n], 0, 0]
+            return row
+        orders = np.array([Decimal(j) for j in range(1, k + 1)])[:, None]
+        total = zeros(c.shape[2])
+        for a, s in self.slopes[n]:
+            if a not in self.static:
+                total = total + _sum(orders * c[self.at[a], 1 : k + 1], c[self.at[s], k - 1 :: -1][:k])
+        return total / k
+
+    def derivatives(self, nodes: Sequence[int] | None = None) -> Array:
+        """(nodes, directions) of the newest coefficients; of all nodes unless some are given."""
+        newest = self.c[:, self.order, 1:]
+        return newest if nodes is None else newest[[self.at[n] for n in nodes]]
+
+    def turn(self, turned: Callable[[Array], Array]) -> None:
+        """Go on along other directions: combinations of the present ones, (..., directions) each."""
+        past = self.c[:, : self.order + 1]
+        along = turned(past[..., 1:])
+        self.c = zeros(*self.c.shape[:2], 1 + along.shape[2])
+        self.c[:, : self.order + 1] = np.concatenate([past[..., :1], along], axis=2)
 
 
-def inverse(ring: Ring, matrix: Array) -> Array:
-    """The inverse of a square matrix; NoSuchNumber where it is singular."""
-    n = len(matrix)
-    both = ring.zeros(n, 2 * n)
-    both[:, :n] = matrix
-    for i in range(n):
-        both[i, n + i] += 1
-    reduced, pivots = ring.rref(both)
-    if pivots[:n] != list(range(n)):
-        raise NoSuchNumber("the unknowns are not determined")
-    return reduced[:, n:]
-
-
-@dataclass(frozen=True)
-class Equations:
-    """Nodes of one graph: derivatives and residuals of the unknowns, outputs, what stands at 0 at the start, named signals.
-
-    starts: per state the node that is 0 at the start, or None where the start is free.
-    """
-
-    graph: Graph
-    derivatives: tuple[int, ...]
-    residuals: tuple[int, ...]
-    outputs: tuple[int, ...]
-    starts: tuple[int | None, ...]
-    signals: tuple[int, ...]
-    _slopes: dict[int, list[tuple[int, int]]] = field(default_factory=dict, repr=False, compare=False)
-
-    def unknown_slopes(self, node: int) -> list[tuple[int, int]]:
-        """(unknown, node) pairs: the derivatives of a node by the algebraic unknowns."""
-        if node not in self._slopes:
-            nx = len(self.derivatives)
-            keys = ((self.graph.nodes[v], d) for v, d in self.graph.gradient(node).items())
-            self._slopes[node] = [(k[2] - nx, d) for k, d in keys if k[1] == "y" and k[2] >= nx]
-        return self._slopes[node]
-
-    @staticmethod
-    def fraction(value: float) -> Fraction:
-        """The fraction a float stands for: of small terms if there is one, else its decimal text."""
-        if not math.isfinite(value):
-            raise NotRational("a constant that is not finite")
-        near = Fraction(value).limit_denominator(10**6)
-        return near if float(near) == value else Fraction(repr(value))
+def _sum(a: Array, b: Array) -> Array:
+    """The sum of the products of the rows of two blocks, each a value and its derivatives."""
+    row = a[:, 0] @ b
+    row[1:] += b[:, 0] @ a[:, 1:]
+    return row
