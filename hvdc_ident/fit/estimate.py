@@ -29,7 +29,7 @@ from hvdc_ident.fit.multistart import (
     search_clock_offsets,
     whitened_by_residuals,
 )
-from hvdc_ident.fit.noise_model import source_text
+from hvdc_ident.fit.noise import source_text
 from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
 from hvdc_ident.fit.objective import predicted_reduction
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult

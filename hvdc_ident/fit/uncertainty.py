@@ -17,7 +17,7 @@ from scipy.special import stdtrit
 
 from hvdc_ident.data import Array
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.noise_model import MISFIT
+from hvdc_ident.fit.noise import MISFIT
 from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import Estimate

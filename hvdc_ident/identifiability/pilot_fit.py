@@ -20,7 +20,7 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
 from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.multistart import misfit_weights
-from hvdc_ident.fit.noise_model import GIVEN, MISFIT, from_misfit
+from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit
 from hvdc_ident.fit.nonsmooth import Trend
 from hvdc_ident.fit.objective import LeastSquares, descend
 from hvdc_ident.fit.residual import ResidualBlock
