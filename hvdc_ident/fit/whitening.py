@@ -1,4 +1,4 @@
-"""Autoregressive models of noise, and whitening with them.
+"""Autoregressive models of noise and of residuals, and whitening with them.
 
 A model is a tuple of AR coefficients phi from row to row: e_k = phi_1 e_(k-1) + ... + phi_p e_(k-p) + white noise; () is white.
 """
@@ -20,8 +20,26 @@ MOST = 8
 """The highest AR order that is tried."""
 FEWEST = 20
 """From fewer rows the noise is not whitened: a coefficient would be known to 0.2 at best."""
+FEWEST_OF_RESIDUALS = 4
+"""From fewer rows no autocorrelation of residuals is told; with a few tens it is a rough guess and errs to the wide side."""
 LONG = 120
 """Rows of a record from which more than one AR coefficient is told."""
+
+
+def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
+    """Return the AR(1) coefficient of several records together, 0 where it is not significant (5 %, one-sided) or negative.
+
+    unknowns: how many parameters were fitted to them; a fit lowers the coefficient by about (k + (k + 2) rho)/n
+    (Marriott and Pope 1954, for k = 1 and 2), which is added back.
+    """
+    n = sum(r.size for r in residuals)
+    power = sum(float(r @ r) for r in residuals)
+    if power == 0.0 or n < FEWEST_OF_RESIDUALS:
+        return 0.0
+    rho = sum(float(r[1:] @ r[:-1]) for r in residuals) / power
+    if rho < 1.645 / np.sqrt(n):
+        return 0.0
+    return float(min(rho + (unknowns + (unknowns + 2.0) * rho) / n, 1.0 - 2.0 / n))
 
 
 def autoregression(records: Sequence[Array], most: int = MOST) -> AR:

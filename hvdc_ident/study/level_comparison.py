@@ -28,7 +28,7 @@ from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.noise import MISFIT, source_of
 from hvdc_ident.fit.simulator import observe, unknowns
-from hvdc_ident.fit.uncertainty import autocorrelation
+from hvdc_ident.fit.whitening import autocorrelation
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate import ModelSimulator
 
