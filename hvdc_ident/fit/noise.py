@@ -60,6 +60,8 @@ LOUDER, QUIETER = "louder", "quieter"
 
 SURE = 4.0
 """Standard errors beyond which nothing is put down to chance: one in 16 000, where a diagnosis asks some hundred such questions."""
+LONG = 120
+"""Rows of a record from which a diagnosis takes several AR coefficients as they are; how uncertain one is, it draws."""
 IN_COMMON = 11.5
 """Twice the log-likelihood by which the records' sum has to differ from their differences to hold something in common."""
 FINEST = 0.1
@@ -306,7 +308,7 @@ def _pooled(output: str, experiments: Sequence[Experiment], runs: Mapping[str, M
     # A model that meets a record to its last digits, or a thousand times better than was stated, leaves no noise to tell of.
     shows = std > (floor if given is None else max(1e-12 * _range_of(experiments, output), 1e-3 * given))
     coarse = is_coarse(quiet, step)
-    longer = autoregression(quiet) if shows and even else ()
+    longer = autoregression(quiet) if shows and even and sum(r.size for r in quiet) >= LONG * len(quiet) else ()
     return _Pool(
         records=tuple(quiet) if shows or coarse else tuple(0.0 * r for r in quiet),
         given=given,

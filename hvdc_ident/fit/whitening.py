@@ -22,8 +22,6 @@ FEWEST = 20
 """From fewer rows the noise is not whitened: a coefficient would be known to 0.2 at best."""
 FEWEST_OF_RESIDUALS = 4
 """From fewer rows no autocorrelation of residuals is told; with a few tens it is a rough guess and errs to the wide side."""
-LONG = 120
-"""Rows of a record from which more than one AR coefficient is told."""
 
 
 def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
@@ -45,14 +43,15 @@ def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
 def autoregression(records: Sequence[Array], most: int = MOST) -> AR:
     """Return the AR model of the noise in several records together, its order by BIC; () where it is white.
 
-    records: (n,) each, evenly sampled, without trend. Yule-Walker on the pooled autocovariances, by Levinson's recursion: the
+    records: (n,) each, evenly sampled, without trend. One coefficient at most for ten rows: of fewer BIC finds too many in every tenth
+    record, of more in one of 15 to 50. Yule-Walker on the pooled autocovariances, by Levinson's recursion: the
     model is stationary whatever the data. A single coefficient is that of the restricted likelihood (`FirstOrder`), which is
     not biased in short records.
     """
     n = sum(r.size for r in records)
     if n < FEWEST:
         return ()
-    most = most if n >= LONG * len(records) else 1
+    most = min(most, n // 10)
     covariance = [sum(float(r[k:] @ r[: max(r.size - k, 0)]) for r in records) / n for k in range(most + 1)]
     if covariance[0] <= 0:
         return ()
