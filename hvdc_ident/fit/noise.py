@@ -439,8 +439,8 @@ def _noise(pool: _Pool, colour: Colour) -> OutputNoise:
     if pool.first is not None and colour.tanh:
         std = pool.first.std(colour)
     elif pool.first is not None:
-        std, known = pool.first.level
-        freedom = max(round(known), 1)
+        level, known = pool.first.level
+        std, freedom = max(level, std), max(round(known), 1)
     found = replace(
         found,
         std=std,
