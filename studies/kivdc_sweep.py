@@ -14,7 +14,7 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajectory
 from hvdc_ident.files import csv_text, json_text, write_text
 from hvdc_ident.fit import FitParameter
-from hvdc_ident.fit.uncertainty import autocorrelation
+from hvdc_ident.fit.whitening import autocorrelation
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.linearize import find_operating_point, loop, margins
 from hvdc_ident.models import load_model

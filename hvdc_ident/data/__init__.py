@@ -6,17 +6,27 @@ from hvdc_ident.data.experiment import Experiment, SignalLike, experiment, recor
 from hvdc_ident.data.noise import (
     FEWEST_QUIET,
     FLOOR_SHARE,
-    GAP,
-    MAD_TO_STD,
+    NoiseEstimate,
+    QuietRows,
     at_rest,
-    event_time,
+    before_event,
     noise_estimate,
     noise_floor,
-    pre_event_ar,
+    quiet_rows,
     row_scatter,
+    without_line,
 )
-from hvdc_ident.data.signals import InputSignal, Interpolation, input_signal, multisine, ramp, step
-from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
+from hvdc_ident.data.signals import (
+    MAD_TO_STD,
+    InputSignal,
+    Interpolation,
+    event_time,
+    input_signal,
+    multisine,
+    ramp,
+    step,
+)
+from hvdc_ident.data.trajectory import GAP, Array, Origin, Trajectory, is_even, segments, trajectory
 from hvdc_ident.data.units import PREFIXED, PREFIXES, UNITS, conversion, is_unit, same_unit, scaled, seconds_of
 
 __all__ = [
@@ -31,25 +41,31 @@ __all__ = [
     "Experiment",
     "InputSignal",
     "Interpolation",
+    "NoiseEstimate",
     "Origin",
+    "QuietRows",
     "SignalLike",
     "Trajectory",
     "at_rest",
+    "before_event",
     "conversion",
     "event_time",
     "experiment",
     "input_signal",
+    "is_even",
     "is_unit",
     "multisine",
     "noise_estimate",
     "noise_floor",
-    "pre_event_ar",
+    "quiet_rows",
     "ramp",
     "recording_lines",
     "row_scatter",
     "same_unit",
     "scaled",
     "seconds_of",
+    "segments",
     "step",
     "trajectory",
+    "without_line",
 ]

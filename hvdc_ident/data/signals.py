@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,6 +24,11 @@ CORNER_TOLERANCE = 1e-4
 """A corner is marked where leaving it out moves the signal by more than this share of its range."""
 MAX_CORNERS = 64
 """With more marked corners the signal is curved or noisy, and none of them is a break."""
+
+MAD_TO_STD = 1.482602218505602
+"""Standard deviation over median absolute deviation, of a normal distribution."""
+DEPARTURE = 6.0
+"""A noisy input has left its level when it is so many times its scatter off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +243,47 @@ def _joined(t: Array, v: Array) -> InputSignal:
     corners = marked & ~fixed
     breaks = t[double] if corners.sum() > MAX_CORNERS else t[double | corners]
     return InputSignal(t[kept], v[kept], np.unique(breaks))
+
+
+def event_time(inputs: Mapping[str, InputSignal]) -> float | None:
+    """Return the instant of the first change of any input in s; None where none changes.
+
+    Noise of a recorded input is no change: without a break in it, the signal has to leave its first level by six times
+    the scatter from point to point.
+    """
+    instants = [t for t in map(_first_change, inputs.values()) if t is not None]
+    return min(instants) if instants else None
+
+
+def _first_change(signal: InputSignal) -> float | None:
+    t, v = signal.times, signal.values
+    if signal.is_constant:
+        return None
+    at_break = np.flatnonzero((np.diff(v) != 0) & np.isin(t[:-1], signal.breaks))
+    end = int(at_break[0]) + 1 if at_break.size else t.size
+    # Up to the first break a smooth course, a noisy one, or both: what moves there is not quiet because a break follows.
+    x = v[:end]
+    scatter = robust_std(off_line(*distinct(t[:end], x)))
+    level = float(np.median(x[: max(1, min(20, x.size // 10))]))
+    away = np.abs(x - level) > max(DEPARTURE * scatter, MERGE_TOLERANCE * float(np.ptp(v)))
+    if away.any():
+        return float(t[max(0, int(np.argmax(away)) - 1)])
+    return float(t[at_break[0]]) if at_break.size else None
+
+
+def distinct(t: Array, v: Array) -> tuple[Array, Array]:
+    """Return the rows with the first of two at one time left out."""
+    keep = np.append(np.diff(t) > 0, True)
+    return t[keep], v[keep]
+
+
+def robust_std(x: Array) -> float:
+    """Return the standard deviation, from the median absolute deviation where that says anything: not where half the values are equal."""
+    if x.size == 0:
+        return 0.0
+    middle = float(np.median(x))
+    by_median = MAD_TO_STD * float(np.median(np.abs(x - middle)))
+    return by_median if by_median > 0 else float(np.std(x))
 
 
 def off_line(t: Array, v: Array) -> Array:

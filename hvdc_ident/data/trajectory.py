@@ -4,16 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.display import Shown, Table, axes_of, data_frame, first_rows, library
-from hvdc_ident.errors import WaveformError, unknown_name
+from hvdc_ident.errors import StudyError, WaveformError, unknown_name
 from hvdc_ident.text import with_unit
 
 Array = NDArray[np.float64]
+
+GAP = 1.5
+"""A step over so many median steps is a gap: a new record begins."""
+UNEVEN = 0.02
+"""Steps may differ from the median by this share: rows are then evenly spaced."""
 
 
 @dataclass(frozen=True)
@@ -151,4 +158,46 @@ def trajectory(
     values = np.column_stack(columns) if columns else np.empty((len(time), 0))
     return Trajectory(
         np.asarray(time, dtype=float), values, tuple(signals), tuple((units or {}).get(n, "") for n in signals)
+    )
+
+
+def segments(time: Array, where: str) -> tuple[slice, ...]:
+    """Return the stretches of evenly spaced rows; a gap, or a second row at one instant, begins a new one.
+
+    Raises StudyError where steps within a stretch differ: an AR model from row to row would then mean nothing.
+    """
+    parts, steps, median = _stretches(np.asarray(time, dtype=float).tobytes())
+    if steps is not None:
+        raise StudyError(
+            "whitening needs evenly spaced rows",
+            where=where,
+            expected=f"steps of {median:g} s",
+            got=f"steps from {steps[0]:g} to {steps[1]:g} s",
+            hint="resample the record, or leave `whiten` out: intervals are then corrected for correlated samples",
+        )
+    return parts
+
+
+def is_even(time: Array) -> bool:
+    """Return whether rows are evenly spaced but for gaps, so that a correlation from row to row means something."""
+    return _stretches(np.asarray(time, dtype=float).tobytes())[1] is None
+
+
+@lru_cache(maxsize=256)
+def _stretches(instants: bytes) -> tuple[tuple[slice, ...], tuple[float, float] | None, float]:
+    """Return the stretches, the smallest and the largest step where they differ, and the median; a fit asks again and again."""
+    time = np.frombuffer(instants)
+    steps = np.diff(time)
+    positive = steps[steps > 0]
+    if not positive.size:
+        return tuple(slice(k, k + 1) for k in range(time.size)), None, 0.0
+    median = float(np.median(positive))
+    cut = (steps <= 0) | (steps > GAP * median)
+    inner = steps[~cut]
+    differ = bool(inner.size) and float(np.abs(inner - median).max()) > UNEVEN * median
+    ends = [0, *(np.flatnonzero(cut) + 1).tolist(), time.size]
+    return (
+        tuple(slice(a, b) for a, b in pairwise(ends)),
+        (float(inner.min()), float(inner.max())) if differ else None,
+        median,
     )

@@ -43,7 +43,7 @@ from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, Simulator
-from hvdc_ident.fit.record_noise import LOUDER, QUIETER, OutputNoise
+from hvdc_ident.fit.noise import LOUDER, QUIETER, OutputNoise
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.simulate import ModelSimulator

@@ -13,7 +13,7 @@ from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.residual_checks import loud_after_breaks, residual_tests
 from hvdc_ident.effects import effects
-from hvdc_ident.fit.record_noise import SURE, freedom_of
+from hvdc_ident.fit.noise import SURE, freedom_of
 from hvdc_ident.text import figures, percentage
 
 CLEARLY = 30.0

@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap,
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
-from hvdc_ident.fit.record_noise import SURE
+from hvdc_ident.fit.noise import SURE
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures, listed, percentage, quantity
 

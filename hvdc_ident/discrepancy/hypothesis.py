@@ -18,9 +18,9 @@ from hvdc_ident.discrepancy.nominal import Nominal, of_held_out, orthonormal
 from hvdc_ident.effects import EffectUse, Probe, apply_effects, distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import FitParameter, Problem
+from hvdc_ident.fit.noise import OutputNoise
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
-from hvdc_ident.fit.record_noise import OutputNoise
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.immutable import FrozenMap

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.result import EffectSize
-from hvdc_ident.fit.record_noise import SURE
+from hvdc_ident.fit.noise import SURE
 from hvdc_ident.immutable import FrozenMap
 
 TIED = 2.0

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, Trajectory
+from hvdc_ident.data.noise import TANH
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit import FitParameter, Problem, Simulator, StartOutcome
-from hvdc_ident.fit.record_noise import GIVEN, OutputNoise, draws, noise_of, stated_by
+from hvdc_ident.fit.noise import GIVEN, OutputNoise, noise_of, stated_by
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.simulator import approximate, observe
 from hvdc_ident.identifiability.gate import gate, gated, searched
@@ -100,6 +101,72 @@ class Nominal:
             assert measured is not None
             found.append(measured[b.output][b.rows] - b.misfit)
         return found
+
+
+def draws(
+    problem: Problem,
+    blocks: Sequence[ResidualBlock],
+    noise: Mapping[str, OutputNoise],
+    fitted: Sequence[Array],
+    count: int,
+    seed: int,
+) -> list[Array]:
+    """Return for each block (m, count) records of nothing but noise, weighted and whitened as the residuals are.
+
+    fitted: the model's output at each block's rows, in its unit: rounding depends on it. A single AR coefficient is
+    drawn too, within its error, and so is a standard deviation that is estimated, of a record by itself where the records
+    differ, and the size of the noise below a quantiser: what is not known of the noise widens what noise can do. Where the
+    standard deviation is not given it goes with the coefficient, for the steps from row to row are what is sure.
+    """
+    times = {e.name: e.time for e in problem.fitted_experiments}
+    outputs = list(dict.fromkeys(b.output for b in blocks))
+    found: list[Array] = []
+    for k, (b, y) in enumerate(zip(blocks, fitted, strict=True)):
+        n = noise[b.output]
+        random = np.random.default_rng([seed, 1, k])
+        model = np.repeat(np.array(n.model)[:, None], count, axis=1)
+        if len(n.model) == 1:  # one draw an output: its records share the noise
+            spread = np.random.default_rng([seed, 2, outputs.index(b.output)]).standard_normal(count)
+            model = np.tanh(np.clip(np.arctanh(model) + n.error * spread, TANH[0], TANH[-1]))
+        e = _coloured(random.standard_normal((y.size, count)), model)
+        if len(n.model) == 1 and n.source != GIVEN:
+            e *= np.sqrt((1.0 - n.model[0] ** 2) / (1.0 - model[0] ** 2))
+        if n.freedom and n.quantised is None:
+            own = n.by_record.get(b.experiment)
+            freedom, which = (n.freedom, ()) if own is None else (own[1], (k,))
+            spread = np.random.default_rng([seed, 4, outputs.index(b.output), *which]).chisquare(freedom, count)
+            e *= np.sqrt(freedom / spread)
+        if n.step:
+            size = n.below * np.ones(count)
+            if n.quantised is not None:
+                spread = np.random.default_rng([seed, 3, outputs.index(b.output)]).standard_normal(count)
+                size = size * np.exp(n.error * spread)
+            placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
+            e = np.round((placed + size * e) / n.step) * n.step - placed
+            quantised = problem.treatment.quantised(b.output)
+            if quantised is not None and b.profile is None:
+                found.append(quantised.residual(e)[0])
+                continue
+            e = b.scaled(e)
+        found.append(problem.treatment.applied(e, times[b.experiment][b.rows], b.output, b.experiment))
+    return found
+
+
+def _coloured(white: Array, model: Array) -> Array:
+    """(m, count) stationary AR noise of variance 1; model: (p, count) coefficients."""
+    p = model.shape[0]
+    if not p:
+        return white
+    settle = 200
+    lead = np.random.default_rng(0).standard_normal((settle, white.shape[1]))
+    e = np.vstack([lead, white])
+    for k in range(p, e.shape[0]):
+        for lag in range(p):
+            e[k] += model[lag] * e[k - 1 - lag]
+    kept = e[settle:]
+    if p == 1:
+        return np.asarray(kept * np.sqrt(1.0 - model[0] ** 2))
+    return np.asarray(kept / np.sqrt(np.mean(kept**2)))
 
 
 def unit_columns(columns: Array) -> Array:

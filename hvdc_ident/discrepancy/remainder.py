@@ -22,12 +22,12 @@ from scipy.stats import chi2
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import left_by, unseen_rows
 from hvdc_ident.discrepancy.hypothesis import Refit, held_out_by_record, slot_signals, unseen
-from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
+from hvdc_ident.discrepancy.nominal import Nominal, draws, of_held_out
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.pushes import Inversion, Pushed, pushed
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
-from hvdc_ident.fit.record_noise import draws, freedom_of
+from hvdc_ident.fit.noise import freedom_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 

@@ -13,7 +13,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.hypothesis import Placed, Refit
 from hvdc_ident.discrepancy.nominal import Nominal, unit_columns
 from hvdc_ident.effects import effects
-from hvdc_ident.fit.record_noise import SURE
+from hvdc_ident.fit.noise import SURE
 
 BINS = 8
 AFTER = 10

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import Array, event_time
+from hvdc_ident.data import FEWEST_QUIET, Array, event_time, quiet_rows
 from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, formula_rivals, likely, rivals
 from hvdc_ident.discrepancy.evidence import louder_than_noise, material_gap, worst
 from hvdc_ident.discrepancy.explain import moved_parameters
@@ -27,7 +27,6 @@ from hvdc_ident.discrepancy.stand import FoundForm
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.adequacy import MATTERS
-from hvdc_ident.fit.record_noise import FEWEST, first_at_rest
 from hvdc_ident.text import figures, listed, percentage, value_by_place
 
 DOMINANT = 0.5
@@ -287,15 +286,13 @@ def noise_left(left: Nominal) -> float:
         e = experiments[b.experiment]
         event = e.event if e.event is not None else event_time(e.inputs)
         rows[b.output] = rows.get(b.output, 0) + b.residual.size
-        if event is not None and b.slope is None:  # one level between two steps is no measure of the others
-            before = e.time[b.rows] < event - 1e-12
-            first = first_at_rest(e.time[b.rows][before], b.misfit[before], run[before])
-            if first is not None:
-                quiet.setdefault(b.output, []).append(b.residual[before][first:])
+        if b.slope is None:  # one level between two steps is no measure of the others
+            rest = quiet_rows(e.time[b.rows], b.misfit + run, event, run, b.profile)
+            quiet.setdefault(b.output, []).append(b.residual[rest.rows])
     total = 0.0
     for output, count in rows.items():
         own = np.concatenate(quiet.get(output) or [np.zeros(0)])
-        total += count * (float(np.mean(own**2)) if own.size >= FEWEST else 1.0)
+        total += count * (float(np.mean(own**2)) if own.size >= FEWEST_QUIET else 1.0)
     return max(total / max(sum(rows.values()), 1), 1.0)
 
 

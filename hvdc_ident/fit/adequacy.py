@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtri
 
 from hvdc_ident.data import FLOOR_SHARE, MAD_TO_STD, Array, Experiment
-from hvdc_ident.fit.noise_model import ESTIMATED, GIVEN, MISFIT, from_misfit, scatter_of
+from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, scatter_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.immutable import FrozenMap
@@ -149,9 +149,9 @@ def _size(
         scatter = scatter_of(problem.fitted_experiments, output)
         if scatter is None:
             return ResidualSize(None, 0.0, np.inf, None, white, "not-judged")
-        noise, rows = scatter
+        noise, behind = scatter
         misfit = np.concatenate([b.residual * b.sigma for b in blocks])
-        ratio, behind = _power(problem, misfit) / share / noise**2, 0.5 * rows
+        ratio = _power(problem, misfit) / share / noise**2
     high = max(MATTERS, _quantile(spare, behind, 1.0 - level))
     # Of few independent samples the unknowns take a larger share than of the rows.
     low = min(1.0 / MATTERS, _quantile(spare, behind, level) * spare / (effective * share))
@@ -207,7 +207,7 @@ def _line(output: str, size: ResidualSize, source: str) -> str:
         return (
             f"the noise of {output} is taken from the fit's own residual, which then cannot tell whether the model fits"
         )
-    kind = "stated" if source == GIVEN else "estimated" if source.startswith(ESTIMATED) else "row-to-row"
+    kind = "stated" if source == GIVEN else "row-to-row" if from_misfit(source) else "estimated"
     ratio = f"chi2/dof {size.ratio:.3g}"
     if size.times == 0.0:
         return f"the residual of {output} is 0: nothing of the {kind} noise is in these rows ({ratio})"

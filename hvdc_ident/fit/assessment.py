@@ -17,7 +17,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.adequacy import ljung_box
 from hvdc_ident.fit.descent import descend
-from hvdc_ident.fit.noise_model import from_misfit
+from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import compared_rows, per_deviation, stretches
 from hvdc_ident.fit.result import FitResult

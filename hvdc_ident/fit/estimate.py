@@ -18,7 +18,7 @@ from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.descent import predicted_reduction
 from hvdc_ident.fit.jump_instants import PlacedInstant, placed_instants, search_instants, within_stretches
-from hvdc_ident.fit.noise_model import source_text
+from hvdc_ident.fit.noise import source_text
 from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion

@@ -18,7 +18,7 @@ from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError, StudyError, require_known
 from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
 from hvdc_ident.fit.likelihood import LOSSES, Loss, Prior, QuantisedNoise, prior_rows
-from hvdc_ident.fit.noise_model import AR, GIVEN, sigmas, source_of
+from hvdc_ident.fit.noise import GIVEN, sigmas, source_of
 from hvdc_ident.fit.residual import (
     Band,
     ComparedRecord,
@@ -31,6 +31,7 @@ from hvdc_ident.fit.residual import (
     with_steady_start,
 )
 from hvdc_ident.fit.simulator import Simulator, unknown_of, unknowns
+from hvdc_ident.fit.whitening import AR
 from hvdc_ident.immutable import FrozenMap
 
 

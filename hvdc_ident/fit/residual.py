@@ -14,11 +14,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.data import GAP, Array, Experiment, Trajectory
+from hvdc_ident.data import GAP, Array, Experiment, Trajectory, segments
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit.likelihood import QuantisedNoise
-from hvdc_ident.fit.noise_model import AR, segments, whitened
 from hvdc_ident.fit.simulator import TIME_SHIFT, Simulator, observe, states_of
+from hvdc_ident.fit.whitening import AR, whitened
 from hvdc_ident.immutable import FrozenMap
 
 Band = tuple[float, float]

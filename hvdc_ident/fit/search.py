@@ -18,7 +18,7 @@ from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.noise_model import MISFIT, autoregression, before_event, floor_of
+from hvdc_ident.fit.noise import MISFIT, floor_of, models_before_event
 from hvdc_ident.fit.nonsmooth import LUCK, roughness
 from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers import optimiser as named
@@ -27,6 +27,7 @@ from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import StartOutcome
 from hvdc_ident.fit.simulator import approximate
 from hvdc_ident.fit.uncertainty import TWO_SIDED
+from hvdc_ident.fit.whitening import autoregression
 from hvdc_ident.immutable import FrozenMap
 
 WHITEN = ("no", "pre-event", "residual")
@@ -328,7 +329,7 @@ def prewhitened(problem: Problem, whiten: str) -> Problem:
     require_known("way of whitening", [whiten], WHITEN, "")
     if whiten != "pre-event":
         return problem
-    return replace(problem, rho=FrozenMap(before_event(problem.fitted_experiments, problem.outputs_in_time)))
+    return replace(problem, rho=FrozenMap(models_before_event(problem.fitted_experiments, problem.outputs_in_time)))
 
 
 def reweighted(

@@ -17,11 +17,12 @@ from scipy.special import stdtrit
 
 from hvdc_ident.data import Array
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.noise_model import MISFIT
+from hvdc_ident.fit.noise import MISFIT
 from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import Estimate
 from hvdc_ident.fit.simulator import unit_of, unknown_of
+from hvdc_ident.fit.whitening import autocorrelation
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures
 
@@ -40,9 +41,6 @@ SINGULAR = 1e-7
 """Singular values of the normalised columns below this share of the largest are the sensitivities' own error."""
 UNSEEN = 1e-9
 """A parameter whose whole range moves the residual by less than this has no effect."""
-
-FEWEST_ROWS = 4
-"""From fewer rows no autocorrelation is estimated; with a few tens it is a rough guess and errs to the wide side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,22 +95,6 @@ class Uncertainty:
         known = [i for i, n in enumerate(self.names) if n not in self.reasons]
         d = np.sqrt(np.diag(self.corrected))
         return {self.names[i]: {self.names[j]: float(self.corrected[i, j] / d[i] / d[j]) for j in known} for i in known}
-
-
-def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
-    """Return the AR(1) coefficient of several records together, 0 where it is not significant (5 %, one-sided) or negative.
-
-    unknowns: how many parameters were fitted to them; a fit lowers the coefficient by about (k + (k + 2) rho)/n
-    (Marriott and Pope 1954, for k = 1 and 2), which is added back.
-    """
-    n = sum(r.size for r in residuals)
-    power = sum(float(r @ r) for r in residuals)
-    if power == 0.0 or n < FEWEST_ROWS:
-        return 0.0
-    rho = sum(float(r[1:] @ r[:-1]) for r in residuals) / power
-    if rho < 1.645 / np.sqrt(n):
-        return 0.0
-    return float(min(rho + (unknowns + (unknowns + 2.0) * rho) / n, 1.0 - 2.0 / n))
 
 
 def uncertainty(

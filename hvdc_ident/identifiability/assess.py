@@ -20,7 +20,7 @@ from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
 from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.jump_instants import moving_parameters
-from hvdc_ident.fit.noise_model import unknown_noise
+from hvdc_ident.fit.noise import unknown_noise
 from hvdc_ident.fit.partial_fits import Group, part_of
 from hvdc_ident.fit.profile_path import ProfileOptions
 from hvdc_ident.fit.simulator import inputs_of

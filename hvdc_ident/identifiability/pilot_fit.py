@@ -20,7 +20,7 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
 from hvdc_ident.fit.adequacy import Adequacy, adequacy
 from hvdc_ident.fit.descent import descend
-from hvdc_ident.fit.noise_model import GIVEN, MISFIT, from_misfit
+from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit
 from hvdc_ident.fit.nonsmooth import Trend
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import FitResult, StartOutcome

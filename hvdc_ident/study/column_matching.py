@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from hvdc_ident.data import FEWEST_QUIET, Array, Trajectory, conversion, noise_estimate
+from hvdc_ident.data import FEWEST_QUIET, Array, Trajectory, before_event, conversion, noise_estimate
 from hvdc_ident.model import AnyModel
 from hvdc_ident.text import quantity
 
@@ -160,10 +160,10 @@ def _bare(name: str) -> str:
 def _rest(time: Array, values: Array, event: float | None) -> tuple[float | None, float, bool]:
     """The mean before the event, the noise about it, and True; without quiet rows the first value, no noise, and False."""
     known = np.isfinite(values)
-    before = known & (time < event) if event is not None else np.zeros(time.size, dtype=bool)
+    before = before_event(time, values, event)
     if int(before.sum()) < FEWEST_QUIET:
         return (float(values[known][0]) if known.any() else None), 0.0, False
-    return float(values[before].mean()), float(noise_estimate(time, values, event)), True
+    return float(values[before].mean()), noise_estimate(time, values, event).std, True
 
 
 def _candidate(target: Target, column: Column) -> Match | None:

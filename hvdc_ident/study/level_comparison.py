@@ -18,15 +18,17 @@ from hvdc_ident.data import (
     UNITS,
     Array,
     Experiment,
+    before_event,
     conversion,
     noise_floor,
-    pre_event_ar,
     same_unit,
+    without_line,
 )
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.noise_model import MISFIT, source_of
+from hvdc_ident.fit.noise import MISFIT, source_of
 from hvdc_ident.fit.simulator import observe, unknowns
+from hvdc_ident.fit.whitening import autocorrelation
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate import ModelSimulator
 
@@ -182,7 +184,7 @@ class RecordedOutput:
         assert e.measured is not None
         values = e.measured[output]
         finite = np.isfinite(values)
-        before = finite & (e.time < e.event - 1e-12) if e.event is not None else np.zeros(values.size, dtype=bool)
+        before = before_event(e.time, values, e.event)
         after = finite & e.compared & ~before
         noise = max(e.noise.get(output) or 0.0, noise_floor(values[finite]))
         deterministic = source_of([e], output) == MISFIT
@@ -334,7 +336,7 @@ def _error_of_mean(gap: Array, noise: float, deterministic: bool) -> float:
     """The standard error of the mean of some rows: of coloured noise, with what a drift leaves open, as the larger of the
     noise told and seen; that of a deterministic record is its misfit, which no mean makes smaller."""
     n = gap.size
-    rho = pre_event_ar(gap)
+    rho = autocorrelation([without_line(np.arange(float(n)), gap)[0]], 2)
     std = max(noise, float(np.std(gap - gap.mean(), ddof=1)) if n > 2 else 0.0)
     drift = float(np.polyfit(np.arange(n), gap, 1)[0]) * n if n > 2 else 0.0
     independent = 1.0 if deterministic else max(n * (1.0 - rho) / (1.0 + rho), 1.0)

@@ -14,8 +14,10 @@ from hvdc_ident.data import (
     Array,
     Experiment,
     InputSignal,
+    NoiseEstimate,
     Origin,
     Trajectory,
+    before_event,
     conversion,
     event_time,
     input_signal,
@@ -41,8 +43,6 @@ from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
 
 TIME_SHIFT = "time-shift"
-MEDIAN_EFFICIENCY = 0.37
-"""Efficiency of the median absolute deviation as an estimate of normal noise's standard deviation (Rousseeuw, Croux 1993)."""
 
 
 @dataclass(frozen=True)
@@ -137,13 +137,13 @@ def with_noise(
     if e.measured is None:
         return e.with_(event=event), FrozenMap()
     table = e.measured
-    notes = {
-        o: _noise(stated.get(o), e.time, table[o], event, by_row=o in e.noise_profile and o in stated)
-        for o in e.outputs
-    }
-    estimated = [o for o, n in notes.items() if n.source == "estimated"]
-    before = e.time < (event if event is not None else -np.inf)
-    dof = {o: max(1.0, MEDIAN_EFFICIENCY * int((before & np.isfinite(table[o])).sum())) for o in estimated}
+    notes, dof = {}, {}
+    for o in e.outputs:
+        told = o not in stated and int(before_event(e.time, table[o], event).sum()) >= FEWEST_QUIET
+        found = noise_estimate(e.time, table[o], event) if told else NoiseEstimate()
+        notes[o] = _noise(stated.get(o), found, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
+        if notes[o].source == "estimated":
+            dof[o] = max(1.0, found.freedom)
     noise = {o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}
     profile = {o: v for o, v in e.noise_profile.items() if o in noise}
     return e.with_(event=event, noise=noise, noise_dof=e.noise_dof | dof, noise_profile=profile), FrozenMap(notes)
@@ -418,12 +418,11 @@ def _deviations(data: Trajectory, column: str, of: str, mapping: tuple[float, fl
     return np.where(recorded, found, np.nan)
 
 
-def _noise(given: float | None, time: Array, values: Array, event: float | None, *, by_row: bool = False) -> NoiseNote:
-    """The larger of what is given, else estimated before the event, and the floor; where that acts the data show no noise."""
-    floor = noise_floor(values)
-    if given is None and (event is None or int(np.isfinite(values[time < event]).sum()) < FEWEST_QUIET):
+def _noise(given: float | None, found: NoiseEstimate, floor: float, *, by_row: bool) -> NoiseNote:
+    """The larger of what is given, else found before the event, and the floor; where that acts the data show no noise."""
+    if given is None and not found.source:
         return NoiseNote(floor, "residual")
-    std = given if given is not None else noise_estimate(time, values, event)
+    std = given if given is not None else found.std
     if std <= floor:
         return NoiseNote(floor, "floor")
     return NoiseNote(std, "given" if given is not None else "estimated", by_row)

@@ -17,9 +17,9 @@ from hvdc_ident.data import (
     input_signal,
     noise_estimate,
     noise_floor,
-    pre_event_ar,
     row_scatter,
 )
+from hvdc_ident.data.noise import FirstOrder, common_colours
 from hvdc_ident.errors import WaveformError
 
 T = np.arange(501) * 1e-3
@@ -177,15 +177,15 @@ def test_noise_of_white_and_coloured_records() -> None:
     t = np.arange(4000) * 1e-3
     white = 2e-3 * rng.standard_normal(t.size)
     response = np.where(t >= 2, 1 - np.exp(-5 * (t - 2)), 0)
-    assert noise_estimate(t, 0.4 + 0.01 * t + white + response, 2.0) == pytest.approx(2e-3, rel=0.1)
-    assert noise_estimate(t, 0.4 + white + response, None) == pytest.approx(2e-3, rel=0.1)
-    assert noise_estimate(t, 0.4 + white + response, 0.0) == pytest.approx(2e-3, rel=0.1)
+    assert noise_estimate(t, 0.4 + 0.01 * t + white + response, 2.0).std == pytest.approx(2e-3, rel=0.1)
+    assert noise_estimate(t, 0.4 + white + response, None).std == pytest.approx(2e-3, rel=0.1)
+    assert noise_estimate(t, 0.4 + white + response, 0.0).std == pytest.approx(2e-3, rel=0.1)
     coloured = np.zeros(t.size)
     for i in range(1, t.size):
         coloured[i] = 0.9 * coloured[i - 1] + white[i]
-    assert noise_estimate(t, coloured, 4.0) == pytest.approx(2e-3 / math.sqrt(1 - 0.81), rel=0.2)
-    assert pre_event_ar(coloured) == pytest.approx(0.9, abs=0.03)
-    assert abs(pre_event_ar(white)) < 0.05
+    assert noise_estimate(t, coloured, 4.0).std == pytest.approx(2e-3 / math.sqrt(1 - 0.81), rel=0.2)
+    assert common_colours([FirstOrder.of([coloured])])[0].rho == pytest.approx(0.9, abs=0.03)
+    assert abs(common_colours([FirstOrder.of([white])])[0].rho) < 0.05
 
 
 def test_a_motion_before_the_event_is_no_noise() -> None:
@@ -196,7 +196,7 @@ def test_a_motion_before_the_event_is_no_noise() -> None:
     swinging = 0.05 * np.exp(-0.2 * t) * np.cos(3.0 * t)
     after = np.where(t >= 4.0, 0.3 * (1.0 - np.exp(-(t - 4.0))), 0.0)
     for motion in (settling, swinging):
-        assert noise_estimate(t, motion + after + noise, 4.0) == pytest.approx(2e-3, rel=0.1)
+        assert noise_estimate(t, motion + after + noise, 4.0).std == pytest.approx(2e-3, rel=0.1)
         assert not at_rest((motion + noise)[:400])
 
 
@@ -216,17 +216,17 @@ def test_noise_of_any_correlation_time_is_no_motion() -> None:
 def test_noise_ignores_outliers() -> None:
     v = 1e-3 * np.random.default_rng(4).standard_normal(500)
     v[::50] += 1.0
-    assert noise_estimate(np.arange(500.0), v, 500.0) < 2e-3
+    assert noise_estimate(np.arange(500.0), v, 500.0).std < 2e-3
 
 
 @pytest.mark.parametrize("event", [None, 0.0, 0.25])
 def test_deterministic_records_have_no_noise(event: float | None) -> None:
     response = np.where(T >= 0.25, 1 - np.exp(-20 * (T - 0.25)), 0.0)
-    assert noise_estimate(T, response, event) == 0.0
-    assert noise_estimate(T, np.exp(-8 * T), event) == 0.0
+    assert noise_estimate(T, response, event).std == 0.0
+    assert noise_estimate(T, np.exp(-8 * T), event).std == 0.0
     uneven = np.cumsum(np.geomspace(1e-4, 1e-2, 200))
-    assert noise_estimate(uneven, np.exp(-uneven), event) == 0.0
-    assert noise_estimate(T[:3], response[:3], event) == 0.0
+    assert noise_estimate(uneven, np.exp(-uneven), event).std == 0.0
+    assert noise_estimate(T[:3], response[:3], event).std == 0.0
 
 
 def test_floor_is_a_millionth_of_the_range_of_unquantised_values() -> None:
@@ -244,10 +244,10 @@ def test_floor_knows_the_resolution(step: float) -> None:
     assert noise_floor(flicker) == pytest.approx(step / math.sqrt(12), rel=1e-6)
 
 
-def test_autocorrelation_of_nothing() -> None:
-    assert pre_event_ar(np.full(100, 0.3)) == 0.0
-    assert pre_event_ar([1.0, 2.0]) == 0.0
-    assert pre_event_ar(np.linspace(0, 1, 100)) == 0.0
+def test_a_line_and_two_rows_hold_no_noise() -> None:
+    t = np.linspace(0, 1, 100)
+    for values in (np.full(100, 0.3), t, [1.0, 2.0]):
+        assert noise_estimate(t[: len(values)], values, 2.0).std == 0.0
 
 
 def test_the_scatter_from_row_to_row_is_told_where_rows_follow_the_signal_and_only_there() -> None:

@@ -12,9 +12,10 @@ from scipy.stats import multivariate_normal
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
+from hvdc_ident.data.noise import RHO, TANH, FirstOrder, common_colours
+from hvdc_ident.discrepancy.nominal import draws
 from hvdc_ident.fit import Problem
-from hvdc_ident.fit.noise_colour import RHO, TANH, likelihood, together, without_common
-from hvdc_ident.fit.record_noise import OutputNoise, draws, noise_of
+from hvdc_ident.fit.noise import ESTIMATED, OutputNoise, noise_of, without_common
 from hvdc_ident.immutable import FrozenMap
 
 BEFORE = 50
@@ -44,28 +45,26 @@ def records(rho: float, seed: int, told: float | None) -> list[Experiment]:
 
 def test_the_likelihood_is_that_of_the_rows_without_their_line() -> None:
     parts = [process(0.7, (40,), 1), process(0.7, (30,), 2)]
-    found = likelihood(parts)
+    found = FirstOrder.of(parts)
 
-    def dense(k: int, j: int) -> float:
+    def dense(k: int, std: float) -> float:
         total = 0.0
         for r in parts:
             n = r.size
             free = null_space(np.vander(np.arange(n), 2).T)
-            cover = found.std[j] ** 2 * RHO[k] ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+            cover = std**2 * RHO[k] ** np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
             total += float(multivariate_normal.logpdf(free.T @ r, cov=free.T @ cover @ free))
         return total
 
-    spots = [(20, 30), (50, 60), (65, 90)]
-    own = np.array([found.values[s] for s in spots])
+    spots = [(20, 0.5), (50, 1.0), (65, 2.5)]
+    own = np.array([found.at(std)[k] for k, std in spots])
     assert own - own[0] == pytest.approx(np.array([dense(*s) for s in spots]) - dense(*spots[0]), abs=1e-6)
 
 
 def test_a_line_in_a_record_tells_nothing() -> None:
     r = process(0.9, (50,), 3)
-    plain, sloped = likelihood([r]), likelihood([r + 0.2 * np.arange(50) - 3.0])
-    assert sloped.std[np.unravel_index(sloped.values.argmax(), sloped.values.shape)[1]] == pytest.approx(
-        plain.std[np.unravel_index(plain.values.argmax(), plain.values.shape)[1]], rel=0.05
-    )
+    plain, sloped = FirstOrder.of([r]), FirstOrder.of([r + 0.2 * np.arange(50) - 3.0])
+    assert sloped.level == pytest.approx(plain.level, rel=1e-9)
 
 
 def test_a_given_deviation_sharpens_the_coefficient() -> None:
@@ -93,14 +92,14 @@ def test_white_noise_stays_white_beside_a_deviation_that_is_far_too_large() -> N
 
 
 def test_outputs_that_agree_are_told_together_and_others_apart() -> None:
-    def profiles(*rhos: float) -> Array:
-        return np.array([likelihood(list(process(r, (50, 3), k).T)).profile for k, r in enumerate(rhos)])
+    def profiles(*rhos: float) -> list[FirstOrder]:
+        return [FirstOrder.of(list(process(r, (50, 3), k).T)) for k, r in enumerate(rhos)]
 
     alike = profiles(0.9, 0.9, 0.9)
-    apart = [together(row[None])[0].tanh for row in alike]
-    shared = [c.tanh for c in together(alike)]
+    apart = [common_colours([own])[0].tanh for own in alike]
+    shared = [c.tanh for c in common_colours(alike)]
     assert np.ptp(shared) < 0.7 * np.ptp(apart)
-    mixed = together(profiles(0.0, 0.95, 0.0))
+    mixed = common_colours(profiles(0.0, 0.95, 0.0))
     assert mixed[1].rho == pytest.approx(0.95, abs=0.06)
     assert abs(mixed[0].rho) < 0.3
     assert abs(mixed[2].rho) < 0.3
@@ -115,7 +114,7 @@ def test_drawn_noise_keeps_its_steps_where_no_deviation_is_given() -> None:
     problem = Problem(ModelSimulator(model()), experiments(), FREE, rho=FrozenMap({"w": 0.9, "torque": 0.9}))
     blocks = problem.blocks(problem.start, derivatives=False)
     level = [b.misfit for b in blocks]
-    own = OutputNoise(1.0, (0.9,), 0.4, 0.0, "the records before the event", 150)
+    own = OutputNoise(1.0, (0.9,), 0.4, 0.0, ESTIMATED, 150)
     steps = []
     for n in (own, replace(own, source="given")):
         drawn = draws(problem, blocks, FrozenMap({"w": n, "torque": n}), level, 100, 0)
@@ -136,7 +135,7 @@ def test_drawn_noise_is_as_uncertain_as_the_rows_that_tell_of_it() -> None:
     blocks = problem.blocks(problem.start, derivatives=False)
     spread = {}
     for freedom in (46, 0):
-        told = OutputNoise(1.0, (), 0.0, 0.0, "the records before the event", 50, freedom)
+        told = OutputNoise(1.0, (), 0.0, 0.0, ESTIMATED, 50, freedom)
         drawn = draws(problem, blocks, FrozenMap({"w": told, "torque": told}), [b.misfit for b in blocks], 400, 0)
         loud = {
             b.output: np.concatenate([d for d, own in zip(drawn, blocks, strict=True) if own.output == b.output])
@@ -151,9 +150,10 @@ def test_a_ripple_that_all_records_share_is_no_noise() -> None:
     noise = list(process(0.9, (50, 3), 11).T)
     ripple = 0.8 * np.where(np.arange(50) % 3 == 0, 1.0, -0.5)
     rippling = [r + ripple for r in noise]
-    assert together(likelihood(rippling).profile[None])[0].rho < 0.75
-    left = without_common(rippling)
+    assert common_colours([FirstOrder.of(rippling)])[0].rho < 0.75
+    times = [np.arange(50.0)] * 3
+    left = without_common(times, rippling)
     assert len(left) == 2
-    assert together(likelihood(left).profile[None])[0].rho == pytest.approx(0.9, abs=0.08)
-    alike = sum(len(without_common(list(process(0.9, (50, 3), seed).T))) == 3 for seed in range(20))
+    assert common_colours([FirstOrder.of(left)])[0].rho == pytest.approx(0.9, abs=0.08)
+    alike = sum(len(without_common(times, list(process(0.9, (50, 3), seed).T))) == 3 for seed in range(20))
     assert alike >= 18

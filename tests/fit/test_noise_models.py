@@ -11,12 +11,13 @@ from scipy.linalg import toeplitz
 from scipy.optimize import least_squares
 from scipy.stats import binom
 
-from hvdc_ident.data import InputSignal
+from hvdc_ident.data import InputSignal, segments
 from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.likelihood import LOSSES, Prior, loss
-from hvdc_ident.fit.noise_model import autoregression, before_event, segments, whitened
+from hvdc_ident.fit.noise import models_before_event
 from hvdc_ident.fit.residual import transformed
+from hvdc_ident.fit.whitening import autoregression, whitened
 from tests.fit.simulators import Closed, coloured, decay, line, parameters, recorded
 
 RNG = np.random.default_rng
@@ -89,11 +90,13 @@ def measured(rho: float, seed: int, rows: int = 400) -> Problem:
 
 
 def test_noise_before_the_event_gives_the_model():
-    models = before_event(measured(0.8, 0, 4000).fitted_experiments, ["y"])
+    models = models_before_event(measured(0.8, 0, 4000).fitted_experiments, ["y"])
     assert models["y"] == pytest.approx((0.8,), abs=0.05)
     e = measured(0.8, 0).experiments[0]
     with pytest.raises(StudyError, match="no noise of 'y' before the event"):
-        before_event([e.with_(event=None)], ["y"])
+        models_before_event([e.with_(event=None, inputs={})], ["y"])
+    # where no event is told, the input's step is one
+    assert models_before_event([e.with_(event=None)], ["y"]) == models_before_event([e], ["y"])
 
 
 @pytest.mark.parametrize("whiten", ["pre-event", "residual"])
@@ -293,4 +296,4 @@ def test_a_record_that_moves_before_its_event_is_no_noise_to_whiten_with():
     t = np.arange(300) * 0.01
     e = recorded("e", t, {"y": 0.01}, {"event": 2.0}, y=np.exp(-0.7 * t) + 0.01 * RNG(5).standard_normal(t.size))
     with pytest.raises(StudyError, match=r"at least 20 rows before the event, at rest.*got 0 rows"):
-        before_event([e], ["y"])
+        models_before_event([e], ["y"])
