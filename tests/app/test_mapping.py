@@ -23,7 +23,6 @@ from hvdc_ident.app.study_folder import (
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.formats import formats
 from hvdc_ident.study.parse import parse_study
-from hvdc_ident.study.recordings import MEDIAN_EFFICIENCY
 
 LINK = hi.load_model("vsc-hvdc-link")
 
@@ -86,7 +85,7 @@ def test_a_draft_says_what_check_says_of_the_written_study(mapped: tuple[Path, R
     told, drafts = hi.check(file).to_dict(), draft.summary.to_dict()
     assert drafts["experiments"] == told["experiments"] and drafts["rest_levels"] == told["rest_levels"]
     assert draft.experiment.event == 0.1 and draft.noise["P2"].source == "estimated"
-    assert draft.noise["P2"].std == pytest.approx(1e-4, rel=3.0 / np.sqrt(2.0 * 100 * MEDIAN_EFFICIENCY))
+    assert draft.noise["P2"].std == pytest.approx(1e-4, rel=3.0 / np.sqrt(2.0 * 100))
 
 
 def test_a_base_is_proposed_from_the_levels_and_its_absence_told(tmp_path: Path) -> None:
