@@ -32,6 +32,9 @@ MOVED = "what the model lacks may move the estimates by more than any noise, so 
 """The consequence of a misfit for what is estimated. A fit leaves of a missing effect what no parameter can make good, and that does
 not tell how much of it the parameters have made good."""
 
+CORRELATED = "the model lacks something, or the noise is correlated from row to row, as the intervals take it"
+"""The same where no noise is known but what the rows show."""
+
 Verdict = Literal["fits", "does-not-fit", "noise-understated", "noise-overstated", "not-judged"]
 WORST_FIRST: tuple[Verdict, ...] = ("does-not-fit", "noise-understated", "noise-overstated", "fits", "not-judged")
 
@@ -65,6 +68,8 @@ class Adequacy:
     verdict: fits; does-not-fit; noise-understated (white residuals above the noise stated: not the mark of a wrong model);
     noise-overstated; not-judged (no noise is known but the residual's own). chi2_per_dof: over all outputs, against the noise
     stated. outputs: by output. text: the verdict in words, empty where it fits; next: the command to run, or what to do.
+    systematic: whether a residual is more than a noise that is known: the model lacks something, which moves the estimates by
+    what no residual tells. Rows alone do not tell correlated noise from that.
     """
 
     verdict: Verdict
@@ -72,11 +77,7 @@ class Adequacy:
     outputs: FrozenMap[ResidualSize] = field(default_factory=FrozenMap)
     text: str = ""
     next: str = ""
-
-    @property
-    def systematic(self) -> bool:
-        """True where the residual is more than noise: the model lacks something, which moves the estimates by what no residual tells."""
-        return self.verdict == "does-not-fit"
+    systematic: bool = False
 
     @property
     def widening(self) -> float:
@@ -115,8 +116,9 @@ def adequacy(
     power = sum(_power(problem, b.residual) * b.residual.size for b in known)
     chi2 = power / (sum(b.residual.size for b in known) * share) if known else None
     verdict = min((s.verdict for s in sizes.values()), key=WORST_FIRST.index)
-    text, advice = _sentence(sizes, verdict, sources)
-    return Adequacy(verdict, chi2, FrozenMap(sizes), text, advice)
+    systematic = any(s.verdict == "does-not-fit" and not from_misfit(sources[o]) for o, s in sizes.items())
+    text, advice = _sentence(sizes, verdict, sources, systematic=systematic)
+    return Adequacy(verdict, chi2, FrozenMap(sizes), text, advice, systematic)
 
 
 def _power(problem: Problem, residual: Array) -> float:
@@ -180,12 +182,14 @@ def _quantile(dof: float, behind: float, chance: float) -> float:
     return float(fdtri(dof, min(behind, 1e9), chance))
 
 
-def _sentence(sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapping[str, str]) -> tuple[str, str]:
+def _sentence(
+    sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapping[str, str], *, systematic: bool
+) -> tuple[str, str]:
     """Return the verdict in words, and what to do."""
     parts = [_line(o, s, sources[o]) for o, s in sizes.items() if s.verdict == verdict]
     text = "; ".join(p for p in parts if p)
     if verdict == "does-not-fit":
-        return f"{text}: {MOVED}", NEXT
+        return f"{text}: {MOVED if systematic else CORRELATED}", NEXT
     values = ", ".join(
         f"{o} = {s.noise * s.times:.3g}" for o, s in sizes.items() if s.verdict == verdict and s.noise and s.times
     )

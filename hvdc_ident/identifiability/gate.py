@@ -67,7 +67,8 @@ def searched(report: Mapping[str, Any], names: Sequence[str]) -> tuple[StartOutc
 
     Of a report by groups those of the group that has them.
     """
-    pilots = report["pilot"].get("groups") or [report["pilot"]]
+    pilot = report.get("pilot") or {}
+    pilots = pilot.get("groups") or [pilot]
     found = (p["ends"] for p in pilots if p.get("ends") and set(names) <= set(p.get("parameters", names)))
     return tuple(StartOutcome.of(line) for line in next(found, ()))
 

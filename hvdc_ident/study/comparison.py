@@ -51,7 +51,12 @@ class RunComparison(Shown):
         judged = [v for v in self.data["values"] if v["apart"] is not None]
         beyond = [v["parameter"] for v in judged if v["apart"] > 1.0]
         if not beyond:
-            return "No value differs beyond both intervals." if judged else "No value was fitted in both."
+            if judged:
+                return "No value differs beyond both intervals."
+            fitted = any(None not in v["values"] for v in self.data["values"])
+            return (
+                "No value has an interval in both, by which to judge it." if fitted else "No value was fitted in both."
+            )
         mixed = len({s["name"] for s in self.data["sets"]}) > 1
         why = " One run is fitted with an effect and the other without one, which moves values too." if mixed else ""
         return f"Apart beyond both intervals: {listed(beyond)}.{why}"
@@ -177,15 +182,17 @@ def distance(first: Mapping[str, Any], second: Mapping[str, Any]) -> float | Non
 
     |a - b| / sqrt(ha^2 + hb^2), h being the half of each 95 % interval that faces the other value; of normal estimates that
     are independent the distance is above 1 in 5 % of cases where the true values agree. None where an interval is not
-    known or open on that side.
+    known or open on that side, but 0 for equal values.
     """
+    if first["value"] == second["value"]:
+        return 0.0
     low, high = sorted((first, second), key=lambda e: e["value"])
     ends = ((low.get("ci95") or (None, None))[1], (high.get("ci95") or (None, None))[0])
     if ends[0] is None or ends[1] is None:
         return None
     width = math.hypot(ends[0] - low["value"], high["value"] - ends[1])
     between = high["value"] - low["value"]
-    return between / width if width > 0.0 else 0.0 if between == 0.0 else None
+    return between / width if width > 0.0 else None
 
 
 def value_texts(line: Mapping[str, Any]) -> tuple[str, str]:
