@@ -251,7 +251,9 @@ def estimates_of(
         else:
             estimate = _at_bound(unknown, float(value), float(slope), everything, alone=len(bound) == 1)
         unit = unit_of(problem.simulator, nuisances[name]) if name in nuisances else parameters[name].unit
-        estimate = estimate.without_interval(NO_INTERVAL) if systematic else estimate
+        if systematic:  # remarks on an interval are of no use without it
+            kept = estimate if name in bound else replace(estimate, reason="")
+            estimate = kept.without_interval(NO_INTERVAL)
         estimates[name] = replace(estimate, unit=unit, conditional_on=tuple(problem.conditional_on.get(name, ())))
     return estimates
 

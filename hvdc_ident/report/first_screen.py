@@ -149,11 +149,15 @@ def _values(found: Answers) -> str:
     )
     effect = found.counting.name == "effect"
     header = ["parameter, unit", "given", "value", found.interval_words(effect=effect), "change", ""]
+    if not any(v.interval for v in found.values):  # none is given where the model lacks something
+        header, rows = [header[k] for k in (0, 1, 2, 4, 5)], [[row[k] for k in (0, 1, 2, 4, 5)] for row in rows]
     which = " ".join(s for s in (_which(found), found.condition if found.fitted or effect else "") if s)
     depend = "".join(
         f"<p>{text(v.name)} depends on the place: it is {text(v.by_place)}.</p>" for v in found.values if v.by_place
     )
-    return f"<p class='answer'>{which}</p>{table(header, rows, words=(0, 5))}{depend}{more}{_moved(found)}"
+    return (
+        f"<p class='answer'>{which}</p>{table(header, rows, words=(0, len(header) - 1))}{depend}{more}{_moved(found)}"
+    )
 
 
 def _value_row(v: Value) -> list[str]:
