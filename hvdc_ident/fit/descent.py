@@ -67,13 +67,14 @@ class Evaluated:
 class Linearised:
     """The residuals at a point, linear about it. theta: (p,), each unknown in its unit; x: the same in scaled coordinates.
 
-    r: (n,). jacobian: (n, p) per scaled coordinate; slope: (p,) dtheta/dx.
+    r: (n,). triangle, target: R, (k, p), and Q'r, (k,), of the jacobian QR per scaled coordinate; slope: (p,) dtheta/dx.
     """
 
     theta: Array
     x: Array
     r: Array
-    jacobian: Array
+    triangle: Array
+    target: Array
     slope: Array
 
     @classmethod
@@ -81,8 +82,10 @@ class Linearised:
         """Return the residuals at scaled coordinates x, (p,). Raises SimulationError where they are inadmissible."""
         theta = space.unscaled(x)
         r, jacobian = objective.residual(theta)
-        slope = space.slope(theta)
-        return cls(theta, space.scaled(theta), r, jacobian * slope, slope)
+        slope, p = space.slope(theta), theta.size
+        # Of the residuals as a last column the triangle holds Q'r; Q itself, as long as the records, is not formed.
+        factor = np.asarray(np.linalg.qr(np.column_stack([jacobian, r]), mode="r"))
+        return cls(theta, space.scaled(theta), r, factor[:p, :p] * slope, factor[:p, p], slope)
 
     @cached_property
     def cost(self) -> float:
@@ -91,26 +94,19 @@ class Linearised:
 
     @cached_property
     def norms(self) -> Array:
-        """Length of each column, (p,), 1 for a column of zeros."""
-        norms = np.linalg.norm(self.jacobian, axis=0)
+        """Length of each column of the jacobian, (p,), 1 for a column of zeros."""
+        norms = np.linalg.norm(self.triangle, axis=0)
         return np.where(norms > 0, norms, 1.0)
 
     @cached_property
     def gradient(self) -> Array:
         """Gradient of the cost by scaled coordinates, (p,)."""
-        return np.asarray(self.jacobian.T @ self.r)
-
-    @cached_property
-    def _factors(self) -> tuple[Array, Array]:
-        """Triangle R of the jacobian, (k, p), and Q'r, (k,)."""
-        q, triangle = np.linalg.qr(self.jacobian)
-        return triangle, q.T @ self.r
+        return np.asarray(self.triangle.T @ self.target)
 
     def step(self, damping: float, size: Array, low: Array, high: Array) -> Array:
         """Return the p in [low, high] that minimises |r + J p|^2 + damping |size p|^2, (p,)."""
-        triangle, target = self._factors
-        matrix = np.vstack([triangle, np.sqrt(damping) * np.diag(size)])
-        right = np.concatenate([-target, np.zeros(size.size)])
+        matrix = np.vstack([self.triangle, np.sqrt(damping) * np.diag(size)])
+        right = np.concatenate([-self.target, np.zeros(size.size)])
 
         def solve(free: NDArray[np.bool_], p: Array) -> Array:
             return np.asarray(np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ p[~free], rcond=None)[0])
@@ -121,14 +117,13 @@ class Linearised:
 
     def predicted(self, p: Array) -> float:
         """Return the reduction of the cost that the linear residuals promise for the step p, (p,)."""
-        along = self._factors[0] @ p
+        along = self.triangle @ p
         return -float(self.gradient @ p + 0.5 * along @ along)
 
     def evaluated(self) -> Evaluated:
         """Return cost, gradient and curvature per unit of the unknowns."""
-        inverse = 1.0 / self.slope
-        triangle = self._factors[0] * inverse
-        return Evaluated(self.cost, self.gradient * inverse, triangle.T @ triangle)
+        triangle = self.triangle / self.slope
+        return Evaluated(self.cost, self.gradient / self.slope, triangle.T @ triangle)
 
 
 DescentEnd = Literal["inadmissible", "flat", "stationary", "settled", "enough", "standstill", "spent"]
@@ -196,7 +191,7 @@ class Descent:
         size, damping, growth, reach = self.at.norms, self.options.damping, 2.0, self.options.reach
         while self.evaluations < self.options.max_evaluations:
             here = self.at
-            if not here.jacobian[:, ~self._held].any():
+            if not here.triangle[:, ~self._held].any():
                 return "flat"
             low, high = self.room()
             if self._stationary(here, low, high):
@@ -245,7 +240,7 @@ class Descent:
 
     def _stationary(self, here: Linearised, low: Array, high: Array) -> bool:
         g = np.where(((low >= 0) & (here.gradient > 0)) | ((high <= 0) & (here.gradient < 0)), 0.0, here.gradient)
-        return bool((np.abs(g) <= self.options.gradient * here.norms * np.linalg.norm(here.r)).all())
+        return bool((np.abs(g) <= self.options.gradient * here.norms * np.sqrt(2.0 * here.cost)).all())
 
 
 @dataclass(frozen=True, eq=False)
