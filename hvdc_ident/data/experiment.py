@@ -38,7 +38,7 @@ class Experiment(Shown):
     measured: a Trajectory with the recorded outputs, in place of `outputs`; their units stand there.
     values: inputs held constant at other than the model's start value.
     noise_profile: (n,) by output, the standard deviation of each row over `noise`, where rows differ; noise_dof: number of
-    independent samples that `noise` was estimated from (left out: it is exact).
+    independent samples that `noise` was estimated from (left out: it is exact); noise_from: by which rows, in words.
     drive: names among the inputs that are insertion points of the model and follow their signal in place of their equation.
     instrument: recording chains by output: {"window-mean": s, "delay": s, "class": %}.
     offsets: constants added to inputs all along, in their units. starts: states that begin at a value and not at rest.
@@ -71,6 +71,7 @@ class Experiment(Shown):
     nuisance: tuple[str, ...] = ()
     offsets: FrozenMap[float] = field(default_factory=FrozenMap)
     noise_dof: FrozenMap[float] = field(default_factory=FrozenMap)
+    noise_from: FrozenMap[str] = field(default_factory=FrozenMap)
     starts: FrozenMap[float] = field(default_factory=FrozenMap)
     noise_profile: FrozenMap[Array] = field(default_factory=FrozenMap)
     search: FrozenMap[tuple[float, float, float]] = field(default_factory=FrozenMap)

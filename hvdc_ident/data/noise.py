@@ -51,9 +51,7 @@ _LONGEST = 1000  # rows in which a motion is looked for, the last of a longer re
 _PIECE = 500  # rows of a record that are taken as one in a likelihood
 _SPREADS = 0.0, 0.1, 0.2, 0.4, 0.8, 1.6  # of artanh(rho) among outputs that are told together, as a standard deviation
 _QUANTISED_CHANGES = 20  # changes needed before a resolution is read off them
-_SCATTER_ERROR = (
-    0.9  # standard error of the logarithm of `row_scatter`, times the root of the rows' number (simulation)
-)
+_SCATTER_ERROR = 0.9  # standard error of the logarithm of `row_scatter`, times the root of the number of rows
 _SMOOTH = 0.05  # see `is_smooth`
 _SLOW = 0.5  # lag-1 coefficient from which the noise of a rounded record is coloured, and not white noise that flickers
 
@@ -101,7 +99,7 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> N
     step, records = resolution(v), [quiet.values]
     if is_coarse(records, step):
         flicker = flicker_of([v], step)
-        std = step * math.sqrt(1.0 / 12.0 + flicker**2)
+        std = rounded_std(step, flicker)
         return NoiseEstimate(std, FREEDOM_OF_ROUNDED, ROUNDED) if flicker else NoiseEstimate(source=ROUNDED)
     if white_std(records) <= noise_floor(v):
         return NoiseEstimate(source=ESTIMATED)
@@ -442,6 +440,11 @@ def flicker_of(records: Sequence[Array], step: float) -> float:
     scatter = float(power[: max(1, int(0.98 * power.size))].mean()) / 6.0  # the largest are the events
     low = scatter * math.sqrt(math.pi)
     return low if low < 1.0 / 3.0 else math.sqrt(max(scatter - 1.0 / 12.0, 0.0))
+
+
+def rounded_std(step: float, flicker: float) -> float:
+    """Return the standard deviation of rounded values: of the rounding, and of the noise below it, flicker in steps."""
+    return step * math.sqrt(1.0 / 12.0 + flicker**2)
 
 
 def _line(count: int) -> Array:

@@ -43,6 +43,7 @@ from hvdc_ident.data.noise import (
     freedom_of_scatter,
     is_coarse,
     resolution,
+    rounded_std,
     white_std,
 )
 from hvdc_ident.errors import StudyError
@@ -56,7 +57,7 @@ MOVING = "estimated before the event, where the model moves: at most so much"
 """The source where inputs that are recorded with their noise keep the model moving. What it lacks is in such rows too, so that the
 noise is no more; all rows tell more of what it lacks, and no steps from row to row tell of noise that a recorder has smoothed."""
 LOUDER, QUIETER = "louder", "quieter"
-"""What the records are, where they are not as loud as was stated."""
+"""Words for records that are not as loud as was stated."""
 
 SURE = 4.0
 """Standard errors beyond which nothing is put down to chance: one in 16 000, where a diagnosis asks some hundred such questions."""
@@ -155,16 +156,9 @@ def source_text(experiments: Sequence[Experiment], output: str, weight: float | 
     estimated = [e for e in measured if output in e.noise_dof]
     if not estimated:
         return GIVEN
-    how = ", ".join(dict.fromkeys(_estimated_from(e, output) for e in estimated))
+    how = ", ".join(dict.fromkeys(e.noise_from.get(output, ESTIMATED) for e in estimated))
     everywhere = len(estimated) == len(measured)
     return how if everywhere else f"{how} in {', '.join(e.name for e in estimated)}, given for the others"
-
-
-def _estimated_from(experiment: Experiment, output: str) -> str:
-    """Return which rows of a record its standard deviation was estimated from, in words."""
-    if experiment.event is None or experiment.measured is None:
-        return ESTIMATED
-    return noise_estimate(experiment.time, experiment.measured[output], experiment.event).source or ESTIMATED
 
 
 def unknown_noise(experiments: Sequence[Experiment], sources: Mapping[str, str]) -> dict[str, str]:
@@ -248,7 +242,7 @@ def freedom_of(noise: Mapping[str, OutputNoise], outputs: Iterable[str]) -> floa
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """What the records of one output tell of its noise.
+    """The records of one output before its events, and the noise that they show.
 
     records: rows before the events, less line and what they have in common; given: the standard deviation stated; step: what the
     records are rounded to, floor: the least they can hold, flicker: the noise below the rounding, in steps. scatter: the white noise
@@ -422,7 +416,7 @@ def _noise(pool: _Pool, colour: Colour) -> OutputNoise:
         return _from_scatter(found, *pool.scatter)
     if pool.step and (still or is_coarse(pool.records, pool.step)):
         # A level tells its own flicker only: none in the middle of a step, most at its edge. So all rows are asked.
-        rounded = pool.step * math.sqrt(1.0 / 12.0 + pool.flicker**2)
+        rounded = rounded_std(pool.step, pool.flicker)
         if given is not None and given >= rounded:
             return replace(found, std=given)
         count = len(pool.own) or 1

@@ -137,16 +137,17 @@ def with_noise(
     if e.measured is None:
         return e.with_(event=event), FrozenMap()
     table = e.measured
-    notes, dof = {}, {}
+    notes, dof, told_by = {}, {}, {}
     for o in e.outputs:
         told = o not in stated and int(before_event(e.time, table[o], event).sum()) >= FEWEST_QUIET
         found = noise_estimate(e.time, table[o], event) if told else NoiseEstimate()
         notes[o] = _noise(stated.get(o), found, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
         if notes[o].source == "estimated":
-            dof[o] = max(1.0, found.freedom)
+            dof[o], told_by[o] = max(1.0, found.freedom), found.source
     noise = {o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}
     profile = {o: v for o, v in e.noise_profile.items() if o in noise}
-    return e.with_(event=event, noise=noise, noise_dof=e.noise_dof | dof, noise_profile=profile), FrozenMap(notes)
+    known = {"noise_dof": e.noise_dof | dof, "noise_from": e.noise_from | told_by}
+    return e.with_(event=event, noise=noise, **known, noise_profile=profile), FrozenMap(notes)
 
 
 def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> None:
