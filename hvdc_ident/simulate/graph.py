@@ -309,14 +309,22 @@ class Graph:
                 self._gradients[n] = self._differentiate(n)
         return self._gradients[node]
 
-    def reachable(self, roots: Iterable[int], known: Container[int] = ()) -> list[int]:
-        """Every node the roots depend on, roots included, in an order of evaluation; not what is known, nor behind it."""
-        seen, stack = set(), list(roots)
+    def reachable(
+        self,
+        roots: Iterable[int],
+        known: Container[int] = (),
+        arguments: Callable[[int], Iterable[int]] | None = None,
+    ) -> list[int]:
+        """Every node the roots depend on, roots included, in an order of evaluation; not what is known, nor behind it.
+
+        arguments: the nodes that a node is computed from, where these are fewer than the graph's own.
+        """
+        seen, stack = set[int](), list(roots)
         while stack:
             n = stack.pop()
             if n not in seen and n not in known:
                 seen.add(n)
-                stack.extend(self.arguments(n))
+                stack.extend((arguments or self.arguments)(n))
         return sorted(seen)
 
     def arguments(self, node: int) -> tuple[int, ...]:

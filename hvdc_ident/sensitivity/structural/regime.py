@@ -37,14 +37,8 @@ class Equations:
         return self.graph.arguments(node)
 
     def behind(self, roots: Iterable[int], known: Container[int] = ()) -> list[int]:
-        """Every node the roots depend on, roots included, in an order of evaluation; not what is known, nor behind it."""
-        seen, stack = set[int](), list(roots)
-        while stack:
-            n = stack.pop()
-            if n not in seen and n not in known:
-                seen.add(n)
-                stack.extend(self.arguments(n))
-        return sorted(seen)
+        """Every node the roots depend on in this regime, as `Graph.reachable`."""
+        return self.graph.reachable(roots, known, self.arguments)
 
 
 class EquationSource:
