@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.errors import TimingError
 from hvdc_ident.expression import FUNCTIONS
 from hvdc_ident.linearize.limits import Condition, conditions
 from hvdc_ident.model import Model
-from hvdc_ident.simulate import Code, Function, Graph, ModelEquations, by_structure
+from hvdc_ident.simulate import Code, Function, Graph, ModelEquations, by_structure, check_times
 
 Array = NDArray[Any]
 
@@ -245,23 +244,14 @@ class CompiledSystem:
         return result
 
     def timing(self, p: Array) -> Array:
-        """Delay times, then sampling periods, then compute times, s. Raises ModelError where one is not usable."""
+        """Delay times, then sampling periods, then compute times, s. Raises TimingError where one is not usable."""
         model = self.structure.model
         nd, nq = len(model.delays), len(model.sampled)
         if nd + nq == 0:
             return np.zeros(0)
         zero = self._zero
         t = self._run("timing", nd + 2 * nq, zero, zero, p, zero)
-        for name, value in zip((*model.delays, *model.sampled), t[: nd + nq], strict=True):
-            if not (value > 0.0 or (value == 0.0 and name in model.delays)):
-                raise TimingError(
-                    f"the delay of '{name}' is negative"
-                    if name in model.delays
-                    else f"the sampling period of '{name}' is not above 0",
-                    where=f"model '{model.name}'",
-                    got=f"{value:g} s",
-                    hint="bounds within which its time is not negative, and a sampling period above 0",
-                )
+        check_times(model, t[: nd + nq])
         return t
 
     def timing_by_parameters(self, p: Array) -> Array:

@@ -6,7 +6,7 @@ from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
     from hvdc_ident.simulate.codegen import NAMES, Elimination, Function
-    from hvdc_ident.simulate.engine import Engine, Method, Tolerance, engine_of
+    from hvdc_ident.simulate.engine import Engine, Method, Tolerance, check_times, engine_of
     from hvdc_ident.simulate.equations import ACCURACY, ModelEquations, by_structure, torn
     from hvdc_ident.simulate.experiment_run import ModelSimulator, chains_of, simulate, with_recording
     from hvdc_ident.simulate.graph import Graph
@@ -19,7 +19,7 @@ else:
         __name__,
         {
             "codegen": "NAMES Elimination Function",
-            "engine": "Engine Method Tolerance engine_of",
+            "engine": "Engine Method Tolerance check_times engine_of",
             "equations": "ACCURACY ModelEquations by_structure torn",
             "graph": "Graph",
             "native": "call lu solve",
@@ -48,6 +48,7 @@ __all__ = [
     "by_structure",
     "call",
     "chains_of",
+    "check_times",
     "engine_of",
     "equilibria",
     "evaluate",

@@ -36,6 +36,26 @@ class Tolerance:
     search: bool = True
 
 
+def check_times(model: Model, times: Array) -> None:
+    """Raise TimingError for a negative delay, or a sampling period that is not above 0. times: delays, then periods, s."""
+    for name, value in zip((*model.delays, *model.sampled), times.tolist(), strict=True):
+        if name in model.delays and not value >= 0.0:
+            raise TimingError(
+                f"the delay of '{name}' is negative",
+                where=f"model '{model.name}'",
+                expected="0 s or more",
+                got=f"{value:g} s",
+                hint="bounds within which the expression of its time is not negative",
+            )
+        if name in model.sampled and not value > 0.0:
+            raise TimingError(
+                f"the sampling period of '{name}' is not above 0",
+                where=f"model '{model.name}'",
+                got=f"{value:g} s",
+                hint="give it a positive time, or leave the effect out; where it is estimated, `min` above 0",
+            )
+
+
 class Engine:
     """Machine code of one model structure for one list of sensitivity parameters and outputs; reusable for any values."""
 
@@ -72,23 +92,7 @@ class Engine:
         if count:
             evaluate(self._address[NAMES.index("const")], np.zeros(1), np.zeros(1), p, np.zeros(1), values)
             m = self.structure.model
-            names = [*m.delays, *m.sampled]
-            for k, name in enumerate(names):
-                if k < s.nd and not values[k] >= 0.0:
-                    raise TimingError(
-                        f"the delay of '{name}' is negative",
-                        where=f"model '{m.name}'",
-                        expected="0 s or more",
-                        got=f"{values[k]:g} s",
-                        hint="bounds within which the expression of its time is not negative",
-                    )
-                if k >= s.nd and not values[k] > 0.0:
-                    raise TimingError(
-                        f"the sampling period of '{name}' is not above 0",
-                        where=f"model '{m.name}'",
-                        got=f"{values[k]:g} s",
-                        hint="give it a positive time, or leave the effect out; where it is estimated, `min` above 0",
-                    )
+            check_times(m, values[: s.nd + s.nq])
             for k, name in enumerate(m.sampled):
                 period, compute = values[s.nd + k], values[s.nd + s.nq + k]
                 if not 0.0 <= compute <= period:
