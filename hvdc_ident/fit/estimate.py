@@ -31,11 +31,13 @@ from hvdc_ident.fit.search import (
     LocalMinimum,
     cost_at,
     distinct,
+    higher_ends,
     local_minima,
     prewhitened,
     reweighted,
     same_place,
     search,
+    slack_of,
     whitened_by_residuals,
 )
 from hvdc_ident.fit.simulator import unknown_of
@@ -275,7 +277,7 @@ def _arrived(
     They reached its cost, to within what moves no estimate by half its spread, or its place, to a thousandth of the ranges,
     for a cost may scatter by the simulation's own error. jump: that scatter, where it is known.
     """
-    slack = max(1e-6 * best.cost, SAME / effective_share) + jump
+    slack = slack_of(best.cost, effective_share=effective_share) + jump
     reached = [
         (o.cost, o)
         for o in outcomes
@@ -302,18 +304,16 @@ def _doubt(
     Then the starts say nothing of how likely a still lower cost is. The size of the residual is the unit of cost, whether or not the
     noise is known: costs that differ by less lead to the same estimates. samples: number of residuals.
     """
-    ends = sorted(((o.cost, o) for o in outcomes if o.cost is not None), key=lambda pair: pair[0])
+    reached = [LocalMinimum(_end(problem, o), o.cost) for o in outcomes if o.cost is not None]
+    ends = sorted(reached, key=lambda end: end.cost)
     if len(outcomes) < 2 or not ends:
         return ""
-    lowest, first = ends[0]
-    spread = max(1.0, 2.0 * lowest / max(samples - len(problem.unknowns), 1))
-    slack = max(1e-6 * lowest, spread * SAME / effective_share) + jump
+    lowest = ends[0].cost
+    unit = max(1.0, 2.0 * lowest / max(samples - len(problem.unknowns), 1))
+    slack = slack_of(lowest, unit, effective_share) + jump
     if optimum.cost < lowest - slack:
         return ""
-    best = LocalMinimum(_end(problem, first), lowest)
-    others = [
-        cost for cost, o in ends[1:] if cost > lowest + slack and not same_place(problem, best.theta, _end(problem, o))
-    ]
+    others = [end.cost for end in higher_ends(problem, ends, slack)]
     if len(others) < len(ends) - 1:
         return ""
     levels = [c for k, c in enumerate(others) if k == 0 or c > others[k - 1] + slack]

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -89,9 +88,10 @@ class Search:
     runs: tuple[OptimiserResult, ...]
 
     @property
-    def ends(self) -> list[tuple[float, OptimiserResult]]:
-        """Cost and run of those that could be simulated, the lowest first."""
-        return sorted(((r.cost, r) for r in self.runs if r.cost is not None), key=lambda end: end[0])
+    def ends(self) -> list[LocalMinimum]:
+        """Ends of the runs that could be simulated, the lowest first."""
+        reached = [LocalMinimum(r.theta, r.cost) for r in self.runs if r.cost is not None]
+        return sorted(reached, key=lambda end: end.cost)
 
 
 def search(
@@ -121,7 +121,8 @@ def search(
         count, most, number = starts or STARTS, starts or MOST_STARTS, 0
         while True:
             points = _round(problem, count - len(found.points), seed, number)
-            found = _joined(found, points, _runs(problem, method, points, count, len(found.runs), executor, progress))
+            runs = _runs(problem, method, points, count, len(found.runs), executor, progress)
+            found = Search((*found.points, *points), (*found.runs, *runs))
             count, number = min(2 * count, most), number + 1
             if len(found.points) >= count or not _worth_more(problem, found):
                 break
@@ -138,8 +139,8 @@ def _round(problem: Problem, count: int, seed: int, number: int) -> list[Array]:
 
 def _runs(
     problem: Problem,
-    method: Optimiser | _GoOn,
-    points: Sequence[Any],
+    method: Optimiser,
+    points: Sequence[Array],
     count: int,
     done: int,
     executor: Executor | None,
@@ -159,30 +160,37 @@ def _runs(
     return runs
 
 
-def _joined(found: Search, points: Sequence[Array], runs: Sequence[OptimiserResult]) -> Search:
-    return Search((*found.points, *points), (*found.runs, *runs))
-
-
 def _worth_more(problem: Problem, found: Search) -> bool:
     """Return whether further starts are called for, and the simulations allow them."""
     ends = found.ends
     differences = len(problem.unknowns) if approximate(problem.simulator) else 0
     if sum(r.evaluations for r in found.runs) * (1 + differences) >= SIMULATIONS or not ends:
         return False
-    lowest, best = ends[0]
-    unit = 2.0 * lowest / max(problem.rows - len(problem.unknowns), 1)
+    unit = 2.0 * ends[0].cost / max(problem.rows - len(problem.unknowns), 1)
     known = MISFIT not in problem.noise_source.values()
-    slack = max(TIE * lowest, (max(1.0, unit) if known else unit) * SAME)
+    slack = slack_of(ends[0].cost, max(1.0, unit) if known else unit)
     if differences:
         try:
-            slack += LUCK * roughness(problem, best.theta)
-        except (
-            SimulationError
-        ):  # what could be simulated cannot be again: the fit's result says so, and no start would do better
+            slack += LUCK * roughness(problem, ends[0].theta)
+        except SimulationError:
+            # What could be simulated cannot be again: the fit's result says so, and no start would do better.
             return False
-    higher = [run for cost, run in ends[1:] if cost > lowest + slack and not same_place(problem, best.theta, run.theta)]
-    alone = len(higher) == len(ends) - 1
-    return bool(higher) and (alone or (known and unit > MATTERS))
+    higher = higher_ends(problem, ends, slack)
+    return bool(higher) and (len(higher) == len(ends) - 1 or (known and unit > MATTERS))
+
+
+def slack_of(cost: float, unit: float = 1.0, effective_share: float = 1.0) -> float:
+    """Return by how much a run's cost may be above another and be as low: it moves no estimate by half its spread.
+
+    unit: mean squared residual that noise alone leaves, half of it the unit of cost. effective_share: independent samples per sample.
+    """
+    return max(TIE * cost, unit * SAME / effective_share)
+
+
+def higher_ends(problem: Problem, ends: Sequence[LocalMinimum], slack: float) -> list[LocalMinimum]:
+    """Return those of several ends, the lowest first, that reached neither the lowest one's cost, to within a slack, nor its place."""
+    best = ends[0]
+    return [e for e in ends[1:] if e.cost > best.cost + slack and not same_place(problem, best.theta, e.theta)]
 
 
 def _taken_up(
@@ -201,15 +209,20 @@ def _taken_up(
     lowest = min((o.cost for o in begun if o.cost is not None), default=np.inf)
     places: list[Array] = []
     which: list[int | None] = []
-    stay: list[bool] = []  # those that used up their evaluations, but for the lowest: nothing more is expected of them
+    stay: dict[
+        int, str
+    ] = {}  # those that used up their evaluations, but for the lowest: nothing more is expected of them
     for o in begun:
         end = placed(o.end)
         alike = next((k for k, known in enumerate(places) if same_place(problem, known, end)), len(places))
         if o.cost is not None and alike == len(places):
             places.append(end)
-            stay.append(o.status == "max-evaluations" and o.cost > lowest)
+            if o.status == "max-evaluations" and o.cost > lowest:
+                stay[alike] = o.message
         which.append(None if o.cost is None else alike)
-    runs = _runs(problem, _GoOn(method), list(zip(places, stay, strict=True)), len(places), 0, executor, progress)
+    going = [k for k in range(len(places)) if k not in stay]
+    gone = _runs(problem, method, [places[k] for k in going], len(going), 0, executor, progress)
+    runs = dict(zip(going, gone, strict=True)) | {k: _stayed(problem, places[k], why) for k, why in stay.items()}
     points, results = [], []
     for number, (o, k) in enumerate(zip(begun, which, strict=True)):
         points.append(placed(o.start))
@@ -217,21 +230,14 @@ def _taken_up(
             results.append(OptimiserResult(points[-1], None, "failed", o.message, o.evaluations))
         else:
             added = runs[k].evaluations if which.index(k) == number else 0
-            message = o.message if stay[k] else runs[k].message
-            results.append(replace(runs[k], message=message, evaluations=o.evaluations + added))
+            results.append(replace(runs[k], evaluations=o.evaluations + added))
     return Search(tuple(points), tuple(results))
 
 
-@dataclass(frozen=True)
-class _GoOn:
-    """The run on from where another ended: by the method, or no further than one evaluation where it is to stay."""
-
-    method: Optimiser
-
-    def run(self, problem: Problem, end: tuple[Array, bool]) -> OptimiserResult:
-        """Return the run from an end, (p,), that stays there or not."""
-        theta, stays = end
-        return TrustRegion(max_evaluations=1).run(problem, theta) if stays else self.method.run(problem, theta)
+def _stayed(problem: Problem, theta: Array, why: str) -> OptimiserResult:
+    """Return the end of a run that used up its evaluations elsewhere, with its cost here. why: its message."""
+    cost = cost_at(problem, theta)
+    return OptimiserResult(theta, cost, "failed" if cost is None else "max-evaluations", why, 1)
 
 
 def _continued(problem: Problem, method: Optimiser, found: Search) -> Search:
