@@ -64,7 +64,7 @@ class Evaluated:
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
+class LinearResiduals:
     """The residuals at a point, linear about it. theta: (p,), each unknown in its unit; x: the same in scaled coordinates.
 
     r: (n,). triangle, target: R, (k, p), and Q'r, (k,), of the jacobian QR per scaled coordinate; slope: (p,) dtheta/dx.
@@ -78,7 +78,7 @@ class Linearised:
     slope: Array
 
     @classmethod
-    def at(cls, objective: Residuals, space: Coordinates, x: Array) -> Linearised:
+    def at(cls, objective: Residuals, space: Coordinates, x: Array) -> LinearResiduals:
         """Return the residuals at scaled coordinates x, (p,). Raises SimulationError where they are inadmissible."""
         theta = space.unscaled(x)
         r, jacobian = objective.residual(theta)
@@ -161,7 +161,7 @@ class Descent:
     fixed: NDArray[np.bool_] | None = None
     evaluations: int = 0
     failure: SimulationError | None = None
-    at: Linearised | None = None
+    at: LinearResiduals | None = None
     space: Coordinates = field(init=False)
 
     def __post_init__(self) -> None:
@@ -228,7 +228,7 @@ class Descent:
         """Return whether the simulation at x succeeds at a cost below the given one; only then x becomes the best point."""
         self.evaluations += 1
         try:
-            there = Linearised.at(self.objective, self.space, x)
+            there = LinearResiduals.at(self.objective, self.space, x)
         except SimulationError as error:
             self.failure = error
             return False
@@ -238,7 +238,7 @@ class Descent:
         self.at = there
         return True
 
-    def _stationary(self, here: Linearised, low: Array, high: Array) -> bool:
+    def _stationary(self, here: LinearResiduals, low: Array, high: Array) -> bool:
         g = np.where(((low >= 0) & (here.gradient > 0)) | ((high <= 0) & (here.gradient < 0)), 0.0, here.gradient)
         return bool((np.abs(g) <= self.options.gradient * here.norms * np.sqrt(2.0 * here.cost)).all())
 
@@ -276,7 +276,7 @@ def descend(
 def predicted_reduction(objective: Residuals, theta: Array) -> float:
     """Return the fall of the cost that a Gauss-Newton step within the bounds promises. Raises SimulationError."""
     space = Coordinates(objective.unknowns)
-    here = Linearised.at(objective, space, space.scaled(theta))
+    here = LinearResiduals.at(objective, space, space.scaled(theta))
     low, high = space.bounds
     return here.predicted(here.step(LEAST_DAMPING, here.norms, low - here.x, high - here.x))
 

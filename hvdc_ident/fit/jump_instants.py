@@ -292,7 +292,7 @@ def _bounded(f: FitParameter, ends: tuple[float, float], value: float) -> FitPar
 
 @dataclass(frozen=True, eq=False)
 class PlacedInstant:
-    """What the records tell of a parameter that moves an instant: the instant lies between two rows.
+    """An instant that the records place between two rows, as the interval of the parameter that moves it.
 
     low, high: the 95 % interval; an end that is a bound of the search and nothing else is not excluded. passes: the range
     between the two passings of rows that it lies in. points: (value, rise of the cost, (p,) the unknowns) along it,

@@ -265,7 +265,7 @@ class _Runs:
 
     @property
     def note(self) -> str:
-        """What the numbers leave open."""
+        """Points that failed, and the sensitivities' error, in words; empty where there is nothing to say."""
         parts = []
         if self.failures:
             first, number = self.failures[0], len(self.failures)

@@ -38,7 +38,7 @@ COUNTS = ("accepted", "rejected", "events", "evaluations", "segments", "forced")
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class DelayedRun:
     """Outputs of a run, (n, outputs), their derivatives by the asked parameters, (n, outputs, parameters), and what it cost."""
 
     values: Array
@@ -55,7 +55,7 @@ def run(
     time: Array,
     tolerance: Tolerance,
     method: Method = "auto",
-) -> Answer:
+) -> DelayedRun:
     """Return a run of the model, in which every delay may be 0 or short.
 
     p: (parameters,) values in the model's order. inputs: one InputSignal an input. Raises TimingError for a negative delay, and as
@@ -63,7 +63,7 @@ def run(
     """
     engine = engine_of(model, sensitivities, outputs)
 
-    def answer(of: Model, parameters: Sequence[str], values: Array) -> Answer:
+    def answer(of: Model, parameters: Sequence[str], values: Array) -> DelayedRun:
         code = engine if of is model else engine_of(of, parameters, outputs)
         scale = np.array([of.parameters[n].size for n in parameters]) if parameters else None
         out, statistics = code.run(values, inputs, time, tolerance, method, scale, model=of)
@@ -92,10 +92,10 @@ def run(
     return replace(found, statistics=_sum(cost))
 
 
-def _answer(code: Engine, out: Array, statistics: Statistics) -> Answer:
+def _answer(code: Engine, out: Array, statistics: Statistics) -> DelayedRun:
     s = code.structure.sizes
     slopes = out[:, s.no :].reshape(len(out), s.no, s.width)[:, :, : s.np] if s.width else np.zeros((len(out), s.no, 0))
-    return Answer(out[:, : s.no], slopes, statistics)
+    return DelayedRun(out[:, : s.no], slopes, statistics)
 
 
 def _steps(turns: float, inputs: Sequence[Any], tolerance: Tolerance) -> int:
@@ -125,7 +125,9 @@ def _with_time(model: Model, name: str, others: tuple[str, ...]) -> tuple[Model,
     return replace(model, parameters=model.parameters | {parameter: Parameter(0.0, "s")}, delays=delays), parameter
 
 
-def _between(found: Answer, base: Answer, end: Answer, share: float, shortest: float, rows: Array) -> Answer:
+def _between(
+    found: DelayedRun, base: DelayedRun, end: DelayedRun, share: float, shortest: float, rows: Array
+) -> DelayedRun:
     """Return `found` with what a delay adds. base: all short ones at 0. end: this one at `shortest` s, its time the last parameter.
 
     share: its time over `shortest`. rows: (parameters,) derivatives of its time.

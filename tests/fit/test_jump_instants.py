@@ -58,7 +58,9 @@ def control_run(time, t0, kp=3.0, ki=40.0, L=0.1, R=0.5):
     """(i, v) by SciPy, integrated in two parts with the order constant in each."""
 
     def part(order, start, span, at):
-        right = lambda t, y: [(kp * (order - y[0]) + y[1] - R * y[0]) / L, ki * (order - y[0])]  # noqa: E731
+        def right(t, y):
+            return [(kp * (order - y[0]) + y[1] - R * y[0]) / L, ki * (order - y[0])]
+
         return solve_ivp(right, span, start, t_eval=at, rtol=1e-12, atol=1e-14, method="DOP853").y
 
     rest = [0.4, 0.4 * R]

@@ -247,10 +247,10 @@ CASES: dict[str, tuple[Model, list[str], set[str], set[str]]] = {
 LARGE = ("Akt", "T cells", "HIV", "JAK-STAT")
 
 
-def _answer(name: str, **options: object) -> StructuralResult:
+def _answer(name: str, **options: Any) -> StructuralResult:
     model, outputs, _, _ = CASES[name]
     start = {n: "free" if s.start is None else "given" for n, s in model.states.items()}
-    return structural_identifiability(model, list(model.parameters), outputs, start=start, **options)  # type: ignore[arg-type]
+    return structural_identifiability(model, list(model.parameters), outputs, start=start, **options)
 
 
 @pytest.mark.parametrize(("name", "seed"), [(n, s) for n in CASES for s in ([0, 1, 7] if n not in LARGE else [0])])

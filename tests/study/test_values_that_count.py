@@ -249,7 +249,8 @@ def test_an_ambiguous_diagnosis_decides_nothing(study: Path, tmp_path: Path, res
     assert asked.of == "effect" and "not certain: the diagnosis is ambiguous" in asked.note
     answers = Answers(Results(folder))
     assert {v.name: v.value for v in answers.values} == fit
-    assert next(v.interval for v in answers.values if v.name == "K") is None  # without the effect the model does not fit
+    # Without the effect the model does not fit.
+    assert next(v.interval for v in answers.values if v.name == "K") is None
     assert results["fit"]["estimates"]["K"]["ci95"] is None
     done("report", folder, "--quiet")
     page = (folder / "report.html").read_text()

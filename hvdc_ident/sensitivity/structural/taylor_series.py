@@ -14,7 +14,7 @@ from fractions import Fraction
 from itertools import chain
 from typing import Any, TypeAlias
 
-import mpmath  # type: ignore[import-untyped]
+import mpmath  # type: ignore[import-untyped]  # it has no type hints
 import numpy as np
 
 from hvdc_ident.sensitivity.structural.regime import Equations
