@@ -10,18 +10,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy.special import chdtrc, fdtri
 
 from hvdc_ident.data import FLOOR_SHARE, MAD_TO_STD, Array, Experiment
-from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, scatter_of
+from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, scatter_of, source_of
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.fit.residual import ResidualBlock, stretches
+from hvdc_ident.fit.whitening import autocorrelation
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import times_text
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.assessment import Curve
 
 LEVEL = 1e-3
 """Chance of a verdict against the model or the noise where both are right, over all outputs together."""
@@ -36,6 +40,7 @@ CORRELATED = "the model lacks something, or the noise is correlated from row to 
 """The same where no noise is known but what the rows show."""
 
 Verdict = Literal["fits", "does-not-fit", "noise-understated", "noise-overstated", "not-judged"]
+TOO_LARGE: tuple[Verdict, ...] = ("does-not-fit", "noise-understated")
 WORST_FIRST: tuple[Verdict, ...] = ("does-not-fit", "noise-understated", "noise-overstated", "fits", "not-judged")
 
 
@@ -45,7 +50,7 @@ class ResidualSize:
 
     low, high: between them the ratio is what chance allows; noise: the standard deviation stated or, where none was, the scatter from
     row to row, in the output's unit; None where there is neither. white: whether the residual has no significant
-    autocorrelation.
+    autocorrelation. record: the experiment that alone shows it; empty where it is shown by all together.
     """
 
     ratio: float | None
@@ -54,6 +59,12 @@ class ResidualSize:
     noise: float | None
     white: bool
     verdict: Verdict
+    record: str = ""
+
+    @property
+    def follows(self) -> bool | None:
+        """Return whether the model follows the record to its noise; None where no noise is known but the residual's own."""
+        return None if self.verdict == "not-judged" else self.verdict not in TOO_LARGE
 
     @property
     def times(self) -> float | None:
@@ -67,7 +78,8 @@ class Adequacy:
 
     verdict: fits; does-not-fit; noise-understated (white residuals above the noise stated: not the mark of a wrong model);
     noise-overstated; not-judged (no noise is known but the residual's own). chi2_per_dof: over all outputs, against the noise
-    stated. outputs: by output. text: the verdict in words, empty where it fits; next: the command to run, or what to do.
+    stated. outputs: by output, of all its records together, or of one that alone is above its noise. signals: by output and
+    experiment. text: the verdict in words, empty where it fits; next: the command to run, or what to do.
     systematic: whether a residual is more than a noise that is known: the model lacks something, which moves the estimates by
     what no residual tells. Rows alone do not tell correlated noise from that.
     """
@@ -78,6 +90,7 @@ class Adequacy:
     text: str = ""
     next: str = ""
     systematic: bool = False
+    signals: FrozenMap[FrozenMap[ResidualSize]] = field(default_factory=FrozenMap)
 
     @property
     def widening(self) -> float:
@@ -85,8 +98,7 @@ class Adequacy:
 
         The misfit then stands for the noise, as it does where none is stated; 1 where the residual is no larger.
         """
-        above = self.verdict in ("does-not-fit", "noise-understated")
-        return max(self.chi2_per_dof or 1.0, 1.0) if above else 1.0
+        return max(self.chi2_per_dof or 1.0, 1.0) if self.verdict in TOO_LARGE else 1.0
 
 
 def adequacy(
@@ -106,63 +118,159 @@ def adequacy(
     if samples <= unknowns:
         return Adequacy("not-judged", None, text="no more rows than unknowns: nothing is left to judge the fit by")
     share = 1.0 - unknowns / samples
-    level = LEVEL / max(len(problem.outputs), 1)
-    sizes = {}
+    sizes: dict[str, ResidualSize] = {}
+    signals: dict[str, FrozenMap[ResidualSize]] = {}
+    scale = _Scale(share, 1.0 / max(len(problem.outputs), 1), 1.0 / len(blocks), robust=not problem.loss.linear)
     for output in problem.outputs:
         of_output = [b for b in blocks if b.output == output]
-        source = sources[output]
-        sizes[output] = _size(problem, output, of_output, share, effective[output], rho[output], source, level)
+        reference = _reference(problem.fitted_experiments, output, of_output, sources[output], problem.noise_dof)
+        residuals = {b.experiment: reference.scaled(b.residual, b.sigma) for b in of_output}
+        references = {b.experiment: reference.of(b.sigma) for b in of_output}
+        sizes[output], signals[output] = _sizes(residuals, reference, references, effective[output], rho[output], scale)
     known = [b for b in blocks if not from_misfit(sources[b.output])]
-    power = sum(_power(problem, b.residual) * b.residual.size for b in known)
+    power = sum(scale.power(b.residual) * b.residual.size for b in known)
     chi2 = power / (sum(b.residual.size for b in known) * share) if known else None
     verdict = min((s.verdict for s in sizes.values()), key=WORST_FIRST.index)
     systematic = any(s.verdict == "does-not-fit" and not from_misfit(sources[o]) for o, s in sizes.items())
     text, advice = _sentence(sizes, verdict, sources, systematic=systematic)
-    return Adequacy(verdict, chi2, FrozenMap(sizes), text, advice, systematic)
+    return Adequacy(verdict, chi2, FrozenMap(sizes), text, advice, systematic, FrozenMap(signals))
 
 
-def _power(problem: Problem, residual: Array) -> float:
-    """Return the mean squared residual; under a robust loss by the median, for outliers are not noise."""
-    if problem.loss.linear:
+def sizes_of_runs(
+    curves: Mapping[str, Mapping[str, Curve]], experiments: Sequence[Experiment]
+) -> dict[str, FrozenMap[ResidualSize]]:
+    """Return the size of the residuals of runs that no fit has judged, by output and experiment, by the rule of a fit's.
+
+    curves: by experiment and output.
+    """
+    by_name = {e.name: e for e in experiments}
+    outputs = dict.fromkeys(o for line in curves.values() for o in line)
+    scale = _Scale(1.0, 1.0 / max(len(outputs), 1), 1.0 / max(sum(map(len, curves.values())), 1))
+    found = {}
+    for output in outputs:
+        line = {e: c[output] for e, c in curves.items() if output in c}
+        of_output = [by_name[e] for e in line]
+        known = source_of(of_output, output) == GIVEN
+        behind = min((e.noise_dof.get(output, np.inf) for e in of_output), default=np.inf)
+        sigma = _rms([c.sigma for c in line.values()], [c.rows.size for c in line.values()]) if known else None
+        reference = _Reference(sigma, behind) if known else _scatter(of_output, output)
+        residuals = {e: c.residual if known else reference.scaled(c.misfit, 1.0) for e, c in line.items()}
+        parts = [residuals[e][part] for e, c in line.items() for part in stretches(c.rows)]
+        rho, rows = autocorrelation(parts, 0.0), sum(c.rows.size for c in line.values())
+        references = {e: reference.of(c.sigma) for e, c in line.items()}
+        effective = rows * (1.0 - rho) / (1.0 + rho)
+        found[output] = _sizes(residuals, reference, references, effective, rho, scale)[1]
+    return found
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """What the residual of an output is held against.
+
+    noise: a standard deviation, in the unit, None where there is none; behind: the independent samples that it rests on. known:
+    whether it is known apart from these rows, and the residual is in units of it already. exact: the output is met so well that nothing
+    of it is noise.
+    """
+
+    noise: float | None
+    behind: float = np.inf
+    known: bool = True
+    exact: bool = False
+
+    def of(self, sigma: float) -> _Reference:
+        """Return the reference of one record, with the standard deviation sigma, in the unit."""
+        return replace(self, noise=sigma) if self.known else self
+
+    def scaled(self, residual: Array, sigma: float) -> Array:
+        """Return the residual, which is in units of sigma, in units of the noise."""
+        return residual if self.known or self.noise is None else residual * sigma / self.noise
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """share: of the rows that the unknowns leave free. together, alone: shares of the chance of an error that the judgement of an
+    output, and of a single record, may take. robust: whether outliers are no misfit."""
+
+    share: float
+    together: float
+    alone: float
+    robust: bool = False
+
+    def power(self, residual: Array) -> float:
+        """Return the mean squared residual; by the median where outliers are not noise."""
+        if self.robust:
+            return (MAD_TO_STD * float(np.median(np.abs(residual)))) ** 2
         return float(np.mean(residual**2))
-    return (MAD_TO_STD * float(np.median(np.abs(residual)))) ** 2
+
+
+def _reference(
+    experiments: Sequence[Experiment], output: str, blocks: Sequence[ResidualBlock], source: str, behind: float
+) -> _Reference:
+    """Return the reference of an output by the source of its noise (`noise_source`)."""
+    if not from_misfit(source):
+        return _Reference(_rms([b.sigma for b in blocks], [b.residual.size for b in blocks]), behind)
+    if source != MISFIT:
+        return _Reference(None, known=False, exact=True)
+    return _scatter(experiments, output)
+
+
+def _scatter(experiments: Sequence[Experiment], output: str) -> _Reference:
+    """Return the scatter of an output from row to row as the reference."""
+    scatter = scatter_of(experiments, output)
+    return _Reference(None, known=False) if scatter is None else _Reference(*scatter, known=False)
+
+
+def _rms(deviations: Sequence[float], rows: Sequence[int]) -> float:
+    """Return the root mean square of deviations of so many rows each."""
+    return float(np.sqrt(np.average(np.square(deviations), weights=rows)))
+
+
+def _sizes(
+    residuals: Mapping[str, Array],
+    reference: _Reference,
+    references: Mapping[str, _Reference],
+    effective: float,
+    rho: float,
+    scale: _Scale,
+) -> tuple[ResidualSize, FrozenMap[ResidualSize]]:
+    """Return the size of an output's residual, and that in each of its records.
+
+    residuals: by experiment, in units of the noise. reference: of all records; references: of each. A record can be too large by
+    itself. Where only all of them together are, those are that have `MATTERS` times the noise: at least one has.
+    """
+    together = np.concatenate(list(residuals.values()))
+    whole = _size(together, reference, effective, rho, scale, LEVEL * scale.together)
+    signals = {}
+    for name, residual in residuals.items():
+        own = effective * residual.size / together.size
+        size = _size(residual, references[name], own, rho, scale, LEVEL * scale.alone)
+        if size.verdict == "fits" and whole.verdict in TOO_LARGE and size.ratio is not None and size.ratio > MATTERS:
+            size = replace(size, verdict=whole.verdict)
+        signals[name] = replace(size, record=name)
+    worst = max(signals.values(), key=lambda s: (s.verdict in TOO_LARGE, s.ratio or 0.0))
+    alone = worst.verdict in TOO_LARGE and whole.verdict not in TOO_LARGE
+    return worst if alone else whole, FrozenMap(signals)
 
 
 def _size(
-    problem: Problem,
-    output: str,
-    blocks: Sequence[ResidualBlock],
-    share: float,
-    effective: float,
-    rho: float,
-    source: str,
-    level: float,
+    residual: Array, reference: _Reference, effective: float, rho: float, scale: _Scale, level: float
 ) -> ResidualSize:
-    """Return the size of one output's residual. share: of the rows that the unknowns leave free."""
-    residual = np.concatenate([b.residual for b in blocks])
-    effective, white = _independent(residual.size, effective, rho), rho == 0.0
+    """Return the size of a residual in units of the noise. level: the chance of a verdict against the model or the noise."""
+    white = rho == 0.0
+    if reference.noise is None:
+        return ResidualSize(None, 0.0, np.inf, None, white, "fits" if reference.exact else "not-judged")
+    effective, share = _independent(residual.size, effective, rho), scale.share
     spare = max(effective - residual.size * (1.0 - share), 1.0)
-    if from_misfit(source) and source != MISFIT:
-        return ResidualSize(None, 0.0, np.inf, None, white, "fits")
-    if not from_misfit(source):
-        noise: float | None = float(np.sqrt(sum(b.sigma**2 * b.residual.size for b in blocks) / residual.size))
-        ratio, behind = _power(problem, residual) / share, problem.noise_dof
-    else:
-        scatter = scatter_of(problem.fitted_experiments, output)
-        if scatter is None:
-            return ResidualSize(None, 0.0, np.inf, None, white, "not-judged")
-        noise, behind = scatter
-        misfit = np.concatenate([b.residual * b.sigma for b in blocks])
-        ratio = _power(problem, misfit) / share / noise**2
-    high = max(MATTERS, _quantile(spare, behind, 1.0 - level))
+    ratio = scale.power(residual) / share
+    high = max(MATTERS, _quantile(spare, reference.behind, 1.0 - level))
     # Of few independent samples the unknowns take a larger share than of the rows.
-    low = min(1.0 / MATTERS, _quantile(spare, behind, level) * spare / (effective * share))
+    low = min(1.0 / MATTERS, _quantile(spare, reference.behind, level) * spare / (effective * share))
     verdict: Verdict = "fits"
     if ratio > high:
-        verdict = "noise-understated" if white and not from_misfit(source) else "does-not-fit"
-    elif ratio < low and not from_misfit(source):
+        verdict = "noise-understated" if white and reference.known else "does-not-fit"
+    elif ratio < low and reference.known:
         verdict = "noise-overstated"
-    return ResidualSize(ratio, low, high, noise, white, verdict)
+    return ResidualSize(ratio, low, high, reference.noise, white, verdict)
 
 
 def _independent(rows: int, effective: float, rho: float) -> float:
@@ -211,19 +319,20 @@ def _line(output: str, size: ResidualSize, source: str) -> str:
         return (
             f"the noise of {output} is taken from the fit's own residual, which then cannot tell whether the model fits"
         )
+    where = f"{output} in '{size.record}'" if size.record else output
     kind = "stated" if source == GIVEN else "row-to-row" if from_misfit(source) else "estimated"
     ratio = f"chi2/dof {size.ratio:.3g}"
     if size.times == 0.0:
-        return f"the residual of {output} is 0: nothing of the {kind} noise is in these rows ({ratio})"
+        return f"the residual of {where} is 0: nothing of the {kind} noise is in these rows ({ratio})"
     if size.verdict == "noise-overstated":
         return f"the {kind} noise of {output} is {times_text(1.0 / size.times)} what the residual shows ({ratio})"
     if size.verdict == "noise-understated":
         return (
-            f"the residual of {output} is white and {times_text(size.times)} the {kind} noise ({ratio}): that noise is too "
+            f"the residual of {where} is white and {times_text(size.times)} the {kind} noise ({ratio}): that noise is too "
             "small, or the model lacks something too fast for these rows to show"
         )
     if size.verdict == "does-not-fit":
-        return f"the residual of {output} is {times_text(size.times)} the {kind} noise ({ratio})"
+        return f"the residual of {where} is {times_text(size.times)} the {kind} noise ({ratio})"
     return ""
 
 

@@ -106,7 +106,7 @@ class FitResult(Shown):
     per_experiment: statistics over fits to single experiments, where they were made.
     loss, whitening: what residuals cost, and the AR coefficients they were whitened with, by output.
     dof: degrees of freedom of Student's t behind the intervals, None where the noise is known and white (its square is
-    the F quantile of one parameter). goodness, validation, windowed_errors: see `goodness`, `validation` and `windowed`.
+    the F quantile of one parameter). goodness, validation: see there.
     covariance: of the unknowns that have one; not in the JSON, which has std and correlation.
     """
 
@@ -138,7 +138,6 @@ class FitResult(Shown):
     dof: float | None = None
     goodness: Mapping[str, Any] = field(default_factory=dict)
     validation: Mapping[str, Any] = field(default_factory=dict)
-    windowed_errors: Mapping[str, Any] = field(default_factory=dict)
     covariance: Covariance | None = field(default=None, metadata={"json": False})
 
     def to_dict(self) -> dict[str, Any]:

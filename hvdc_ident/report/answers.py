@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.fit.adequacy import MATTERS
-from hvdc_ident.fit.windowed_errors import signal_within
 from hvdc_ident.report.overlay import STAGES, Overlay, overlay_of
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.values_that_count import ValuesThatCount, values_that_count
@@ -31,40 +29,36 @@ AT_BOUND = "at its bound"
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Errors of the model with one set of values.
+class Count:
+    """How many signals passed, failed and were not judged."""
 
-    name: "given", "fitted" or "effect". rmse, largest: in the worst signal, in its unit; times: rmse over the noise, there.
-    above: signals whose error is above the noise, of `judged`, and `unknown`: those whose noise is not known. outside: signals
-    outside the tolerance, of `limited`, and `unlimited`: those without one.
+    passed: int
+    failed: int
+    not_judged: int
+
+    @property
+    def judged(self) -> int:
+        """How many were judged."""
+        return self.passed + self.failed
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of the model with one set of values, as its judgement has them.
+
+    name: "given", "fitted" or "effect". rmse, peak: in the worst signal, in its unit; times: rmse over the noise, there. follows:
+    the verdict; by_limits: whether it is by a tolerance or by windows, and not by the noise. on_noise, in_limits: the signals that
+    are followed to their noise, and that keep the study's tolerance or, where it states none, the limits of the windows.
     """
 
     name: str
     rmse: float | None
-    largest: float | None
+    peak: float | None
     times: float | None
-    above: int
-    judged: int
-    outside: int
-    limited: int
-    unknown: int = 0
-    unlimited: int = 0
-
-    @property
-    def on_noise(self) -> bool | None:
-        """True where every signal is followed to its noise, False where one is not; None where the noise of none, or of some, is
-        not known and no other fails."""
-        return _passed(self.above, self.judged, self.unknown)
-
-    @property
-    def tolerated(self) -> bool | None:
-        """True where every signal keeps its tolerance, False where one does not; None where none, or not all, of them have one."""
-        return _passed(self.outside, self.limited, self.unlimited)
-
-
-def _passed(failed: int, judged: int, not_judged: int) -> bool | None:
-    """Return False where one failed, True where all were judged and none did, else None."""
-    return False if failed else None if not_judged or not judged else True
+    follows: bool | None
+    by_limits: bool
+    on_noise: Count
+    in_limits: Count
 
 
 @dataclass(frozen=True)
@@ -128,20 +122,22 @@ class Answers:
         self.diagnosis = results.get("discrepancy")
 
     @cached_property
-    def rmse(self) -> dict[str, Table]:
-        """Root mean square error by set of values, output and experiment, of the sets that there are."""
-        found: dict[str, Table] = {}
-        gap = self.diagnosis.get("gap") or {}
-        found["given"] = (
-            self.fit.get("rmse_given")
-            or self.results.get("simulation").get("rmse")
-            or joined_gap(gap.get("nominal") or {})
-        )
-        if self.fitted:
-            found["fitted"] = self.fit.get("rmse") or {}
-        if self.added:
-            found["effect"] = self.diagnosis.get("rmse_after") or joined_gap(gap.get("augmented") or {})
-        return {n: t for n, t in found.items() if t}
+    def judgements(self) -> dict[str, Mapping[str, Any]]:
+        """The judgement of the model with each set of values that there is: "given", "fitted" and "effect"."""
+        found: dict[str, Mapping[str, Any]] = {}
+        for stage in STAGES.values():
+            for name, judgement in (self._judged(stage).get("sets") or {}).items():
+                found.setdefault(name, judgement)
+        wanted = {"given": True, "fitted": bool(self.fitted), "effect": bool(self.added)}
+        return {n: found[n] for n, there in wanted.items() if there and (found.get(n) or {}).get("signals")}
+
+    def _judged(self, stage: str) -> Mapping[str, Any]:
+        return self.results.get(stage).get("judgement") or {}
+
+    def signals(self, name: str) -> dict[Signal, Mapping[str, Any]]:
+        """The judgement of each signal with a set of values, empty without one."""
+        table = (self.judgements.get(name) or {}).get("signals") or {}
+        return {(o, e): about for o, line in table.items() for e, about in line.items()}
 
     @property
     def fitted(self) -> tuple[str, ...]:
@@ -182,24 +178,19 @@ class Answers:
     def worst(self) -> Signal | None:
         """The signal with the largest error at the given or the fitted values: over its tolerance, else its noise, else its range."""
         shares: dict[int, dict[Signal, float]] = {0: {}, 1: {}, 2: {}}
-        for name in [n for n in ("given", "fitted") if n in self.rmse]:
-            for (output, experiment), error in _entries(self.rmse[name]):
-                scales = (self.tolerance.get(output), self.noise((output, experiment)))
-                for kind, scale in enumerate(scales):
+        for name in ("given", "fitted"):
+            for signal, about in self.signals(name).items():
+                scales = (about["tolerance"], about["noise"])
+                swing = None if any(scales) else self._swing(*signal)
+                for kind, scale in enumerate((*scales, swing)):
                     if scale:
-                        shares[kind][output, experiment] = max(
-                            error / scale, shares[kind].get((output, experiment), 0.0)
-                        )
-                if not any(scales) and (swing := self._swing(output, experiment)):
-                    shares[2][output, experiment] = max(error / swing, shares[2].get((output, experiment), 0.0))
+                        shares[kind][signal] = max(about["rmse"] / scale, shares[kind].get(signal, 0.0))
         ranked = next((s for s in shares.values() if s), {})
         return max(ranked, key=lambda signal: ranked[signal], default=None)
 
     def noise(self, signal: Signal) -> float | None:
         """The standard deviation of a signal's noise, in its unit; None where it is not known."""
-        output, experiment = signal
-        floor = (self.diagnosis.get("gap") or {}).get("noise_floor") or {}
-        return self.results.noise(experiment, output) or (None if self.fit else floor.get(output))
+        return next((about["noise"] for n in self.judgements if (about := self.signals(n).get(signal))), None)
 
     def interval(self, name: str, stage: str) -> tuple[float | None, float | None] | None:
         """The 95 % interval of a parameter as the fit or the diagnosis ("discrepancy") found it."""
@@ -209,24 +200,28 @@ class Answers:
 
     @property
     def tolerance(self) -> Mapping[str, float]:
-        """The study's tolerance by output, in its unit."""
-        return self.diagnosis.get("tolerance") or {}
+        """The study's tolerance of the RMSE by output, in its unit."""
+        return self._about.get("tolerance") or {}
 
-    @cached_property
+    @property
     def profile(self) -> Mapping[str, Any]:
         """The tolerance profile of windows before, during and after the event; empty where no error was held against one."""
-        windowed = self.fit.get("windowed_errors") or self.results.get("simulation").get("windowed_errors") or {}
-        return windowed.get("profile") or {}
+        return self._about.get("profile") or {}
+
+    @cached_property
+    def _about(self) -> Mapping[str, Any]:
+        """What the errors were held against, by the last stage that judged."""
+        return next((j for stage in reversed(STAGES.values()) if (j := self._judged(stage))), {})
 
     @property
     def by_tolerance(self) -> bool:
-        """True where the verdict is against a tolerance that the study names, and not against the noise."""
+        """True where the study names a tolerance, which then is what the verdict is against, where a signal has one."""
         return bool(self.tolerance) or bool(self.profile.get("named"))
 
     @cached_property
     def errors(self) -> tuple[Errors, ...]:
         """The errors by set of values, in the order given, fitted, with the effect."""
-        return tuple(self._errors(name) for name in self.rmse)
+        return tuple(self._errors(name) for name in self.judgements)
 
     @property
     def judged(self) -> Errors | None:
@@ -237,67 +232,44 @@ class Answers:
     @property
     def follows(self) -> bool | None:
         """The verdict on the model as it is, fitted where it was; None where neither a tolerance nor a noise is known."""
-        return None if self.judged is None else self.passed(self.judged)
+        return None if self.judged is None else self.judged.follows
 
-    def held_to_tolerance(self, errors: Errors) -> bool:
-        """True where the verdict on these errors is by a tolerance, False where it is by the noise."""
-        return self.by_tolerance and errors.limited > 0
-
-    def passed(self, errors: Errors) -> bool | None:
-        """The verdict on these errors; None where a signal is not judged and no other fails."""
-        return errors.tolerated if self.held_to_tolerance(errors) else errors.on_noise
-
-    def not_judged(self, errors: Errors, *, tolerance: bool) -> str:
-        """Phrase on the signals that are not judged, by the tolerance or else by the noise, and what to state; empty without any."""
-        count = errors.unlimited if tolerance else errors.unknown
+    def not_judged(self, errors: Errors, *, limits: bool) -> str:
+        """Phrase on the signals that are not judged, by the limits or else by the noise, and what to state; empty without any."""
+        count = (errors.in_limits if limits else errors.on_noise).not_judged
         if not count:
             return ""
         said = f"{count} signal{'s' if count > 1 else ''} not judged"
-        if not tolerance:
-            return f"{said}: state the noise of {listed(self._without_noise(errors.name))}"
+        each = self.signals(errors.name)
+        if not limits:
+            unknown = dict.fromkeys(o for (o, _), about in each.items() if about["follows"]["noise"] is None)
+            return f"{said}: state the noise of {listed(list(unknown))}"
         if self.tolerance:
-            rest = [o for o in self.rmse[errors.name] if o not in self.tolerance]
+            rest = list(dict.fromkeys(o for o, _ in each if o not in self.tolerance))
             return f"{said}: the study states no tolerance for {listed(rest)}"
         why: dict[str, list[str]] = {}
-        for output, line in self._windows(errors.name).items():
-            for about in line.values():
-                if signal_within(about) is None:
-                    names = why.setdefault(str(about.get("reason") or "no limit in its unit"), [])
-                    names += [] if output in names else [output]
+        for (output, _), about in each.items():
+            if about["follows"]["windows"] is None:
+                names = why.setdefault(str(about["windows"].get("reason") or "no limit in its unit"), [])
+                names += [] if output in names else [output]
         reasons = [f"{one_of(names)} ({reason})" for reason, names in why.items()]
         return f"{said}: {'; '.join(reasons)}" if reasons else said
 
     def _errors(self, name: str) -> Errors:
-        table = self.rmse[name]
-        signals = list(_entries(table))
-        noisy = [(e, s) for (o, x), e in signals if (s := self.noise((o, x)))]
-        kept = self._kept(name)
-        rmse = largest = times = None
-        if self.worst is not None:
-            output, experiment = self.worst
-            rmse = (table.get(output) or {}).get(experiment)
-            noise = self.noise(self.worst)
-            times = rmse / noise if rmse is not None and noise else None
-            run = overlay_of(self.results, experiment, output, (name,))
-            largest = None if run is None else float(np.nanmax(np.abs(run.error(name)), initial=0.0))
-        above = sum(e**2 > MATTERS * s**2 for e, s in noisy)
-        unknown, unlimited = (max(len(signals) - len(judged), 0) for judged in (noisy, kept))
+        judgement = self.judgements[name]
+        about = self.signals(name).get(self.worst) if self.worst is not None else None
+        rmse, peak, noise = (about[k] for k in ("rmse", "peak", "noise")) if about else (None, None, None)
+        counts = {by: Count(**count) for by, count in judgement["counts"].items()}
         return Errors(
-            name, rmse, largest, times, above, len(noisy), sum(not k for k in kept), len(kept), unknown, unlimited
+            name,
+            rmse,
+            peak,
+            rmse / noise if rmse is not None and noise else None,
+            judgement["follows"],
+            judgement["by"] != "noise",
+            counts["noise"],
+            counts["tolerance" if self.tolerance else "windows"],
         )
-
-    def _without_noise(self, name: str) -> list[str]:
-        return list(dict.fromkeys(o for (o, x), _ in _entries(self.rmse[name]) if not self.noise((o, x))))
-
-    def _kept(self, name: str) -> list[bool]:
-        """Of each signal with a tolerance, whether the model keeps it: the study's own, else that of the profile's windows."""
-        if self.tolerance:
-            return [e <= self.tolerance[o] for (o, _), e in _entries(self.rmse[name]) if o in self.tolerance]
-        each = [signal_within(about) for line in self._windows(name).values() for about in line.values()]
-        return [kept for kept in each if kept is not None]
-
-    def _windows(self, name: str) -> Mapping[str, Any]:
-        return (self.results.get(STAGES[name]).get("windowed_errors") or {}).get("errors") or {}
 
     def _swing(self, output: str, experiment: str) -> float | None:
         """Peak-to-peak value of a recorded signal, in its unit; None where its recording is not at hand."""
@@ -310,7 +282,7 @@ class Answers:
         """The recording of the worst signal with the model's runs."""
         if self.worst is None:
             return None
-        sets = tuple(n for n in STAGES if n in self.rmse)
+        sets = tuple(self.judgements)
         return overlay_of(self.results, self.worst[1], self.worst[0], sets)
 
     @cached_property
@@ -447,13 +419,6 @@ class Answers:
         return found
 
 
-def _entries(table: Table) -> Iterable[tuple[Signal, float]]:
-    for output, line in table.items():
-        for experiment, error in line.items():
-            if error is not None:
-                yield (output, experiment), float(error)
-
-
 def added_to(diagnosis: Mapping[str, Any]) -> str:
     """Return the kind of the addition in an augmented model: "effect", "formula", "filter" or "curve"; empty without one."""
     if diagnosis.get("effects"):
@@ -513,12 +478,3 @@ def _implied(place: Mapping[str, Any], depend: Collection[str]) -> str:
     sizes = (place.get("parameters") or {}) | {n: v for n, v in place["values"].items() if n in depend}
     told = listed(f"{n} = {quantity(p['value'], p.get('unit') or '')}" for n, p in sizes.items())
     return f" (then {told})"
-
-
-def joined_gap(gap: Mapping[str, Table]) -> dict[str, dict[str, float | None]]:
-    """Return the errors of fitted and held-out experiments, which a diagnosis keeps apart, in one table."""
-    found: dict[str, dict[str, float | None]] = {}
-    for part in gap.values():
-        for output, line in part.items():
-            found.setdefault(output, {}).update(line)
-    return found

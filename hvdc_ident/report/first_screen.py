@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from hvdc_ident.report.answers import AT_BOUND, Answers, Errors, Value
+from hvdc_ident.report.answers import AT_BOUND, Answers, Count, Errors, Value
 from hvdc_ident.report.html import badge, estimate, number, percent, prose, rough, share, table, text
 from hvdc_ident.report.overlay import WORDS, Sheet
 from hvdc_ident.report.results import Results
@@ -63,9 +63,9 @@ def _verdict(found: Answers) -> str:
             text(WORDS[e.name]),
             rough(e.rmse),
             rough(e.times) if e.times is not None else "",
-            rough(e.largest) if e.largest is not None else "",
-            _counted(e.above, e.judged, e.unknown) if e.judged else "",
-            _counted(e.outside, e.limited, e.unlimited) if e.limited or (e.unlimited and found.by_tolerance) else "",
+            rough(e.peak) if e.peak is not None else "",
+            _counted(e.on_noise) if e.on_noise.judged else "",
+            _counted(e.in_limits) if e.in_limits.judged or found.by_tolerance else "",
         ]
         for e in found.errors
     ]
@@ -75,24 +75,25 @@ def _verdict(found: Answers) -> str:
     return f"<p class='answer'>{_sentence(found, found.judged)}</p><p>{worst}</p>{table(header, rows, words=(0, 4, 5))}{_basis(found)}"
 
 
-def _counted(failed: int, judged: int, not_judged: int) -> str:
+def _counted(count: Count) -> str:
     """A badge with the number of signals behind it, where it is not all of them, and the number of those that are not judged."""
     parts = []
-    if failed:
-        parts.append(f"{badge(False)} {failed} of {judged}")
-    elif judged:
-        parts.append(badge(True) + (f" {judged}" if not_judged else ""))
-    return ", ".join([*parts, *([f"not judged {not_judged}"] if not_judged else [])])
+    if count.failed:
+        parts.append(f"{badge(False)} {count.failed} of {count.judged}")
+    elif count.judged:
+        parts.append(badge(True) + (f" {count.judged}" if count.not_judged else ""))
+    return ", ".join([*parts, *([f"not judged {count.not_judged}"] if count.not_judged else [])])
 
 
 def _sentence(found: Answers, judged: Errors) -> str:
     which = "The fitted model" if judged.name == "fitted" else "The model with its given values"
-    held = found.held_to_tolerance(judged)
-    count, failed = (judged.limited, judged.outside) if held else (judged.judged, judged.above)
+    held = judged.by_limits
+    signals_of = judged.in_limits if held else judged.on_noise
+    count = signals_of.judged
     if not count:
         return f"{which} is not judged: neither the noise of the recordings nor a tolerance is known."
-    if not failed:
-        rest = text(found.not_judged(judged, tolerance=held))
+    if not signals_of.failed:
+        rest = text(found.not_judged(judged, limits=held))
         signals = f"the {count} signal{'s' if count > 1 else ''} that {'are' if count > 1 else 'is'} judged"
         if held:
             kind = f"keeps the tolerance in {signals}; {rest}" if rest else "keeps the tolerance"
@@ -103,29 +104,32 @@ def _sentence(found: Answers, judged: Errors) -> str:
     completed = next((e for e in found.errors if e.name == "effect"), None)
     mended = ""
     if completed is not None:
-        done = completed.limited and not completed.outside if held else completed.judged and not completed.above
-        some = completed.unlimited if held else completed.unknown
-        mended = f"; with the effect it does{', where it is judged' if some else ''}" if done else ""
+        after = completed.in_limits if held else completed.on_noise
+        some = ", where it is judged" if after.not_judged else ""
+        mended = f"; with the effect it does{some}" if after.passed and not after.failed else ""
     return f"{badge(False)} {which} {kind}{mended}."
 
 
 def _basis(found: Answers) -> str:
     """One line on what the columns compare with what."""
     parts = []
-    if any(e.judged for e in found.errors):
-        parts.append("On the noise: the error has at most twice the noise’s power. Behind FAIL: signals that fail.")
-        if rest := found.not_judged(found.errors[-1], tolerance=False):
+    if any(e.on_noise.judged for e in found.errors):
+        parts.append(
+            "On the noise: the error has at most twice the noise’s power, or what chance allows so few independent rows. "
+            "Behind FAIL: signals that fail."
+        )
+        if rest := found.not_judged(found.errors[-1], limits=False):
             parts.append(f"On the noise, {text(rest)}.")
     if found.tolerance:
         each = ", ".join(
             f"{text(o)} {number(v)} {text(found.results.units.get(o, ''))}".rstrip() for o, v in found.tolerance.items()
         )
         parts.append(f"Tolerance of the RMSE: {each}.")
-    elif any(e.limited for e in found.errors) or found.profile.get("named"):
+    elif any(e.in_limits.judged for e in found.errors) or found.profile.get("named"):
         parts.append(_windows(found.profile))
     if found.tolerance or found.profile:
-        windowed = next((e for e in reversed(found.errors) if e.limited), found.errors[-1])
-        if (windowed.limited or found.by_tolerance) and (rest := found.not_judged(windowed, tolerance=True)):
+        windowed = next((e for e in reversed(found.errors) if e.in_limits.judged), found.errors[-1])
+        if (windowed.in_limits.judged or found.by_tolerance) and (rest := found.not_judged(windowed, limits=True)):
             parts.append(f"In the {'tolerance' if found.tolerance else 'windows'}, {text(rest)}.")
     return f"<p class='small'>{' '.join(parts)}</p>"
 
@@ -263,7 +267,12 @@ def _undiagnosed(found: Answers) -> str:
     command = "<code>hvdc-ident diagnose STUDY</code> looks for what is missing."
     if found.follows is False:
         return f"<p class='answer'>Not asked yet. {command}</p>"
-    if found.follows is True and found.judged is not None and found.judged.on_noise:
+    if (
+        found.follows is True
+        and found.judged is not None
+        and not found.judged.on_noise.not_judged
+        and not found.judged.on_noise.failed
+    ):
         return "<p class='answer'>No sign of anything: what is left is noise.</p>"
     return f"<p class='answer'>Not asked. {command}</p>"
 

@@ -152,7 +152,7 @@ def _passed(answers: Answers) -> bool | None:
     errors = _given(answers)
     if errors is None:
         return None
-    return answers.passed(errors)
+    return errors.follows
 
 
 def _missed(answers: Answers) -> str:
@@ -161,9 +161,10 @@ def _missed(answers: Answers) -> str:
     if errors is None or answers.worst is None:
         return "The model could not be compared with the recordings at its given values."
     mine = "With the values it came with, your model"
-    held = answers.held_to_tolerance(errors)
-    failed, count = (errors.outside, errors.limited) if held else (errors.above, errors.judged)
-    rest = answers.not_judged(errors, tolerance=held)
+    held = errors.by_limits
+    signals_of = errors.in_limits if held else errors.on_noise
+    failed, count = signals_of.failed, signals_of.judged
+    rest = answers.not_judged(errors, limits=held)
     if count and not failed:
         kind = ("keeps the tolerance in", "") if held else ("follows", " to its noise")
         signals = f"{count} recorded signal{'s' if count > 1 else ''}" if rest else "every recorded signal"
@@ -182,14 +183,15 @@ def _missed(answers: Answers) -> str:
 
 def _in_windows(answers: Answers, errors: Errors) -> str:
     """Sentence on the windows of the tolerance profile that stands in where a study names none."""
-    if not errors.limited or not answers.profile:
+    if not errors.in_limits.judged or not answers.profile:
         return ""
     name = str(answers.profile.get("source", "")).split(" (")[0] or str(answers.profile.get("name", ""))
-    rest = answers.not_judged(errors, tolerance=True)
+    rest = answers.not_judged(errors, limits=True)
     rest = f"; {rest}" if rest else ""
-    if errors.outside:
-        return f" In {errors.outside} of {errors.limited} signals that is more than the windows of {name} allow{rest}."
-    signals = f"{errors.limited} signal{'s' if errors.limited > 1 else ''}" if rest else "every signal"
+    if errors.in_limits.failed:
+        return f" In {errors.in_limits.failed} of {errors.in_limits.judged} signals that is more than the windows of {name} allow{rest}."
+    count = errors.in_limits.judged
+    signals = f"{count} signal{'s' if count > 1 else ''}" if rest else "every signal"
     return f" In {signals} it is less than the windows of {name} allow{rest}."
 
 
@@ -228,7 +230,7 @@ def _figure(answers: Answers) -> str:
     """The worst signal before and after."""
     if answers.worst is None:
         return ""
-    after = "effect" if "effect" in answers.rmse else "fitted"
+    after = "effect" if "effect" in answers.judgements else "fitted"
     overlay = overlay_of(answers.results, answers.worst[1], answers.worst[0], ("given", after))
     if overlay is None:
         return ""

@@ -48,12 +48,14 @@ def use_of(effect: Mapping[str, Any]) -> dict[str, Any]:
 def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
     """Return what discrepancy.json says of the augmented model beside the recordings, and a CSV file of its curves by name.
 
-    fitted: the parameters that the diagnosis estimated. The JSON holds `rmse_after`, `windowed_errors`, `estimates_after` and
+    fitted: the parameters that the diagnosis estimated. The JSON holds `judgement`, `rmse_after`, `estimates_after` and
     `residual_tests_after`, as fit.json does of the fit. Experiments that the model cannot be run on are left out, and so are those
-    with unknowns of their own, whose values a diagnosis does not keep. Nothing is returned where no effect was put in.
+    with unknowns of their own, whose values a diagnosis does not keep. Where no effect was put in there is the judgement alone, at the
+    given values.
     """
+    sets = {"given": fitting.curves_at_given(study)}
     if found.augmented is None:
-        return {}, {}
+        return {"judgement": fitting.judgement_of(study, sets)}, {}
     curves: dict[str, dict[str, Curve]] = {}
     files: dict[str, str] = {}
     for e in study.experiments:
@@ -71,7 +73,7 @@ def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dic
             rmse.setdefault(output, {})[name] = float(np.sqrt(np.mean(curve.misfit**2)))
     data = {
         "rmse_after": rmse,
-        "windowed_errors": fitting.errors_in_windows(study, curves),
+        "judgement": fitting.judgement_of(study, {**sets, "effect": curves}),
         **_estimates(study, found, fitted, curves),
     }
     return data, files

@@ -61,7 +61,7 @@ def check_questions(study: Study, where: str) -> None:
     if s.fit:
         from hvdc_ident.fit.likelihood import LOSSES
         from hvdc_ident.fit.optimisers import catalogue
-        from hvdc_ident.fit.windowed_errors import tolerance
+        from hvdc_ident.fit.tolerance_profile import tolerance
 
         require_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
         require_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")

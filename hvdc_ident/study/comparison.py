@@ -10,7 +10,7 @@ from typing import Any
 
 from hvdc_ident.display import Shown, Table, rounded
 from hvdc_ident.errors import InputError
-from hvdc_ident.report.answers import joined_gap
+from hvdc_ident.report.answers import Answers
 from hvdc_ident.report.comparison import comparison_page
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.values_that_count import estimates_that_count, values_that_count
@@ -321,15 +321,11 @@ def _gaps(first: Results, second: Results) -> list[dict[str, Any]]:
 
 
 def _rmse(results: Results, kind: str) -> Mapping[str, Mapping[str, Any]]:
-    """The RMSE by output and recording at one set of values; empty where that has not been computed."""
-    if kind == "given":
-        return results.get("simulation").get("rmse") or results.get("fit").get("rmse_given") or {}
-    if kind == "fitted":
-        return results.get("fit").get("rmse") or {}
-    diagnosis = results.get("discrepancy")
-    if not diagnosis.get("augmented_model"):
-        return {}
-    return dict(joined_gap(diagnosis["gap"]["augmented"]))
+    """The RMSE by output and recording with one set of values; empty where that has not been computed."""
+    table: dict[str, dict[str, float]] = {}
+    for (output, experiment), about in Answers(results).signals("effect" if kind == "augmented" else kind).items():
+        table.setdefault(output, {})[experiment] = about["rmse"]
+    return table
 
 
 def _verdict(stage: Stage, results: Results) -> str:

@@ -10,17 +10,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 
+from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.files import csv_columns
 from hvdc_ident.fit import FitResult, Group, Problem, StartOutcome, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
 from hvdc_ident.fit.frequency_data import with_responses
+from hvdc_ident.fit.judgement import judge
 from hvdc_ident.fit.likelihood import loss
 from hvdc_ident.fit.partial_fits import part_of
 from hvdc_ident.fit.residual import compared_rows
-from hvdc_ident.fit.windowed_errors import tolerance, windowed_errors
+from hvdc_ident.fit.tolerance_profile import tolerance
 from hvdc_ident.identifiability import gated_fit
 from hvdc_ident.identifiability.gate import searched
 from hvdc_ident.model import Model
+from hvdc_ident.simulate import simulate
 from hvdc_ident.study.checks import need_candidates, need_experiments, need_start
 from hvdc_ident.study.schema import FitTable
 from hvdc_ident.study.study import priors
@@ -165,14 +168,41 @@ def curves_of_run(experiment: Experiment, run: Trajectory) -> dict[str, Curve]:
     }
 
 
-def errors_in_windows(study: Study, found: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
-    """The errors before, during and after the event, with the tolerance profile; its `named` says whether the study names it."""
-    asked = asked_of(study)
+def judgement_of(
+    study: Study, sets: Mapping[str, Mapping[str, Mapping[str, Curve]]], result: FitResult | None = None
+) -> dict[str, Any]:
+    """Return whether the model follows the recordings, as a stage's JSON says it, by set of values.
+
+    sets: by name, the curves of every output by experiment and output. result: the fit that gave the curves named "fitted", whose own
+    judgement of the residuals then holds. Beside each `Judgement`: the tolerance that the study states, by output, and the profile of
+    the windows; its `named` says whether the study names it.
+    """
+    asked, stated = asked_of(study), study.settings.diagnose
     profile = tolerance(asked.tolerance, study.path.parent)
+    tolerances = {} if stated is None else stated.tolerances
+    named = "tolerance" in asked.model_fields_set
     units = {n: o.unit for n, o in study.model.outputs.items()}
-    recorded = {e.name: found[e.name] for e in study.experiments if e.name in found}
-    table = windowed_errors(recorded, study.experiments, profile, units)
-    return {**table, "profile": {**table["profile"], "named": "tolerance" in asked.model_fields_set}}
+    sizes = result.adequacy.signals if result is not None and result.adequacy is not None else {}
+    found: dict[str, Any] = {}
+    for name, runs in sets.items():
+        recorded = {e.name: runs[e.name] for e in study.experiments if e.name in runs}
+        own = sizes if name == "fitted" else {}
+        found[name] = judge(
+            recorded, study.experiments, units, profile, tolerance=tolerances, named=named, sizes=own
+        ).to_dict()
+    head = {k: getattr(profile, k) for k in ("name", "version", "title", "source", "notes", "unit")}
+    return {"tolerance": tolerances, "profile": {**head, "named": named}, "sets": found}
+
+
+def curves_at_given(study: Study) -> dict[str, dict[str, Curve]]:
+    """Return every recorded output beside a run at the given values, by experiment and output; experiments without a run are left out."""
+    found = {}
+    for e in study.experiments:
+        try:
+            found[e.name] = curves_of_run(e, simulate(study.model, e, study.given).trajectory)
+        except (ComputationError, SteadyStateError):  # the stage `simulate` says why
+            continue
+    return found
 
 
 def curves_csv(experiment: Experiment, found: Mapping[str, Curve]) -> str:

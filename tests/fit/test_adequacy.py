@@ -132,3 +132,26 @@ def test_a_record_that_stands_still_at_the_model_is_told_without_a_factor():
 def test_a_record_that_the_model_meets_to_its_last_digits_fits():
     judged = straight(None, 1 + 2 * T).adequacy
     assert judged.verdict == "fits" and "to 1e-06 of its range" in judged.text
+
+
+def test_a_single_record_that_is_off_is_not_lost_among_others():
+    """Nine records on the line and one bent away from it: together 1.6 times the noise's power, that one 7 times."""
+    records = {f"e{k}": 1 + 2 * T + white(k) for k in range(9)}
+    records["bent"] = 1 + 2 * T + white(9) + 0.35 * np.sin(6 * T)
+    experiments = tuple(recorded(n, T, {"y": 0.1}, y=y) for n, y in records.items())
+    judged = fit(Problem(LINE, experiments, FREE), starts=1).adequacy
+    power = {n: s.ratio for n, s in judged.signals["y"].items()}
+    assert np.mean(list(power.values())) < 2.0 < power["bent"]
+    assert judged.verdict == "does-not-fit" and "the residual of y in 'bent' is" in judged.text
+    assert [n for n, s in judged.signals["y"].items() if not s.follows] == ["bent"]
+
+
+def test_records_that_are_off_only_together_are_told_by_their_size():
+    """Of few rows each no record is beyond chance; all of them are, and those with twice the noise's power do not follow."""
+    t = np.linspace(0.0, 1.0, 6)
+    experiments = tuple(recorded(f"e{k}", t, {"y": 0.1}, y=1 + 2 * t + white(k, 0.17, 6)) for k in range(40))
+    judged = fit(Problem(LINE, experiments, FREE), starts=1).adequacy
+    signals = judged.signals["y"].values()
+    assert judged.verdict == "noise-understated" and judged.outputs["y"].record == ""
+    assert {s.follows for s in signals} == {True, False}
+    assert all(s.follows is (s.ratio <= 2.0) for s in signals if s.ratio < s.high)

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from tests.report.judgements import judgement
+
 HEADING = {
     "schema": 1,
     "study": "demo-like",
@@ -73,24 +75,22 @@ def _about() -> dict[str, Any]:
     return {"units": dict.fromkeys(OUTPUTS, "pu"), "noise": noise, "experiments": roles}
 
 
-def _windows(named: bool, high: float) -> dict[str, Any]:
+def _windows(high: float) -> dict[str, Any]:
     limits = {"max": 0.05, "mean": 0.02, "mean_absolute": 0.03}
-    profile = {
-        "name": "steps",
-        "version": "1",
-        "title": "steps",
-        "source": "IEC 61400-27-2:2020 (windows)",
-        "notes": "",
-        "unit": "pu",
-    }
     window = {"from": 0.0, "to": 0.05, "n": 51, "limits": limits, "mean": 1e-5, "mean_absolute": 8e-5}
-    line = {"event": EVENT, "end": 0.2, "end_from": "inputs"}
+    line = {"event": EVENT, "end": 0.2, "end_from": "inputs", "within": high <= 0.05, "reason": ""}
     line |= {w: {**window, "max": high, "within": high <= 0.05} for w in ("before", "during", "after")}
-    return {"profile": {**profile, "named": named}, "errors": {o: dict.fromkeys(EXPERIMENTS, line) for o in OUTPUTS}}
+    return dict.fromkeys(OUTPUTS, line)
+
+
+def judged(rmse: dict[str, Any], *names: str, **more: Any) -> dict[str, Any]:
+    """The judgement of some sets of values by the RMSE by stage; more: a tolerance, or that the study names the profile."""
+    stages = {"given": "simulation", "fitted": "fit", "effect": "discrepancy"}
+    return judgement({n: rmse[stages[n]] for n in names}, dict.fromkeys(OUTPUTS, NOISE), _windows(0.01), **more)
 
 
 def _simulation(rmse: dict[str, Any]) -> dict[str, Any]:
-    return {**_about(), "stage": "simulate", "rmse": rmse["simulation"], "windowed_errors": _windows(False, 0.01)}
+    return {**_about(), "stage": "simulate", "rmse": rmse["simulation"], "judgement": judged(rmse, "given")}
 
 
 def _candidates() -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _fit(rmse: dict[str, Any]) -> dict[str, Any]:
         "rmse_given": rmse["simulation"],
         "adequacy": adequacy,
         "noise_source": dict.fromkeys(OUTPUTS, "given"),
-        "windowed_errors": _windows(False, 0.01),
+        "judgement": judged(rmse, "given", "fitted"),
     }
 
 
@@ -193,7 +193,6 @@ def _discrepancy(rmse: dict[str, Any]) -> dict[str, Any]:
         "estimates_after": {n: {"value": a, "ci95": [0.995 * a, 1.005 * a]} for n, (_, _, a) in GAINS.items()},
         "augmented_model": "augmented-model.toml",
         "rmse_after": rmse["discrepancy"],
-        "windowed_errors": _windows(False, 0.01),
-        "tolerance": {},
+        "judgement": judged(rmse, "given", "effect"),
         "notes": [],
     }

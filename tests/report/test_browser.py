@@ -108,10 +108,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         m: {"fit": v, "holdout": 1.1 * v} for m, v in (("nominal", 20.0), ("refitted", 4.0), ("augmented", 1.0))
     }
     (results / "discrepancy.json").write_text(json.dumps(found), "utf-8")
-    windows = fit["windowed_errors"]["errors"]
-    windows |= {
-        f"{o}_{k}": line for o, line in list(windows.items()) for k in range(12)
-    }  # so many that they are folded
+    for judged in fit["judgement"]["sets"].values():  # so many signals that they are folded
+        judged["signals"] |= {f"{o}_{k}": line for o, line in list(judged["signals"].items()) for k in range(12)}
     (results / "fit.json").write_text(json.dumps(fit), "utf-8")
     write_report(results)
     return results

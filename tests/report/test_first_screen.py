@@ -15,7 +15,7 @@ from hvdc_ident.report.first_screen import first_screen
 from hvdc_ident.report.letter import Letterhead, write_letter
 from hvdc_ident.report.page import page, write_report
 from hvdc_ident.report.results import Results
-from tests.report.demo_like import EXPERIMENTS, GAINS, OUTPUTS, demo_like
+from tests.report.demo_like import EXPERIMENTS, GAINS, OUTPUTS, demo_like, judged
 from tests.report.test_browser import CLIPPED
 
 DESK = {"width": 1400, "height": 900}
@@ -46,6 +46,14 @@ def changed(folder: Path, source: Path, **stages: dict[str, Any] | None) -> Path
             heading = {k: heading[k] for k in ("schema", "study", "model", "software", "seed", "sources")}
             (folder / f"{name}.json").write_text(json.dumps({**heading, **data, **change}), "utf-8")
     return folder
+
+
+def judged_anew(source: Path, **more: Any) -> dict[str, dict[str, Any]]:
+    """Changes of results like the demo's: every stage judged against a tolerance, or with a profile that the study names."""
+    data = {n: json.loads((source / f"{n}.json").read_text("utf-8")) for n in ("simulation", "fit", "discrepancy")}
+    rmse = {n: d.get("rmse") or d["rmse_after"] for n, d in data.items()}
+    sets = {"simulation": ("given",), "fit": ("given", "fitted"), "discrepancy": ("given", "effect")}
+    return {n: {"judgement": judged(rmse, *names, **more)} for n, names in sets.items()}
 
 
 def words(html: str) -> str:
@@ -105,10 +113,10 @@ def test_the_answers_of_the_demo(like_the_demo: Path) -> None:
     worst = {"Ir1", "Ii1"} & {found.worst[0]} if found.worst else set()
     assert worst and found.worst is not None and found.worst[1].endswith("3")
     assert given.times == pytest.approx(np.sqrt(np.mean(error**2)) / 1e-4, rel=0.02)
-    assert given.largest == pytest.approx(np.abs(error).max(), rel=0.05)
+    assert given.peak == pytest.approx(3.0 * given.rmse)  # as the judgement has it
     still = 3  # Ir2 does not move in three recordings
-    assert (given.above, given.judged) == (len(EXPERIMENTS) * len(OUTPUTS) - still, 27)
-    assert (fitted.on_noise, effect.on_noise, given.tolerated) == (False, True, True)
+    assert (given.on_noise.failed, given.on_noise.judged) == (len(EXPERIMENTS) * len(OUTPUTS) - still, 27)
+    assert fitted.on_noise.failed and not effect.on_noise.failed and not given.in_limits.failed
     assert found.follows is False and not found.by_tolerance
     assert {v.name: v.value for v in found.values} == {n: a for n, (_, _, a) in GAINS.items()}
     screen = first_screen(Results(like_the_demo))
@@ -151,9 +159,7 @@ def test_a_value_that_depends_on_the_place_has_no_single_value(like_the_demo: Pa
 
 
 def test_a_study_that_names_a_tolerance_is_judged_by_it(like_the_demo: Path, tmp_path: Path) -> None:
-    windows = json.loads((like_the_demo / "fit.json").read_text("utf-8"))["windowed_errors"]
-    windows["profile"]["named"] = True
-    folder = changed(tmp_path / "named", like_the_demo, fit={"windowed_errors": windows})
+    folder = changed(tmp_path / "named", like_the_demo, **judged_anew(like_the_demo, named=True))
     screen = first_screen(Results(folder))
     assert "PASS The fitted model keeps the tolerance." in tile(screen, "verdict") and "named by the study" in screen
     text = page(folder)
@@ -161,7 +167,7 @@ def test_a_study_that_names_a_tolerance_is_judged_by_it(like_the_demo: Path, tmp
     assert errors.index("Before, during and after the event") < errors.index(
         "RMSE, given values"
     )  # the limits stand in front
-    own = changed(tmp_path / "own", like_the_demo, discrepancy={"tolerance": {"Ir1": 2e-4, "Ii1": 1.0}})
+    own = changed(tmp_path / "own", like_the_demo, **judged_anew(like_the_demo, tolerance={"Ir1": 2e-4, "Ii1": 1.0}))
     screen = first_screen(Results(own))
     assert "FAIL The fitted model does not keep the tolerance; with the effect it does, where it is judged." in tile(
         screen, "verdict"

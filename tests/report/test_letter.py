@@ -14,6 +14,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.report.letter import Letterhead, letter_of, write_letter
 from hvdc_ident.report.results import Results
 from hvdc_ident.study.study import without_letter
+from tests.report.judgements import judgement
 
 HEADING = {"schema": 1, "study": "s", "model": "m", "software": "hvdc_ident 0", "seed": 0, "sources": {}}
 
@@ -64,6 +65,9 @@ def diagnosis(**changes: Any) -> dict[str, Any]:
         ],
         "separating_experiment": {"text": "Record P2 at 1 kHz"},
         "gap": gap,
+        "judgement": judgement(
+            {"given": {"P2": {"step": 0.02}}, "effect": {"P2": {"step": 0.001, "ramp": 0.001}}}, {"P2": 0.001}
+        ),
         "parameters_before": {"KIP": 30.0},
         "parameters_refitted": {"KIP": 31.5},
         "parameters_after": {"KIP": 30.1},

@@ -19,6 +19,7 @@ from hvdc_ident.report.html import number, share
 from hvdc_ident.report.page import page, write_report
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.sections.discrepancy import SECTION
+from tests.report.judgements import judgement
 from tests.report.test_letter import diagnosis, folder_with
 
 NASTY = "<script>alert(1)</script>&\"'$x^2$"
@@ -50,6 +51,7 @@ def folder_of(path: Path, rows: int = 500, study: str = "a study", output: str =
         "rmse": {output: {"e": 0.01}},
         "rmse_start": {output: {"e": 0.1}},
         "chi2_per_dof": 1.02,
+        "judgement": judgement({"given": {output: {"e": 0.1}}, "fitted": {output: {"e": 0.01}}}, {output: 0.01}),
         "units": {output: unit},
         "experiments": {"e": about},
         "noise": {"e": {output: {"std": 0.01, "source": "given"}}},

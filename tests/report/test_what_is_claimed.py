@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hvdc_ident.report.answers import Answers, beyond_noise
+from hvdc_ident.report.answers import Answers, Count, beyond_noise
 from hvdc_ident.report.first_screen import first_screen
 from hvdc_ident.report.html import estimate, number
 from hvdc_ident.report.letter import letter_of, write_letter
@@ -20,39 +20,49 @@ from hvdc_ident.report.results import Results
 from hvdc_ident.report.sections.output_errors import SECTION as ERRORS
 from hvdc_ident.study.run_summary import run_lines, values_table
 from hvdc_ident.text import figures, interval_text, span, times_text
+from tests.report.judgements import judgement
 from tests.report.test_first_screen import tile, words
 from tests.report.test_letter import HEADING
 
 LIMITS = {"max": 0.05, "mean": 0.02, "mean_absolute": 0.03}
-PROFILE = {"name": "steps", "version": "1", "title": "steps", "source": "IEC 61400-27-2:2020 (windows)", "notes": ""}
 IN_KV = "the limits are in pu, the output is in kV"
 
 
-def windowed(errors: Mapping[str, float], units: Mapping[str, str], *, named: bool = False) -> dict[str, Any]:
-    """Windowed errors as a stage writes them, of outputs with a largest error each; limits hold for pu."""
-    lines: dict[str, Any] = {}
-    for output, high in errors.items():
-        limited = units[output] == "pu"
+OFF = {"gate": 0.001, "Ut": 4.0}
+NOISE = {"gate": 0.001, "Ut": 0.02}
+
+
+def judged(
+    off: Mapping[str, float] = OFF,
+    noise: Mapping[str, float | None] = NOISE,
+    units: Mapping[str, str] | None = None,
+    **more: Any,
+) -> dict[str, Any]:
+    """The judgement as a stage writes it, of outputs with an error each, with the given values and with the effect; limits hold for pu."""
+    windows: dict[str, Any] = {}
+    for output, high in off.items():
+        limited = {"gate": "pu", "Ut": "kV", **(units or {})}[output] == "pu"
         within = high <= LIMITS["max"] if limited else None
         one = {"from": 0.0, "to": 0.4, "n": 40, "limits": LIMITS if limited else None, "within": within}
         one |= {"max": high, "mean": 0.0, "mean_absolute": 0.0}
         about = {"event": 0.5, "end": 0.6, "end_from": "inputs", "within": within, "reason": "" if limited else IN_KV}
-        lines[output] = {"jump": about | dict.fromkeys(("before", "during", "after"), one)}
-    return {"profile": {**PROFILE, "unit": "pu", "named": named}, "errors": lines}
+        windows[output] = about | dict.fromkeys(("before", "during", "after"), one)
+    after = {o: {"jump": n or 1e-3} for o, n in noise.items() if o in off}
+    sets = {"given": {o: {"jump": v} for o, v in off.items()}, "effect": after, "fitted": {}}
+    return judgement(sets, noise, windows, **more)
 
 
 def hydro(folder: Path, **stages: Mapping[str, Any] | None) -> Results:
     """Results of a governor: gate in pu and terminal voltage in kV, recorded once; stages as they are changed, or left out."""
     folder.mkdir(exist_ok=True)
     units = {"gate": "pu", "Ut": "kV"}
-    off = {"gate": 0.001, "Ut": 4.0}
-    noise = {o: {"std": s, "source": "given", "by_row": False} for o, s in (("gate", 0.001), ("Ut", 0.02))}
+    noise = {o: {"std": s, "source": "given", "by_row": False} for o, s in NOISE.items()}
     simulation = {
         "units": units,
         "experiments": {"jump": {"role": "fit", "event": 0.5, "window": None}},
         "noise": {"jump": noise},
-        "rmse": {o: {"jump": v} for o, v in off.items()},
-        "windowed_errors": windowed(off, units),
+        "rmse": {o: {"jump": v} for o, v in OFF.items()},
+        "judgement": judged(),
         "candidates": {n: {"given": g, "min": 0.01, "max": 9.0, "unit": u} for n, g, u in (("Tg", 0.2, "s"), ("Kd", 1.5, ""))},
     }  # fmt: skip
     for name, data in {"simulation": simulation, **stages}.items():
@@ -99,8 +109,8 @@ def lagging(**changes: Any) -> dict[str, Any]:
         "parameters_refitted": {"Tg": 0.5, "Kd": 1.9},
         "parameters_after": {"Tg": 0.201, "Kd": 2.4},
         "estimates_after": {"Tg": {"value": 0.201, "ci95": [0.199, 0.203]}, "Kd": {"value": 2.4, "ci95": [2.39, 2.41]}},
-        "rmse_after": {"gate": {"jump": 0.001}, "Ut": {"jump": 0.02}},
         "augmented_model": "augmented-model.toml",
+        "judgement": judged(),
         **changes,
     }  # fmt: skip
 
@@ -114,7 +124,7 @@ def told(results: Results) -> str:
 def test_a_signal_without_limits_has_not_passed_the_windows(tmp_path: Path) -> None:
     results = hydro(tmp_path, discrepancy=lagging())
     given = Answers(results).errors[0]
-    assert (given.limited, given.outside, given.unlimited, given.tolerated) == (1, 0, 1, None)
+    assert given.in_limits == Count(passed=1, failed=0, not_judged=1)
     verdict = tile(first_screen(results), "verdict")
     assert "PASS 1, not judged 1" in verdict and f"1 signal not judged: Ut ({IN_KV})" in verdict
     letter = told(results)
@@ -129,13 +139,12 @@ def test_a_signal_without_limits_has_not_passed_the_windows(tmp_path: Path) -> N
 
 
 def test_a_named_profile_that_judges_only_some_signals_gives_no_pass(tmp_path: Path) -> None:
-    units = {"gate": "pu", "Ut": "kV"}
-    results = hydro(tmp_path, simulation={"windowed_errors": windowed({"gate": 0.001, "Ut": 4.0}, units, named=True)})
+    results = hydro(tmp_path, simulation={"judgement": judged(named=True)})
     assert Answers(results).follows is None
     verdict = tile(first_screen(results), "verdict")
     assert f"keeps the tolerance in the 1 signal that is judged; 1 signal not judged: Ut ({IN_KV})" in verdict
     assert not verdict.split("?")[1].strip().startswith("PASS")
-    none = {"windowed_errors": windowed({"Ut": 4.0}, units, named=True), "noise": {}}
+    none = {"judgement": judged({"Ut": 4.0}, {}, named=True), "noise": {}}
     results = hydro(tmp_path, simulation=none, discrepancy=lagging(gap={}))
     assert "is not judged: neither the noise of the recordings nor a tolerance is known" in tile(
         first_screen(results), "verdict"
@@ -145,7 +154,8 @@ def test_a_named_profile_that_judges_only_some_signals_gives_no_pass(tmp_path: P
 
 def test_a_signal_of_unknown_noise_is_not_followed_to_it(tmp_path: Path) -> None:
     known = {"jump": {"gate": {"std": 0.001, "source": "given"}, "Ut": {"std": 0.0, "source": "residual"}}}
-    results = hydro(tmp_path, simulation={"noise": known}, discrepancy=lagging(gap={}))
+    unknown = judged(noise={"gate": 0.001, "Ut": None})
+    results = hydro(tmp_path, simulation={"noise": known, "judgement": unknown}, discrepancy=lagging(gap={}))
     assert Answers(results).follows is None
     assert "follows the 1 signal that is judged to the noise; 1 signal not judged: state the noise of Ut" in tile(
         first_screen(results), "verdict"
@@ -284,7 +294,7 @@ def test_a_place_is_asked_for_once(tmp_path: Path) -> None:
 
 
 def test_a_letter_after_a_diagnosis_alone_names_the_curves_that_it_draws(tmp_path: Path) -> None:
-    hydro(tmp_path, discrepancy=lagging(gap={"nominal": {"fit": {"Ut": {"jump": 4.0}}}, "noise_floor": {"Ut": 0.02}}))
+    hydro(tmp_path, discrepancy=lagging())
     for file in ("simulation.json", "simulation.jump.csv"):
         (tmp_path / file).rename(tmp_path / file.replace("simulation", "discrepancy")) if file.endswith("csv") else (
             tmp_path / file

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.fit.windowed_errors import WINDOWS
+from hvdc_ident.fit.tolerance_profile import WINDOWS
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.sections import gains, output_errors, residuals
 from hvdc_ident.study import fitting
@@ -59,10 +59,11 @@ def pages(fit: dict) -> Results:
 def test_a_plain_fit_has_everything_a_reader_needs(plain):
     data, files = plain
     assert data["status"] == "converged"
-    windowed = data["windowed_errors"]
-    assert windowed["profile"]["name"] == "set-point-step-simulation"
+    judged = data["judgement"]
+    assert judged["profile"]["name"] == "set-point-step-simulation"
+    assert judged["sets"]["fitted"]["follows"] is True
     for name, source in (("step-up", "settling"), ("ramp", "inputs")):
-        line = windowed["errors"]["Irorder1"][name]
+        line = judged["sets"]["fitted"]["signals"]["Irorder1"][name]["windows"]
         assert line["end_from"] == source
         assert all(line[w]["within"] is True and line[w]["n"] > 10 for w in WINDOWS)
     assert set(data["validation"]) == {"ramp"}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.fit.adequacy import MATTERS
-from hvdc_ident.report.answers import Answers
+from hvdc_ident.report.answers import Answers, Signal
 from hvdc_ident.report.html import folded, number, share, table, text
 from hvdc_ident.report.results import Results, Section
 
@@ -14,71 +13,66 @@ NAMES = {"given": "RMSE, given values", "fitted": "RMSE, fitted", "effect": "RMS
 
 def _render(results: Results) -> str:
     found = Answers(results)
-    if not found.rmse:
+    sets = {n: found.signals(n) for n in found.judgements}
+    if not sets:
         return ""
-    fit, windows = results.get("fit"), _windows(results)
-    signals = list(dict.fromkeys((o, e) for t in found.rmse.values() for o, line in t.items() for e in line))
-    loud = [s for s in signals if not _on_noise(results, found, s)]
+    signals = list(dict.fromkeys(s for line in sets.values() for s in line))
+    loud = [s for s in signals if not all(s in line and line[s]["follows"]["noise"] for line in sets.values())]
     rest = [s for s in signals if s not in loud]
     quiet = (
         folded(f"{len(rest)} signals on their noise", _table(results, found, rest), "With every set of values.")
         if rest
         else ""
     )
-    named = (fit.get("windowed_errors") or {}).get("profile", {}).get("named")
     parts = [
         _table(results, found, loud) if loud else "<p>Every signal is on its noise, with every set of values.</p>",
         quiet,
     ]
-    return "".join([windows, *parts] if named else [*parts, windows]) + _held_out(fit)
+    windows = _windows(results, found)
+    named = found.profile.get("named")
+    return "".join([windows, *parts] if named else [*parts, windows]) + _held_out(results.get("fit"))
 
 
-def _on_noise(results: Results, found: Answers, signal: tuple[str, str]) -> bool:
-    """True where the noise of a signal is known and no set of values leaves more than it."""
-    output, experiment = signal
-    noise = results.noise(experiment, output)
-    errors = [(t.get(output) or {}).get(experiment) for t in found.rmse.values()]
-    return noise is not None and all(e is not None and e**2 <= MATTERS * noise**2 for e in errors)
-
-
-def _table(results: Results, found: Answers, signals: list[tuple[str, str]]) -> str:
+def _table(results: Results, found: Answers, signals: list[Signal]) -> str:
     """Table of the root mean square errors of some signals."""
+    sets = {n: found.signals(n) for n in found.judgements}
     rows = []
     for output, experiment in signals:
-        errors = {n: (t.get(output) or {}).get(experiment) for n, t in found.rmse.items()}
+        errors = {n: (line.get((output, experiment)) or {}).get("rmse") for n, line in sets.items()}
         role = "held out" if (results.experiments.get(experiment) or {}).get("role") == "holdout" else "fit"
         cells = [text(output), text(experiment), role, *(number(e, 3) for e in errors.values())]
         change = share(errors["fitted"], errors.get("given")) if "fitted" in errors else ""
-        noise = results.noise(experiment, output)
+        noise = found.noise((output, experiment))
         rows.append([*cells, change, number(noise, 2) if noise else "", text(results.units.get(output, ""))])
-    header = ["output", "experiment", "role", *(NAMES[n] for n in found.rmse), "change by the fit", "noise", "unit"]
+    header = ["output", "experiment", "role", *(NAMES[n] for n in sets), "change by the fit", "noise", "unit"]
     return table(header, rows, words=(0, 1, 2, len(header) - 1))
 
 
-def _windows(results: Results) -> str:
+def _windows(results: Results, found: Answers) -> str:
     """Largest, mean and mean absolute error before, during and after the event, beside the profile's limits."""
-    found = results.get("fit").get("windowed_errors") or results.get("simulation").get("windowed_errors") or {}
-    profile, units = found.get("profile") or {}, results.units
+    judged = found.judged
+    profile, units = found.profile, results.units
     over: list[list[str]] = []
     rows: list[list[str]] = []
     unjudged: list[list[str]] = []
     why: list[str] = []
-    for output, line in (found.get("errors") or {}).items():
-        for name, about in line.items():
-            if about.get("event") is None:
-                continue
-            for window in ("before", "during", "after"):
-                w = about[window]
-                span = f"{number(w['from'], 3)} … {number(w['to'], 3)}" if w["n"] else "–"
-                errors = [_error(w, kind) for kind in ("max", "mean", "mean_absolute")]
-                row = [text(output), text(name), window, span, *errors, text(units.get(output, ""))]
-                {True: rows, False: over, None: unjudged}[w.get("within")].append(row)
-                if w.get("within") is None:
-                    why.append(f"{output}: {about.get('reason') or 'no row in this window'}")
+    ends = set()
+    for (output, name), signal in found.signals(judged.name).items() if judged is not None else ():
+        about = signal["windows"]
+        ends.add(about.get("end_from"))
+        if about.get("event") is None:
+            continue
+        for window in ("before", "during", "after"):
+            w = about[window]
+            span = f"{number(w['from'], 3)} … {number(w['to'], 3)}" if w["n"] else "–"
+            errors = [_error(w, kind) for kind in ("max", "mean", "mean_absolute")]
+            row = [text(output), text(name), window, span, *errors, text(units.get(output, ""))]
+            {True: rows, False: over, None: unjudged}[w.get("within")].append(row)
+            if w.get("within") is None:
+                why.append(f"{output}: {about.get('reason') or 'no row in this window'}")
     if not rows and not over and not unjudged:
         return ""
-    end = {a.get("end_from") for line in found["errors"].values() for a in line.values()}
-    steps = " A step counts as over where its record has settled." if "settling" in end else ""
+    steps = " A step counts as over where its record has settled." if "settling" in ends else ""
     told = (
         f"<p class='small'>Model less record. Profile <strong>{text(profile.get('name', ''))}</strong>, version "
         f"{text(profile.get('version', ''))}: {text(profile.get('title', ''))}; {text(profile.get('source', ''))}. "

@@ -27,7 +27,6 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     from hvdc_ident.model import Model
     from hvdc_ident.study.augmented import compared
     from hvdc_ident.study.pipeline import executor_of
-    from hvdc_ident.study.schema import DiagnoseTable
     from hvdc_ident.study.size_curves import size_curves
 
     _need(study)
@@ -44,8 +43,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             return StageResult({"status": "failed", "message": str(e)}, failed=str(e))
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
     beside, curves = compared(study, found, gate(report, diagnosis=True).fitted)
-    tolerances = (study.settings.diagnose or DiagnoseTable()).tolerances
-    data = {**found.to_dict(), "sizes": sizes, "tolerance": tolerances, **beside}
+    data = {**found.to_dict(), "sizes": sizes, **beside}
     return StageResult(data, {**found.files, **curves})
 
 

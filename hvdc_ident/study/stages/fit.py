@@ -38,7 +38,8 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         return StageResult(data, failed=result.message)
     through = fitting.with_settings(study, gated(problem, gate(report, options.force)))
     curves = fitting.curves_of(through, result)
-    data["windowed_errors"] = fitting.errors_in_windows(study, curves)
+    sets = {"given": fitting.curves_at_given(study), "fitted": curves}
+    data["judgement"] = fitting.judgement_of(study, sets, result)
     data["derived"] = fitting.derived(study, result)
     if study.responses:
         data["responses"] = compared(study, {"given": study.given, "fitted": result.values})

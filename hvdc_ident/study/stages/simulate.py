@@ -64,7 +64,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             for e in study.experiments
         },
         "noise": {e: {o: asdict(n) for o, n in notes.items()} for e, notes in study.noise.items()},
-        "windowed_errors": fitting.errors_in_windows(study, curves),
+        "judgement": fitting.judgement_of(study, {"given": curves}),
     }
     return StageResult(data, files, failed=_failures({n: status[n]["reason"] for n in failed}))
 

@@ -1,4 +1,4 @@
-"""Errors before, during and after an event, and the profiles they are held against."""
+"""Whether a model follows its records: by the noise, a tolerance, and the windows of a profile."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ import pytest
 
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError, UnknownNameError
-from hvdc_ident.fit import windowed_errors as windowed_module
+from hvdc_ident.fit import tolerance_profile
 from hvdc_ident.fit.assessment import Curve
-from hvdc_ident.fit.windowed_errors import event_end, shipped, tolerance, windowed_errors
+from hvdc_ident.fit.judgement import event_end, judge
+from hvdc_ident.fit.tolerance_profile import shipped, tolerance
 from tests.fit.simulators import recorded
 
 T = np.round(np.arange(0, 4.0001, 0.01), 9)
@@ -30,8 +31,8 @@ def pulse(error, unit="pu", signal=None, event=1.0):
     u = signal or InputSignal.corners([(1.0, 0.0), (1.0, 1.0), (2.0, 1.0), (2.0, 0.0)])
     y = u(T)
     e = recorded("e", T, rest={"inputs": {"u": u}, "event": event}, y=y)
-    found = windowed_errors({"e": {"y": curve(y + error, y)}}, (e,), PROFILE, {"y": unit})
-    return found["errors"]["y"]["e"]
+    found = judge({"e": {"y": curve(y + error, y)}}, (e,), {"y": unit}, PROFILE)
+    return found.signals["y"]["e"].windows
 
 
 def test_the_shipped_limits_are_those_that_were_published():
@@ -84,13 +85,17 @@ def test_what_is_not_judged_is_not_passed():
         "dumb": curve(y, y, np.arange(96, 102)),
     }
     units = {"P": "MW", "valve": "p.u.", "spare": "pu", "dumb": "pu"}
-    found = windowed_errors({"e": curves}, (e,), PROFILE, units)
-    lines = {o: line["e"] for o, line in found["errors"].items()}
+    found = judge({"e": curves}, (e,), units, PROFILE, named=True)
+    lines = {o: line["e"].windows for o, line in found.signals.items()}
     assert {o: a["within"] for o, a in lines.items()} == {"P": None, "valve": True, "spare": False, "dumb": None}
     assert lines["P"]["reason"] == "the limits are in pu, the output is in MW"
     assert lines["dumb"]["reason"] == "no row in any window" and lines["valve"]["reason"] == ""
-    assert found["signals"] == {"passed": 1, "failed": 1, "not_judged": 2}
-    assert found["windows"] == {"passed": 3, "failed": 3, "not_judged": 6}
+    assert found.count("windows") == {"passed": 1, "failed": 1, "not_judged": 2}
+    assert (found.by, found.follows) == ("windows", False)
+    kept = judge({"e": {n: curves[n] for n in ("P", "valve")}}, (e,), units, PROFILE, named=True)
+    assert (kept.by, kept.follows) == ("windows", None)
+    alone = judge({"e": {"P": curves["P"]}}, (e,), units, PROFILE, named=True)
+    assert alone.by == "noise"  # the profile judges nothing here
 
 
 def test_a_step_is_over_where_the_reference_has_settled():
@@ -116,8 +121,8 @@ def test_rows_that_are_not_compared_are_not_counted():
     e = recorded("e", T, rest={"inputs": {"u": u}, "event": 1.0}, y=y)
     error = np.where(T < 0.5, 5.0, 0.0)
     rows = np.flatnonzero(T >= 0.5)
-    found = windowed_errors({"e": {"y": curve(y + error, y, rows)}}, (e,), PROFILE, {"y": "pu"})
-    assert found["errors"]["y"]["e"]["before"]["max"] == 0.0
+    found = judge({"e": {"y": curve(y + error, y, rows)}}, (e,), {"y": "pu"}, PROFILE)
+    assert found.signals["y"]["e"].windows["before"]["max"] == 0.0
 
 
 def test_a_profile_of_ones_own_is_a_file(tmp_path):
@@ -151,5 +156,43 @@ def test_a_profile_that_is_wrong_is_refused(tmp_path, old, new, message):
 
 def test_nobody_is_told_to_comply():
     texts = [f.read_text(encoding="utf-8") for f in (files("hvdc_ident.fit") / "tolerances").iterdir()]
-    texts.append(Path(windowed_module.__file__).read_text(encoding="utf-8"))
+    texts.append(Path(tolerance_profile.__file__).read_text(encoding="utf-8"))
     assert texts and not any(re.search("complian|comply", t, re.IGNORECASE) for t in texts)
+
+
+def noisy(sigma, seed=0, n=T.size):
+    return sigma * np.random.default_rng(seed).standard_normal(n)
+
+
+def on_noise(error, stated):
+    """Whether a straight record that the model misses by an error is followed to the noise stated, if any."""
+    y = 1.0 + 0.1 * T
+    e = recorded("e", T, None if stated is None else {"y": stated}, y=y + error)
+    sigma = np.nan if stated is None else stated
+    run = Curve(y, y + error, np.arange(T.size), sigma, None, None)
+    return judge({"e": {"y": run}}, (e,), {"y": "pu"}, PROFILE)
+
+
+def test_the_noise_judges_each_signal():
+    assert on_noise(noisy(0.01), 0.01).follows is True
+    assert on_noise(noisy(0.01) + 0.02, 0.01).follows is False
+    assert on_noise(noisy(0.03), 0.01).follows is False
+    found = on_noise(noisy(0.01) + 0.02, 0.01).signals["y"]["e"]
+    assert (found.noise, found.rmse) == (0.01, pytest.approx(np.hypot(0.01, 0.02), rel=0.05))
+    assert found.peak == pytest.approx(np.abs(noisy(0.01) + 0.02).max())
+    unstated = on_noise(noisy(0.01), None)
+    assert unstated.follows is True and unstated.signals["y"]["e"].noise == pytest.approx(0.01, rel=0.2)
+    assert on_noise(noisy(0.01) + 0.03, None).follows is False
+    assert on_noise(0.01 * np.sin(T), None).follows is None  # rows that show no noise
+
+
+def test_a_tolerance_that_a_study_states_is_what_judges():
+    y = 1.0 + 0.1 * T
+    e = recorded("e", T, {"y": 0.01, "z": 0.01}, y=y, z=y)
+    curves = {"e": {n: Curve(y, y + noisy(0.05), np.arange(T.size), 0.01, None, None) for n in ("y", "z")}}
+    units = {"y": "pu", "z": "pu"}
+    assert judge(curves, (e,), units, PROFILE).follows is False
+    kept = judge(curves, (e,), units, PROFILE, tolerance={"y": 0.1}, named=True)
+    assert (kept.by, kept.follows) == ("tolerance", None)  # z has none
+    assert judge(curves, (e,), units, PROFILE, tolerance={"y": 0.1, "z": 0.1}).follows is True
+    assert judge(curves, (e,), units, PROFILE, tolerance={"y": 0.1, "z": 0.01}).follows is False

@@ -1,0 +1,195 @@
+"""The judgement of whether a model follows its recordings: against their noise, the study's tolerance and the windows of a profile.
+
+It is made once for a set of values, by signal (an output of an experiment), and every page reads it. The error is model - record.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.data import Array, Experiment
+from hvdc_ident.data.units import same_unit
+from hvdc_ident.fit.adequacy import ResidualSize, sizes_of_runs
+from hvdc_ident.fit.assessment import Curve
+from hvdc_ident.fit.tolerance_profile import WINDOWS, ToleranceProfile
+from hvdc_ident.immutable import FrozenMap
+
+Span = tuple[float, float]
+Yardstick = Literal["noise", "tolerance", "windows"]
+"""What the error of a signal is held against."""
+
+
+@dataclass(frozen=True)
+class SignalJudgement:
+    """One output of one experiment. rmse, peak: root mean square and largest modulus of the error, in the output's unit.
+
+    noise: its standard deviation, in the unit; None where none is known. tolerance: of the RMSE, in the unit; None without one.
+    windows: the errors in the windows, see `_errors`. follows: by what the error is held against, None where it is not judged.
+    """
+
+    rmse: float
+    peak: float
+    noise: float | None
+    tolerance: float | None
+    windows: Mapping[str, Any]
+    follows: FrozenMap[bool | None]
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Whether the model follows its recordings with one set of values.
+
+    by: what the verdict is held against: the study's tolerance where it states one, else the windows of a profile that it names,
+    else the noise. signals: by output and experiment, of those that were compared.
+    """
+
+    by: Yardstick
+    signals: FrozenMap[FrozenMap[SignalJudgement]]
+
+    @property
+    def follows(self) -> bool | None:
+        """The verdict: False where a signal fails, None where one is not judged and no other fails, or where there is none."""
+        count = self.count(self.by)
+        return False if count["failed"] else None if count["not_judged"] or not count["passed"] else True
+
+    def count(self, by: Yardstick) -> dict[str, int]:
+        """Return how many signals passed, failed and were not judged."""
+        each = [s.follows[by] for line in self.signals.values() for s in line.values()]
+        return {"passed": each.count(True), "failed": each.count(False), "not_judged": each.count(None)}
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the verdict, the counts by what the errors are held against, and the signals, as JSON takes it."""
+        signals = {
+            o: {e: vars(s) | {"follows": dict(s.follows)} for e, s in line.items()} for o, line in self.signals.items()
+        }
+        counts = {by: self.count(by) for by in ("noise", "tolerance", "windows")}
+        return {"by": self.by, "follows": self.follows, "counts": counts, "signals": signals}
+
+
+def judge(
+    curves: Mapping[str, Mapping[str, Curve]],
+    experiments: Sequence[Experiment],
+    units: Mapping[str, str],
+    profile: ToleranceProfile,
+    *,
+    tolerance: Mapping[str, float] | None = None,
+    named: bool = False,
+    sizes: Mapping[str, Mapping[str, ResidualSize]] | None = None,
+) -> Judgement:
+    """Return the judgement of the model's runs beside their records.
+
+    curves: by experiment and output. units: of the outputs. tolerance: of the RMSE by output, in its unit. named: whether the study
+    itself names the profile. sizes: by output and experiment, the size of the residuals where a fit has told it; else it is told by
+    the same rule.
+    """
+    by_name = {e.name: e for e in experiments}
+    known = sizes_of_runs(curves, experiments)
+    signals: dict[str, dict[str, SignalJudgement]] = {}
+    for name, line in curves.items():
+        for output, curve in line.items():
+            size = (sizes or {}).get(output, {}).get(name) or known[output][name]
+            windows = _errors(by_name[name], curve, profile, units.get(output, ""))
+            signals.setdefault(output, {})[name] = _signal(curve, size, (tolerance or {}).get(output), windows)
+    each = [s for line in signals.values() for s in line.values()]
+    by: Yardstick = "noise"
+    if any(s.tolerance is not None for s in each):
+        by = "tolerance"
+    elif named and not tolerance and any(s.follows["windows"] is not None for s in each):
+        by = "windows"
+    return Judgement(by, FrozenMap({o: FrozenMap(line) for o, line in signals.items()}))
+
+
+def _signal(curve: Curve, size: ResidualSize, tolerance: float | None, windows: Mapping[str, Any]) -> SignalJudgement:
+    rmse = float(np.sqrt(np.mean(curve.misfit**2)))
+    follows = FrozenMap(
+        {
+            "noise": size.follows,
+            "tolerance": None if tolerance is None else rmse <= tolerance,
+            "windows": windows["within"],
+        }
+    )
+    return SignalJudgement(rmse, float(np.abs(curve.misfit).max()), size.noise, tolerance, windows, follows)
+
+
+def _errors(e: Experiment, curve: Curve, profile: ToleranceProfile, unit: str) -> dict[str, Any]:
+    """Return the errors of a signal within the windows of a profile.
+
+    event, end (s; the instant the event is over), end_from ("inputs" or "settling"), and for each window `from`, `to` (s), n, max,
+    mean, mean_absolute (in the output's unit), limits and within (None where there is no limit for the unit, or no row in the
+    window). within: of the signal, whether it keeps its limits in every window that is judged; None where none is, with the reason.
+    """
+    if e.event is None:
+        return {"event": None, "within": None, "reason": "no event: no input moves and none is given"}
+    end, source = event_end(e, curve.measured, profile.windows["settling"])
+    spans = windows(e, end, profile)
+    rows = np.zeros(e.time.size, dtype=bool)
+    rows[curve.rows] = True
+    limited = same_unit(unit, profile.unit)
+    found = {w: _window(e.time, spans[w], rows, curve, profile.limits[w] if limited else None) for w in WINDOWS}
+    judged = [w["within"] for w in found.values() if w["within"] is not None]
+    reason = f"the limits are in {profile.unit}, the output is {f'in {unit}' if unit else 'without a unit'}"
+    reason = "" if judged else "no row in any window" if limited else reason
+    within = all(judged) if judged else None
+    return {"event": e.event, "end": end, "end_from": source, "within": within, "reason": reason, **found}
+
+
+def _window(
+    time: Array, span: Span, rows: NDArray[np.bool_], curve: Curve, limits: Mapping[str, float] | None
+) -> dict[str, Any]:
+    inside = rows & (time >= span[0]) & (time <= span[1])
+    n = int(inside.sum())
+    line: dict[str, Any] = {"from": span[0], "to": span[1], "n": n, "limits": dict(limits) if limits else None}
+    if n == 0:
+        return {**line, "max": None, "mean": None, "mean_absolute": None, "within": None}
+    error = curve.model[inside] - curve.measured[inside]
+    kinds = {
+        "max": float(np.abs(error).max()),
+        "mean": float(error.mean()),
+        "mean_absolute": float(np.abs(error).mean()),
+    }
+    within = all(abs(kinds[k]) <= v for k, v in limits.items()) if limits else None
+    return {**line, **kinds, "within": within}
+
+
+def windows(e: Experiment, end: float, profile: ToleranceProfile) -> dict[str, Span]:
+    """Return from and to, in s, of each window around an event that is over at `end`; one that is empty ends before it begins."""
+    assert e.event is not None
+    w = profile.windows
+    first, last = float(e.time[0]), float(e.time[-1])
+    until = e.event - w["gap_before"]
+    cleared = end + w["gap_cleared"]
+    return {
+        "before": (max(first, until - w["before"]), until),
+        "during": (e.event + w["gap_start"], end - w["gap_end"]),
+        "after": (cleared, min(last - w["gap_end"], cleared + w["after"])),
+    }
+
+
+def event_end(e: Experiment, reference: Array, settling: float) -> tuple[float, str]:
+    """Return the instant the event is over, s, and its source.
+
+    "inputs": the last change of an input, where that is later than the event (the end of a ramp, the clearing of a
+    dip). "settling": for a step, the last instant the reference is farther from its last value than the given share of
+    its whole change.
+    """
+    assert e.event is not None
+    ends = [e.event]
+    for signal in e.inputs.values():
+        moving = np.flatnonzero(np.diff(signal.values) != 0)
+        if moving.size:
+            ends.append(float(signal.times[moving[-1] + 1]))
+    over = max(t for t in ends if t <= e.time[-1]) if any(t <= e.time[-1] for t in ends) else float(e.time[-1])
+    if over > e.event:
+        return over, "inputs"
+    later = (e.time >= e.event) & np.isfinite(reference)
+    y, t = reference[later], e.time[later]
+    if y.size < 2 or np.ptp(y) == 0:
+        return e.event, "settling"
+    last = float(np.mean(y[-max(1, y.size // 50) :]))
+    out = np.flatnonzero(np.abs(y - last) > settling * float(np.ptp(y)))
+    return (float(t[min(out[-1] + 1, t.size - 1)]) if out.size else e.event), "settling"
