@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
@@ -150,6 +150,16 @@ class Model(Shown):
     def values(self) -> dict[str, float]:
         """The parameters' values by name."""
         return {name: p.value for name, p in self.parameters.items()}
+
+    @cached_property
+    def text(self) -> str:
+        """Text that differs where the equations or the values do, to the last digit."""
+        lines = [self.name, repr(self.values), repr({n: i.value for n, i in self.inputs.items()})]
+        for kind in ("states", "signals", "algebraic", "outputs", "delays", "sampled"):
+            for name, item in getattr(self, kind).items():
+                parts = [f"{f.name}={_exact(getattr(item, f.name))}" for f in fields(item)]
+                lines.append(f"{kind} {name} {' '.join(parts)}")
+        return "\n".join(lines)
 
     def with_values(self, values: Mapping[str, float]) -> Model:
         """The model with other parameter or input values; bounds of a parameter that the value leaves are an error."""
@@ -324,6 +334,10 @@ class External(Protocol):
         partial: bool = False,
     ) -> Any:
         """Return a run: a `hvdc_ident.simulate.Simulation`."""
+
+
+def _exact(value: Any) -> str:
+    return str(sp.srepr(value)) if isinstance(value, sp.Basic) else repr(value)
 
 
 AnyModel: TypeAlias = Model | External

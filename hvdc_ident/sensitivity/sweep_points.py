@@ -1,18 +1,16 @@
 """Points of a sweep (grids, lists, Latin hypercubes and their products), and the work of one of them.
 
-The work is a value that any process can be given: from the parameters' values to RMSE, poles and frequency response as bytes.
+The work is a value that any process can be given: from the parameters' values to RMSE, poles and frequency response.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
-import sympy as sp
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
@@ -26,7 +24,7 @@ from hvdc_ident.errors import (
     require_known,
 )
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import Method, simulate
 
 MOST = 10_000_000
@@ -175,9 +173,6 @@ def points_of(axes: AxesLike) -> Points:
 # --- one point: parameter values in; RMSE, poles and frequency response out ---
 
 
-DONE, FAILED = b"\x00", b"\x01"
-
-
 @dataclass(frozen=True, eq=False)
 class Reference:
     """Reference of an output of an experiment: values at the experiment's rows, (m,), in the output's unit."""
@@ -190,7 +185,8 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class PointTask:
-    """The work of a point, the same in every process: called with (k,) values it returns packed bytes.
+    """The work of a point, the same in every process: called with (k,) values it returns its numbers, (n,), or the reason
+    where there are none.
 
     values: parameters and inputs held at other than the model's values. references: what is compared, in order.
     poles: how many poles are wanted (0: none). omega, inputs, outputs: of the frequency response (empty: none).
@@ -208,24 +204,30 @@ class PointTask:
     outputs: tuple[str, ...] = ()
     method: Method = "rosenbrock"
 
-    @cached_property
-    def sizes(self) -> tuple[int, int, int]:
-        """Numbers in a packed point: RMSE, poles (two each), response (two each)."""
-        return len(self.references), 2 * self.poles, 2 * self.omega.size * len(self.outputs) * len(self.inputs)
+    @property
+    def identity(self) -> tuple[Any, ...]:
+        """What decides a point's result beside the point itself and the code."""
+        runs = tuple(e.with_(measured=None, noise={}) for e in self.experiments)
+        return (
+            self.model.text,
+            *(getattr(self, f.name) for f in fields(self) if f.name not in ("model", "experiments")),
+            runs,
+        )
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
-
-    def __call__(self, point: Array) -> bytes:
-        """Return the result of a point as packed bytes; the reason, packed, where a run fails."""
+    def __call__(self, point: Array) -> Array | str:
+        """Return the numbers of a point, see `parts`, or the reason where a run fails."""
         given = FrozenMap({**self.values, **dict(zip(self.names, map(float, point), strict=True))})
         try:
-            numbers = np.concatenate([self._errors(given), self._linear(given)])
+            numbers = np.concatenate([self._errors(given), self._linear(given).view(float)])
         except HvdcIdentError as e:
-            return FAILED + str(e).encode()
-        if not np.isfinite(numbers).all():
-            return FAILED + b"a result is not finite"
-        return DONE + numbers.astype("<f8").tobytes()
+            return str(e)
+        return numbers if np.isfinite(numbers).all() else "a result is not finite"
+
+    def parts(self, numbers: Array) -> tuple[Array, Array, Array]:
+        """Return a point's RMSE (references,), poles (modes,) in 1/s and response (frequencies, outputs, inputs) of its numbers."""
+        rmse, linear = np.split(numbers, [len(self.references)])
+        poles, response = np.split(linear.view(complex), [self.poles])
+        return rmse, poles, response.reshape(self.omega.size, len(self.outputs), len(self.inputs))
 
     def _errors(self, given: FrozenMap[float]) -> Array:
         """Return the RMSE of each reference, (references,), in the outputs' units."""
@@ -240,10 +242,10 @@ class PointTask:
                 found[i] = np.sqrt(np.mean(difference * difference))
         return found
 
-    def _linear(self, given: FrozenMap[float]) -> Array:
-        """Poles, then the response, real and imaginary parts in turn."""
+    def _linear(self, given: FrozenMap[float]) -> np.ndarray[Any, np.dtype[np.complex128]]:
+        """Return the poles, sorted, then the response; nothing where neither is wanted."""
         if not self.poles and not self.omega.size:
-            return np.empty(0)
+            return np.empty(0, dtype=complex)
         from hvdc_ident.linearize import find_operating_point, linearize
 
         at = find_operating_point(self.model, given)
@@ -260,30 +262,7 @@ class PointTask:
             parts.append(poles[np.lexsort((poles.imag, poles.real))])
         if self.omega.size:
             parts.append(np.asarray(linear.response(self.omega), dtype=complex).ravel())
-        return np.concatenate(parts).view(float)
-
-    def unpacked(self, packed: bytes) -> tuple[Array, Array, Array] | str:
-        """RMSE (references,), poles and response as complex numbers; or the reason of a failure."""
-        if packed[:1] != DONE:
-            return packed[1:].decode()
-        numbers = np.frombuffer(packed, dtype="<f8", offset=1)
-        a, b, c = self.sizes
-        response = numbers[a + b :].view(complex).reshape(self.omega.size, len(self.outputs), len(self.inputs))
-        assert numbers.size == a + b + c
-        return numbers[:a], numbers[a : a + b].view(complex), response
-
-    @cached_property
-    def fingerprint(self) -> str:
-        """A hash of all that decides a point's result but the point itself and the code."""
-        parts: list[Any] = [model_text(self.model), self.names, dict(self.values), self.method, self.poles]
-        parts += [self.inputs, self.outputs, self.omega.tobytes()]
-        for r in self.references:
-            parts += [r.experiment, r.output, r.rows.tobytes(), r.values.tobytes()]
-        for e in self.experiments:
-            parts += [e.name, e.time.tobytes(), dict(e.values), e.drive, {k: dict(v) for k, v in e.instrument.items()}]
-            for name, u in e.inputs.items():
-                parts += [name, u.times.tobytes(), u.values.tobytes(), u.breaks.tobytes()]
-        return hashlib.sha256("\n".join(map(repr, parts)).encode()).hexdigest()
+        return np.concatenate(parts)
 
 
 def simulated(model: AnyModel, experiment: Experiment, given: Any, outputs: tuple[str, ...], method: Method) -> Array:
@@ -294,22 +273,6 @@ def simulated(model: AnyModel, experiment: Experiment, given: Any, outputs: tupl
         if method != "explicit" or "stiff" not in e.what:
             raise
     return simulate(model, experiment, given, outputs=outputs, method="rosenbrock").trajectory.values
-
-
-def model_text(model: AnyModel) -> str:
-    """The model as text that differs where its equations or its values do, to the last digit."""
-    if not isinstance(model, Model):
-        return model.text
-    lines = [model.name, repr(model.values), repr({n: i.value for n, i in model.inputs.items()})]
-    for kind in ("states", "signals", "algebraic", "outputs", "delays", "sampled"):
-        for name, item in getattr(model, kind).items():
-            fields = [f"{f}={_exact(getattr(item, f))}" for f in item.__dataclass_fields__]
-            lines.append(f"{kind} {name} {' '.join(fields)}")
-    return "\n".join(lines)
-
-
-def _exact(value: Any) -> str:
-    return str(sp.srepr(value)) if isinstance(value, sp.Basic) else repr(value)
 
 
 Want = Literal["rmse", "poles", "bode"]

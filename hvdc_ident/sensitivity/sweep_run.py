@@ -1,26 +1,26 @@
 """Sweeps: a model run at many points of its parameters, compared with data, another model or itself; and the result.
 
-Points run in this process while that is quick, then in an executor; finished ones can be kept and looked up.
+Points run in an executor, which may keep what is finished, or in this process.
 """
 
 from __future__ import annotations
 
 import csv
 import io
+import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.errors import ComputationError, require_known, unknown_name
-from hvdc_ident.executor import Executor, Progress, outcomes
+from hvdc_ident.executor import Executor, Made, Outcome, Progress, outcomes
 from hvdc_ident.files import csv_cell
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
@@ -257,16 +257,8 @@ class SweepResult(Shown):
 # --- run ---
 
 
-CHUNK = 2048  # points looked up, queued or written at a time
-PROBE, WORTH = 0.3, 2.0  # s: points run here first; work left that is worth starting other processes for
+CHUNK = 2048  # points made or written at a time
 REPORTED = 0.1  # s between two reports of progress
-
-
-class Kept(Protocol):
-    """Store of finished points: bytes by key."""
-
-    def get(self, keys: Sequence[bytes], /) -> Mapping[bytes, bytes]: ...
-    def put(self, key: bytes, value: bytes, /) -> None: ...
 
 
 @dataclass
@@ -284,14 +276,15 @@ class _Table:
         size = (t.omega.size, len(t.outputs), len(t.inputs)) if t.omega.size else (0, 0, 0)
         self.response = np.full((n, *size), np.nan, dtype=complex)
 
-    def fill(self, index: int, packed: bytes) -> None:
-        found = self.task.unpacked(packed)
-        if isinstance(found, str):
-            self.failed[index] = found
+    def fill(self, outcome: Outcome) -> None:
+        """Put the outcome of a point in its row."""
+        index, found = outcome.index, outcome.value
+        if outcome.failure or isinstance(found, str):
+            self.failed[index] = outcome.failure or found
             return
-        self.rmse[index], self.poles[index] = found[0], found[1]
+        self.rmse[index], self.poles[index], response = self.task.parts(found)
         if self.task.omega.size:
-            self.response[index] = found[2]
+            self.response[index] = response
 
 
 def sweep(
@@ -304,7 +297,6 @@ def sweep(
     values: Mapping[str, float] | None = None,
     want: Sequence[Want] | Quantities = ("rmse",),
     executor: Executor | None = None,
-    kept: Callable[[str], Kept] | None = None,
     progress: Progress | None = None,
 ) -> SweepResult:
     """Return a row for each point: the RMSE of each output in each experiment, and poles or frequency response if wanted.
@@ -313,9 +305,8 @@ def sweep(
     {name: values}; parameters, or inputs that no experiment moves, in their units. against: the recordings, the run at
     the base values, or another model's run. outputs: default, the recorded ones (against data), else all the model's.
     values: of the base where they are not the model's. want: names of quantities; `Quantities` says of which frequency
-    response. executor: where points run if there is work
-    for more than a few seconds; rows and digits do not depend on it. kept: given the task's fingerprint, where points
-    are looked up and kept. A point that fails is a row with a reason and no number.
+    response. executor: where points run; rows and digits do not depend on it. A point that fails is a row with a reason and no
+    number.
 
     Raises InputError for names, values, bounds or data that do not fit, ComputationError where the reference fails.
 
@@ -330,11 +321,13 @@ def sweep(
     quantities = want if isinstance(want, Quantities) else Quantities(want)
     check(model, experiments, points, base, quantities.names)
     task = task_of(model, tuple(experiments), points.names, base, against, outputs, quantities)
-    shelf = kept(task.fingerprint) if kept else None
     table = _Table(task, points)
     counter = _Counter(progress, len(points))
-    missing = _known(table, shelf, counter)
-    _run(table, missing, shelf, executor, counter)
+    items = Made(partial(_row, points), range(len(points)))
+    found = map(Outcome, itertools.count(), map(task, items)) if executor is None else outcomes(executor, task, items)
+    for outcome in found:
+        table.fill(outcome)
+        counter.step()
     counter.close()
     known: dict[str, Any] = {**model.inputs, **model.parameters}
     return SweepResult(
@@ -355,63 +348,9 @@ def sweep(
     )
 
 
-def _known(table: _Table, shelf: Kept | None, counter: _Counter) -> NDArray[np.intp]:
-    """Return the places of the points that are not kept yet; those that are, are filled in."""
-    n = len(table.points)
-    if shelf is None:
-        return np.arange(n)
-    missing = []
-    for start in range(0, n, CHUNK):
-        keys = [row.tobytes() for row in table.points.rows(start, start + CHUNK)]
-        found = shelf.get(keys)
-        for offset, key in enumerate(keys):
-            packed = found.get(key)
-            if packed is None:
-                missing.append(start + offset)
-            else:
-                table.fill(start + offset, packed)
-    counter.done = n - len(missing)
-    return np.array(missing, dtype=np.intp)
-
-
-def _run(
-    table: _Table, missing: NDArray[np.intp], shelf: Kept | None, executor: Executor | None, counter: _Counter
-) -> None:
-    """Run every missing point: here while that is quick, in the executor where there is much left."""
-    begin, count = time.perf_counter(), 0
-    for count, (index, row) in enumerate(_rows(table.points, missing), start=1):
-        _finish(table, index, row, table.task(row), shelf, counter)
-        spent = time.perf_counter() - begin
-        if executor is not None and spent > PROBE and spent / count * (missing.size - count) > WORTH:
-            break
-    remaining = missing[count:]
-    if not remaining.size or executor is None:
-        return
-    for outcome in outcomes(executor, table.task, (row for _, row in _rows(table.points, remaining))):
-        index = int(remaining[outcome.index])
-        row = table.points.rows(index, index + 1)[0]
-        if outcome.failure:
-            table.failed[index] = outcome.failure
-            counter.step()
-        else:
-            _finish(table, index, row, outcome.value, shelf, counter)
-
-
-def _finish(table: _Table, index: int, row: Array, packed: bytes, shelf: Kept | None, counter: _Counter) -> None:
-    table.fill(index, packed)
-    if shelf is not None:
-        shelf.put(row.tobytes(), packed)
-    counter.step()
-
-
-def _rows(points: Points, indices: NDArray[np.intp]) -> Iterator[tuple[int, Array]]:
-    """Yield (place, values) of each point, made a chunk at a time."""
-    for start in range(0, indices.size, CHUNK):
-        chosen = indices[start : start + CHUNK]
-        first = int(chosen[0])
-        block = points.rows(first, int(chosen[-1]) + 1) if chosen[-1] - first < 4 * CHUNK else None
-        for index in map(int, chosen):
-            yield index, block[index - first] if block is not None else points.rows(index, index + 1)[0]
+def _row(points: Points, index: int) -> Array:
+    """Return the values of a point, (k,)."""
+    return points.rows(index, index + 1)[0]
 
 
 class _Counter:

@@ -13,6 +13,7 @@ import base64
 import contextlib
 import dataclasses
 import importlib
+import itertools
 import json
 import math
 import os
@@ -34,6 +35,8 @@ from hvdc_ident.immutable import FrozenMap
 
 FOLDER, FILE = ".store", "results.sqlite"
 MOST_KEYS = 500  # of one query
+CHUNK = 4096
+"""Items that are looked up, and given to a pool, at a time."""
 SCHEMA = 1
 PRAGMAS = (
     "page_size = 1024",  # what a small piece writes to the log
@@ -189,46 +192,57 @@ class Job:
 
 
 class CachingExecutor:
-    """The `map` of a pool, or of this process where there is none, whose results are kept in a job and not computed again.
+    """The `map` and `run` of a pool, or of this process where there is none, whose results are kept and not computed again.
 
     A stage does the same work in the same order whenever it is given the same study, seed and software, whatever executor
-    it has. So the place of an item in that order, with a digest of the item itself where it has one, is its key.
+    it has. So the place of an item in that order, with a digest of the item itself where it has one, is its key. by_item: the key is
+    the digest of the item and of the function's `identity`, a value that decides its results, whatever else is done; so work goes on
+    where the study asks for more of the same.
     """
 
-    def __init__(self, job: Job, pool: TolerantExecutor | None = None) -> None:
-        self._job, self._pool, self._calls = job, pool, 0
+    def __init__(self, job: Job, pool: TolerantExecutor | None = None, *, by_item: bool = False) -> None:
+        self._job, self._pool, self._calls, self._by_item = job, pool, 0, by_item
 
     def map(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Any]:
         """Return the function's results in the items' order, those of an earlier run not computed again.
 
         Raises ComputationError where an item has no result in the pool; in this process, what the function raises.
         """
+        return in_order(self.run(function, items))
+
+    def run(self, function: Callable[[Any], Any], items: Iterable[Any], /) -> Iterator[Outcome]:
+        """Yield the outcome of each item, as they come. Raises, in this process, what the function raises."""
         self._calls += 1
-        return self._results(self._calls, function, list(items))
+        key_of = self._keys(function)
+        source, begun = iter(items), 0
+        while chunk := list(itertools.islice(source, CHUNK)):
+            keys = [key_of(begun + index, item) for index, item in enumerate(chunk)]
+            for outcome in self._outcomes(function, chunk, keys):
+                yield replace(outcome, index=begun + outcome.index)
+            begun += len(chunk)
 
-    def _results(self, call: int, function: Callable[[Any], Any], items: list[Any]) -> Iterator[Any]:
-        keys = [f"{call}/{index}/{_item_digest(item)}".encode() for index, item in enumerate(items)]
+    def _keys(self, function: Callable[[Any], Any]) -> Callable[[int, Any], bytes]:
+        """Return the function that gives an item its key, by its place and content."""
+        if self._by_item:
+            work = _short_digest(function.identity)  # type: ignore[attr-defined]
+            return lambda index, item: f"{work}/{_short_digest(item)}".encode()
+        call = self._calls
+        return lambda index, item: f"{call}/{index}/{_item_digest(item)}".encode()
+
+    def _outcomes(self, function: Callable[[Any], Any], items: list[Any], keys: list[bytes]) -> Iterator[Outcome]:
         stored = self._job.get(keys)
-        known = {index: unpacked(stored[key]) for index, key in enumerate(keys) if key in stored}
-        missing = [index for index in range(len(items)) if index not in known]
-
-        def outcomes() -> Iterator[Outcome]:
-            assert self._pool is not None
-            yield from (Outcome(index, value) for index, value in known.items())
-            for outcome in self._pool.run(function, [items[index] for index in missing]):
-                index = missing[outcome.index]
-                if not outcome.failure:
-                    self._put(keys[index], outcome.value)
-                yield replace(outcome, index=index)
-
+        yield from (Outcome(index, unpacked(stored[key])) for index, key in enumerate(keys) if key in stored)
+        missing = [index for index, key in enumerate(keys) if key not in stored]
+        todo = [items[index] for index in missing]
         if self._pool is not None and len(missing) > 1:
-            yield from in_order(outcomes())
-            return
-        for index, item in enumerate(items):
-            if index not in known:
-                known[index] = function(item)
-                self._put(keys[index], known[index])
-            yield known.pop(index)
+            found = self._pool.run(function, todo)
+        else:
+            found = (Outcome(k, function(item)) for k, item in enumerate(todo))
+        for outcome in found:
+            index = missing[outcome.index]
+            if not outcome.failure:
+                self._put(keys[index], outcome.value)
+            yield replace(outcome, index=index)
 
     def _put(self, key: bytes, value: Any) -> None:
         try:
@@ -241,9 +255,14 @@ class CachingExecutor:
 def _item_digest(item: Any) -> str:
     """Return a digest of an item, so that a result is never taken for another's; empty where it has no text form."""
     try:
-        return digest(_text(item, _array_digest))[:16]
+        return _short_digest(item)
     except TypeError:
         return ""
+
+
+def _short_digest(value: Any) -> str:
+    """Return a digest of 64 bits. Raises TypeError where the value has no text form."""
+    return digest(_text(value, _array_digest))[:16]
 
 
 @cache

@@ -25,8 +25,6 @@ sys.path.insert(0, str(Path(__file__).parent))
 import cases
 import forks
 
-from hvdc_ident.sensitivity import sweep_run
-
 STAGES = ("sweep", "identify", "diagnose")
 
 
@@ -44,8 +42,6 @@ class Tally:
 
 def killed(stage: str, folder: Path, kills: int, seed: int, workers: int) -> Tally:
     """The tally of so many kills of a stage, in a folder of its own. Raises AssertionError where a run fails by itself."""
-    if workers > 1:
-        sweep_run.PROBE = sweep_run.WORTH = -1.0
     path = cases.write_study(folder, points=3000, hidden=0.02 if stage == "diagnose" else 0.0)
     options = ("--workers", workers)
     forks.run(stage, path, "--out", folder / "whole", *options)  # everything is compiled here
@@ -63,7 +59,7 @@ def killed(stage: str, folder: Path, kills: int, seed: int, workers: int) -> Tal
             tally.kills += 1
             continue
         assert code == 0, said
-        _compare(stage, folder, tally, exact=not pool)  # the first point of a run never goes to the pool
+        _compare(stage, folder, tally, exact=not pool)  # a single point that is left does not go to the pool
     return tally
 
 

@@ -34,9 +34,7 @@ def fingerprint(folder, stage) -> str:
 
 
 @pytest.mark.filterwarnings("ignore")  # distributed's own, of its sockets
-def test_one_two_and_dask_workers_agree(tmp_path, cluster, monkeypatch):
-    for limit in ("PROBE", "WORTH"):  # a sweep uses its pool however short it is
-        monkeypatch.setattr(f"hvdc_ident.sensitivity.sweep_run.{limit}", -1.0)
+def test_one_two_and_dask_workers_agree(tmp_path, cluster):
     path = cases.write_study(tmp_path, points=30)
     ways = {"one": (), "two": ("--workers", 2), "dask": ("--executor", cluster)}
     for stage in ("sweep", "fit"):  # fit begins with identify

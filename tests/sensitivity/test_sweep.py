@@ -16,6 +16,7 @@ from hvdc_ident.files import Rows, csv_cell, csv_name, json_text
 from hvdc_ident.model import parse_card
 from hvdc_ident.models import load_model
 from hvdc_ident.sensitivity import Quantities, grid, latin_hypercube, listed, sweep
+from hvdc_ident.study.store import CachingExecutor
 from tests.effort import calls
 
 CARD = """
@@ -105,42 +106,44 @@ class Backwards:
             )
 
 
-def test_rows_stand_where_their_points_stand(monkeypatch):
-    monkeypatch.setattr("hvdc_ident.sensitivity.sweep_run.PROBE", -1.0)
-    monkeypatch.setattr("hvdc_ident.sensitivity.sweep_run.WORTH", -1.0)
+def test_rows_stand_where_their_points_stand():
     axis = latin_hypercube({"k": (1, 9), "g": (1, 2)}, 30, seed=1)
     plain = sweep(MODEL, [RECORDED], axis)
     found = sweep(MODEL, [RECORDED], axis, executor=Backwards())
     failed = list(found.failed)
-    assert failed == list(range(1, 30, 7)) and set(found.failed.values()) == {"its worker was ended by SIGSEGV"}
+    assert failed == list(range(0, 30, 7)) and set(found.failed.values()) == {"its worker was ended by SIGSEGV"}
     kept = [i for i in range(30) if i not in failed]
     assert np.array_equal(found.rmse[kept], plain.rmse[kept])
 
 
-class Shelf:
-    def __init__(self):
-        self.items, self.puts = {}, 0
-
+class Shelf(dict):
     def get(self, keys):
-        return {k: self.items[k] for k in keys if k in self.items}
+        return {k: self[k] for k in keys if k in self}
 
     def put(self, key, value):
-        self.items[key], self.puts = value, self.puts + 1
+        assert key not in self  # nothing is computed twice
+        self[key] = value
 
 
 def test_what_is_kept_is_not_run_again_and_what_differs_is_elsewhere():
-    shelves = {}
+    shelf = Shelf()
 
-    def kept(name):
-        return shelves.setdefault(name, Shelf())
+    def kept(model, record, points, **more):
+        return sweep(model, [record], grid("k", 0, 4, points), executor=CachingExecutor(shelf, by_item=True), **more)
 
-    first = sweep(MODEL, [RECORDED], grid("k", 0, 4, 5), kept=kept)
-    again = sweep(MODEL, [RECORDED], grid("k", 0, 4, 9), kept=kept)
-    (shelf,) = shelves.values()
-    assert shelf.puts == 9 and again.to_csv().splitlines()[1] == first.to_csv().splitlines()[1]
-    sweep(MODEL.with_values({"g": 1.5}), [RECORDED], grid("k", 0, 4, 5), kept=kept)
-    sweep(MODEL, [RECORDED.with_(window=(0, 0.5))], grid("k", 0, 4, 5), kept=kept)
-    assert len(shelves) == 3
+    first = kept(MODEL, RECORDED, 5)
+    again = kept(MODEL, RECORDED, 9)
+    assert len(shelf) == 9 and again.to_csv().splitlines()[1] == first.to_csv().splitlines()[1]
+    assert np.array_equal(kept(MODEL, RECORDED, 9).rmse, again.rmse, equal_nan=True) and len(shelf) == 9
+    assert again.failed and kept(MODEL, RECORDED, 9).failed == again.failed  # the reasons are kept as well
+    kept(MODEL.with_values({"g": 1.5}), RECORDED, 5)
+    kept(MODEL, RECORDED.with_(window=(0, 0.5)), 5)
+    kept(MODEL, RECORDED, 5, values={"w": 2.0})
+    both = kept(MODEL, RECORDED, 5, want=("rmse", "poles", "bode"))
+    assert len(shelf) == 9 + 4 * 5
+    back = kept(MODEL, RECORDED, 5, want=("rmse", "poles", "bode"))
+    assert np.array_equal(back.response, both.response, equal_nan=True)
+    assert np.array_equal(back.poles, both.poles, equal_nan=True)
 
 
 def test_text_that_a_spreadsheet_would_calculate_is_quoted():

@@ -22,7 +22,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     from hvdc_ident.sensitivity import sweep
     from hvdc_ident.study.checks import need_experiments
     from hvdc_ident.study.pipeline import workers_of
-    from hvdc_ident.study.store import Store
+    from hvdc_ident.study.store import CachingExecutor, Store
 
     tables = study.settings.sweep
     if not tables:
@@ -42,8 +42,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             against=study.against or ("base" if sweep_reference(tables) == "base" else "data"),
             values=study.given,
             want=sweep_quantities(study, want),
-            executor=pool,
-            kept=(lambda fingerprint: store.job("sweep", fingerprint)) if store is not None else None,
+            executor=pool if store is None else CachingExecutor(store.job("sweep"), pool, by_item=True),
             progress=options.progress,
         )
     data = {**result.summary(), "points": Rows(result.rows, len(result))}
