@@ -198,7 +198,7 @@ def _assembled(
         shares=whole.information.shares(),
         heterogeneity=tests,
         misspecification=misspecification(last, tests, assessment.units) if last else Misspecification(False, ()),
-        recommended=_recommended(assessment, whole),
+        recommended=_recommended(assessment, whole, misfit=first.adequacy.systematic),
         thresholds=FrozenMap(assessment.thresholds),
         pilot={
             "status": result.status,
@@ -306,12 +306,12 @@ def _resampled(assessment: Assessment, last: LocalAnalysis | None, executor: Exe
         return None
 
 
-def _recommended(assessment: Assessment, whole: LocalAnalysis) -> Recommendation | None:
-    """Return what to measure next, where there is an input to move."""
+def _recommended(assessment: Assessment, whole: LocalAnalysis, *, misfit: bool) -> Recommendation | None:
+    """Return what to measure next, where there is an input to move. misfit: whether more than a known noise is left."""
     assessment.report_stage("what to measure next")
     inputs = inputs_of(assessment.problem.simulator, assessment.problem.fitted_experiments)
     try:
-        return recommend(whole, inputs, assessment.units, thresholds=assessment.thresholds)
+        return recommend(whole, inputs, assessment.units, thresholds=assessment.thresholds, misfit=misfit)
     except SimulationError as error:
         assessment.notes.append(f"What to measure next cannot be told: {error.what}.")
         return None

@@ -246,7 +246,8 @@ class Recommendation:
     information without either. half_widths_now, half_widths: of the 95 % intervals by parameter, in its unit, to first
     order, at the values found or held, only as good as the noise assumed; None where it stays open. values: the
     parameters' values there. others: the best of each other kind and input, best first. tried: how many. failed: those
-    that cannot be simulated, with the reason. text: the advice in words.
+    that cannot be simulated, with the reason. text: the advice in words. misfit: whether the model leaves more than a known noise:
+    the half-widths then hold only if nothing else is missing, and no interval of 95 % is predicted.
     """
 
     best: RankedDesign
@@ -259,6 +260,7 @@ class Recommendation:
     tried: int
     failed: tuple[str, ...]
     text: str
+    misfit: bool = False
 
     @property
     def input(self) -> str:
@@ -269,7 +271,8 @@ class Recommendation:
         """The recommendation as JSON takes it."""
         first = self.best.design.moves[0]
         intervals = {
-            n: None if h is None else [self.values[n] - h, self.values[n] + h] for n, h in self.half_widths.items()
+            n: None if h is None or self.misfit else [self.values[n] - h, self.values[n] + h]
+            for n, h in self.half_widths.items()
         }
         return {
             "input": first.input,
@@ -301,14 +304,19 @@ class Recommendation:
 
 
 def recommend(
-    whole: LocalAnalysis, inputs: Mapping[str, Input], units: Mapping[str, str], *, thresholds: Mapping[str, float]
+    whole: LocalAnalysis,
+    inputs: Mapping[str, Input],
+    units: Mapping[str, str],
+    *,
+    thresholds: Mapping[str, float],
+    misfit: bool = False,
 ) -> Recommendation | None:
     """Return the best of the experiments that could be made; None where there is no input to move, or none can be run.
 
     Tried are, for every input, steps at three levels, a ramp and a multisine; and the best steps followed by a step of
     every other input; each with the signals recorded so far, and with one more. whole: all candidates free, at the
     values of the optimum. inputs: the model's. units: of the parameters. thresholds: the rise of the cost at the ends of
-    a parameter's interval, which widens the predicted intervals too.
+    a parameter's interval, which widens the predicted intervals too. misfit: whether the model leaves more than a known noise.
     """
     recordings = in_time(whole.problem.fitted_experiments)
     if not recordings:
@@ -334,12 +342,14 @@ def recommend(
     per_std = whole.slope[: len(whole.names)] * np.sqrt([2.0 * thresholds.get(n, usual) for n in whole.names])
     now, then = (half_widths(m, per_std, whole.names, whole.error) for m in (base, base + best.gain))
     at = FrozenMap({n: whole.value(n) for n in whole.names})
-    text = _text(best, by_determinant, now, then, {**units, **of_inputs}, len(ranked))
+    text = _text(best, by_determinant, now, then, {**units, **of_inputs}, len(ranked), misfit=misfit)
     if whole.deterministic:
         text += " The misfit stands for the noise in these intervals."
     others = tuple(_others(ranked, best))
     count = len({r.design for r in ranked})
-    return Recommendation(best, by_determinant, tried.now, now, then, at, others, count, tuple(tried.failed), text)
+    return Recommendation(
+        best, by_determinant, tried.now, now, then, at, others, count, tuple(tried.failed), text, misfit
+    )
 
 
 class _Ranking:
@@ -450,6 +460,8 @@ def _text(
     then: Mapping[str, float | None],
     units: Mapping[str, str],
     tried: int,
+    *,
+    misfit: bool,
 ) -> str:
     """Return the advice, what it would give for the parameters that gain most, and what stays open all the same."""
 
@@ -463,10 +475,8 @@ def _text(
 
     def gain(name: str) -> str:
         before = "none" if now[name] is None else f"±{now[name]:.3g}"
-        return (
-            f"{name} would get a 95 % confidence interval of ±{then[name]:.3g} {units.get(name, '')}".rstrip()
-            + f" (now {before})"
-        )
+        would = "be known to" if misfit else "get a 95 % confidence interval of"
+        return f"{name} would {would} ±{then[name]:.3g} {units.get(name, '')}".rstrip() + f" (now {before})"
 
     gains = sorted((n for n in then if ratio(n) < WORTH), key=ratio)
     if not gains:
@@ -474,7 +484,8 @@ def _text(
             f"None of the {tried} experiments tried (steps, ramps, multisines and pairs of steps) would narrow an interval "
             f"by a tenth; the most would come from: {instruction(best)}."
         )
-    text = f"{instruction(best)}: {', '.join(map(gain, gains[:NAMED]))}."
+    condition = "if nothing else is missing, " if misfit else ""
+    text = f"{instruction(best)}: {condition}{', '.join(map(gain, gains[:NAMED]))}."
     if best.new:
         text += f" That takes the noise of {listed(best.new)} to be like that of the signals recorded."
     still_open = [n for n, half in then.items() if half is None]

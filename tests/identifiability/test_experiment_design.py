@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hvdc_ident.data import InputSignal
+from hvdc_ident.data import InputSignal, trajectory
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.identifiability import identifiability
@@ -51,6 +51,18 @@ def test_the_input_that_shows_what_is_not_seen_is_recommended() -> None:
     assert found.now.directions == 1 and found.best.criteria.directions == 2
     assert found.half_widths_now["k"] is None and found.half_widths["k"] is not None
     assert "k would get a 95 % confidence interval of ±" in found.text and "(now none)" in found.text
+
+
+def test_under_a_misfit_no_interval_of_95_percent_is_predicted() -> None:
+    """The record bends where the model does not: what it lacks moves the estimates by what no residual tells."""
+    model = two_inputs()
+    record = on_model(model, "e", {"u": InputSignal.step(1.0, 0.0, 1.0)}, ["y"], 1e-3)
+    bent = record.measured["y"] + 0.05 * np.sin(3.0 * record.time)
+    lacking = record.with_(measured=trajectory(record.time, {"y": bent}))
+    found = identifiability(model, [lacking], FREE, starts=2).recommended
+    assert ": if nothing else is missing, k would be known to ±" in found.text and "95 %" not in found.text
+    told = found.to_dict()
+    assert set(told["predicted_ci95"].values()) == {None} and told["predicted_half_width"]["k"] > 0
 
 
 def test_the_predicted_interval_is_what_the_experiment_gives() -> None:
