@@ -30,7 +30,7 @@ from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
 from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.discrepancy.stand_ins import stand_ins
 from hvdc_ident.discrepancy.verdict import (
-    Judgement,
+    Conclusion,
     findings_of,
     headline,
     judge,
@@ -175,7 +175,7 @@ def _assembled(
     model: AnyModel,
     first: Refit,
     outcome: SearchOutcome,
-    judgement: Judgement,
+    judgement: Conclusion,
     other: Told | None,
     free: tuple[FitParameter, ...],
     notes: tuple[str, ...],

@@ -41,7 +41,7 @@ that has no name: less is what a wrong idea of the noise makes."""
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Conclusion:
     """The verdict, why, and the tests of what is left.
 
     sets: by effect that was put in, it and what cannot be told from it. experiment: what would show more where nothing was
@@ -61,7 +61,7 @@ class Judgement:
     remainder: Remainder | None = None
 
 
-def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgement:
+def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclusion:
     """The verdict on a search that has ended."""
     options, last = search.options, outcome.refit
     left = last.nominal()
@@ -76,20 +76,20 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Judgem
     labels = ", ".join(p.candidate.label for p in last.placed)
     if remainder.share > 1.0 - DOMINANT:
         text = f"Something is missing; the best of the catalogue ({labels}) explains only {percentage(1 - remainder.share)} of the gap."
-        return Judgement("unnameable", text, tests, remainder=remainder)
+        return Conclusion("unnameable", text, tests, remainder=remainder)
     sets = tuple(rivals(r, options, search.tries) for r in outcome.kept)
     sets, better = _with_formulas(search, outcome, sets)
     if better is not None:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
-        return Judgement("unnameable", text, tests, instead=better, remainder=remainder)
+        return Conclusion("unnameable", text, tests, instead=better, remainder=remainder)
     explained = first.chi2 - last.chi2
-    found = Judgement("named", "", tests, sets, remainder=remainder)
+    found = Conclusion("named", "", tests, sets, remainder=remainder)
     return _weighed(outcome, left, explained, found, labels, options.significance)
 
 
 def _weighed(
-    outcome: SearchOutcome, left: Nominal, explained: float, found: Judgement, labels: str, significance: float
-) -> Judgement:
+    outcome: SearchOutcome, left: Nominal, explained: float, found: Conclusion, labels: str, significance: float
+) -> Conclusion:
     """The judgement: named; ambiguous where several classes are likely, where something else may be behind one, or where the likely
     places of one imply other values of the parameters; or unnameable where too much is left that a latent input would explain."""
     assert found.remainder is not None
@@ -124,7 +124,7 @@ def _weighed(
     return replace(found, verdict="named" if sure else "ambiguous", text=f"Missing: {names}.")
 
 
-def leaves_more_than_noise(judgement: Judgement, last: Refit, *, adequate: bool, significance: float) -> bool:
+def leaves_more_than_noise(judgement: Conclusion, last: Refit, *, adequate: bool, significance: float) -> bool:
     """Return True where what the model `last` leaves is more than noise: by the tests of it, by the remainder, or by a doubt.
 
     Its values, and the sizes of its effects, then make up for what is left as well. They hold only if nothing else is missing, and
@@ -148,7 +148,7 @@ def _power_by_output(left: Nominal) -> dict[str, float]:
 def findings_of(
     search: SearchContext,
     outcome: SearchOutcome,
-    judgement: Judgement,
+    judgement: Conclusion,
     placed: Sequence[FoundEffect],
     *,
     with_intervals: bool = True,
@@ -175,7 +175,7 @@ def findings_of(
 
 
 def headline(
-    judgement: Judgement,
+    judgement: Conclusion,
     findings: Sequence[Finding],
     depend: Mapping[str, Sequence[ValueAt]] | None = None,
     *,
@@ -211,7 +211,7 @@ def _rest(remainder: Remainder, significance: float) -> str:
     return "; ".join(parts)
 
 
-def _names(found: Judgement) -> list[str]:
+def _names(found: Conclusion) -> list[str]:
     return [g[0].effect for g in found.sets]
 
 
@@ -256,7 +256,7 @@ def _with_formulas(
     return tuple(wider), None
 
 
-def _in_doubt(found: Judgement, labels: str, against: Doubt) -> Judgement:
+def _in_doubt(found: Conclusion, labels: str, against: Doubt) -> Conclusion:
     """Ambiguous, though nothing else that was tried explains as much."""
     they = "they" if len(found.sets) > 1 else "it"
     text = f"Missing: something like {labels}; {against.why}, so {they} may stand for something that is none of those tried."
@@ -311,27 +311,27 @@ def leaves_a_gap(search: SearchContext, last: Refit) -> bool:
     return material_gap(unseen(last), 1.0, share, tolerance, beyond_tolerance)
 
 
-def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Judgement:
+def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Conclusion:
     found = outcome.rounds[-1]
     options = search.options
     if found.form is not None:
         text = f"Something is missing, and nothing of the catalogue can be named: {found.why}."
-        return Judgement("unnameable", text, tests, instead=found.form)
+        return Conclusion("unnameable", text, tests, instead=found.form)
     refused = any(b.p <= options.significance and b.excess > STRONG * last.rows for b in tests)
     strong = found.significant and found.screen.shots[0].fall > STRONG * last.rows
     if (strong or refused) and leaves_a_gap(search, last):
         why = found.why or "the residuals are not noise"
-        return Judgement(
+        return Conclusion(
             "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
         )
     if not any(found.screen.usable(column) for column in found.screen.size):
         still = list(dict.fromkeys(c.effect for c in found.candidates))
         text = "None of the effects looked for is excited by these experiments."
         advice = {"text": ". ".join(f"{e}: {effects()[e].excited_by}" for e in still)}
-        return Judgement("not-excited", text, tests, experiment=advice)
+        return Conclusion("not-excited", text, tests, experiment=advice)
     if found.significant:
-        return Judgement("no-evidence", f"No gap that matters: {found.why}.", tests)
-    return Judgement("no-evidence", f"The data give no sign of a missing effect: {found.why}.", tests)
+        return Conclusion("no-evidence", f"No gap that matters: {found.why}.", tests)
+    return Conclusion("no-evidence", f"The data give no sign of a missing effect: {found.why}.", tests)
 
 
 def _signals(last: Refit) -> dict[str, dict[str, Array]]:

@@ -20,7 +20,7 @@ from hvdc_ident.discrepancy.hypothesis import run
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
-from hvdc_ident.discrepancy.verdict import Judgement, headline, keeps_tolerance, leaves_more_than_noise
+from hvdc_ident.discrepancy.verdict import Conclusion, headline, keeps_tolerance, leaves_more_than_noise
 from hvdc_ident.immutable import FrozenMap
 
 GIVEN = {"Kp": 2.6, "Ki": 9.0}
@@ -89,12 +89,12 @@ def test_more_than_noise_is_left_where_a_test_a_doubt_or_the_remainder_says_so(
     signs = np.tile([1.0, -1.0], 50)
     blocks = [SimpleNamespace(output=o, residual=k * signs) for o, k in (("w", 1.0), ("torque", loud))]
     last: Any = SimpleNamespace(nominal=lambda: SimpleNamespace(blocks=blocks))
-    judgement = Judgement("named", "", (), doubt=doubt, remainder=remainder)
+    judgement = Conclusion("named", "", (), doubt=doubt, remainder=remainder)
     assert leaves_more_than_noise(judgement, last, adequate=adequate, significance=0.01) is more
 
 
 def test_the_headline_speaks_of_a_tolerance_only_where_one_is_stated_and_kept(lagged: Diagnosis) -> None:
-    told = Judgement("named", "", (), remainder=Remainder(0.0, None, 4.0))
+    told = Conclusion("named", "", (), remainder=Remainder(0.0, None, 4.0))
     assert "what remains is 4 times the noise." in headline(told, lagged.findings)
     assert "4 times the noise, within the stated tolerance." in headline(told, lagged.findings, tolerated=True)
     first = plain(experiments(lag=0.03))

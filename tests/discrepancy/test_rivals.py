@@ -30,7 +30,7 @@ from hvdc_ident.discrepancy.remainder import Remainder
 from hvdc_ident.discrepancy.result import Rival
 from hvdc_ident.discrepancy.search import SearchOutcome, against, one_round
 from hvdc_ident.discrepancy.stand import Round
-from hvdc_ident.discrepancy.verdict import Judgement, _weighed
+from hvdc_ident.discrepancy.verdict import Conclusion, _weighed
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
@@ -173,11 +173,11 @@ def test_another_kind_of_delay_is_not_refuted_by_the_price_of_a_parameter() -> N
     assert DiagnosisOptions().set_bic < group[1].delta_bic < np.log(1800) + 1.0
 
 
-def rated(groups: Sequence[Sequence[Rival]], **remainder: float) -> Judgement:
+def rated(groups: Sequence[Sequence[Rival]], **remainder: float) -> Conclusion:
     """The verdict on some sets, with what they leave."""
     refit = plain(experiments())
     left = Remainder(**({"share": 0.0, "held_out": 0.0, "noise_units": 1.0} | remainder), at="wm")  # type: ignore[arg-type]
-    found = Judgement("named", "", (), tuple(tuple(g) for g in groups), remainder=left)
+    found = Conclusion("named", "", (), tuple(tuple(g) for g in groups), remainder=left)
     return _weighed(SearchOutcome(refit, (), ()), refit.nominal(), 1000.0, found, "lag at wm", 0.01)
 
 
