@@ -47,6 +47,15 @@ class TolerantExecutor(Protocol):
         """Yield the outcome of each item."""
 
 
+@runtime_checkable
+class Identified(Protocol):
+    """Work that names what decides its results beside the item: where that is the same, so are they."""
+
+    @property
+    def identity(self) -> Any:
+        """Return the value that decides the results, of numbers, text, arrays, collections and dataclasses of the package."""
+
+
 @dataclass(frozen=True)
 class Made(Generic[T]):
     """Items that are made one after the other as they are asked for, where all of them together would be large."""

@@ -20,7 +20,7 @@ from hvdc_ident.data import FLOOR_SHARE, MAD_TO_STD, Array, Experiment
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, scatter_of, source_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock, stretches
-from hvdc_ident.fit.whitening import autocorrelation
+from hvdc_ident.fit.whitening import independent_samples
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import times_text
 
@@ -124,9 +124,8 @@ def adequacy(
     for output in problem.outputs:
         of_output = [b for b in blocks if b.output == output]
         reference = _reference(problem.fitted_experiments, output, of_output, sources[output], problem.noise_dof)
-        residuals = {b.experiment: reference.scaled(b.residual, b.sigma) for b in of_output}
-        references = {b.experiment: reference.of(b.sigma) for b in of_output}
-        sizes[output], signals[output] = _sizes(residuals, reference, references, effective[output], rho[output], scale)
+        records = {b.experiment: (b.residual, b.sigma) for b in of_output}
+        sizes[output], signals[output] = _sizes(records, reference, effective[output], rho[output], scale)
     known = [b for b in blocks if not from_misfit(sources[b.output])]
     power = sum(scale.power(b.residual) * b.residual.size for b in known)
     chi2 = power / (sum(b.residual.size for b in known) * share) if known else None
@@ -154,18 +153,17 @@ def sizes_of_runs(
         behind = min((e.noise_dof.get(output, np.inf) for e in of_output), default=np.inf)
         sigma = _rms([c.sigma for c in line.values()], [c.rows.size for c in line.values()]) if known else None
         reference = _Reference(sigma, behind) if known else _scatter(of_output, output)
-        residuals = {e: c.residual if known else reference.scaled(c.misfit, 1.0) for e, c in line.items()}
-        parts = [residuals[e][part] for e, c in line.items() for part in stretches(c.rows)]
-        rho, rows = autocorrelation(parts, 0.0), sum(c.rows.size for c in line.values())
-        references = {e: reference.of(c.sigma) for e, c in line.items()}
-        effective = rows * (1.0 - rho) / (1.0 + rho)
-        found[output] = _sizes(residuals, reference, references, effective, rho, scale)[1]
+        records = {e: (c.residual, c.sigma) if known else (c.misfit, 1.0) for e, c in line.items()}
+        rho, effective = independent_samples(
+            [records[e][0][part] for e, c in line.items() for part in stretches(c.rows)], 0.0
+        )
+        found[output] = _sizes(records, reference, effective, rho, scale)[1]
     return found
 
 
 @dataclass(frozen=True)
 class _Reference:
-    """What the residual of an output is held against.
+    """The noise that the residual of an output is held against.
 
     noise: a standard deviation, in the unit, None where there is none; behind: the independent samples that it rests on. known:
     whether it is known apart from these rows, and the residual is in units of it already. exact: the output is met so well that nothing
@@ -188,8 +186,11 @@ class _Reference:
 
 @dataclass(frozen=True)
 class _Scale:
-    """share: of the rows that the unknowns leave free. together, alone: shares of the chance of an error that the judgement of an
-    output, and of a single record, may take. robust: whether outliers are no misfit."""
+    """The scale of a judgement.
+
+    share: of the rows that the unknowns leave free. together, alone: shares of the chance of an error that the judgement of an output,
+    and of a single record, may take. robust: whether outliers are no misfit.
+    """
 
     share: float
     together: float
@@ -226,24 +227,24 @@ def _rms(deviations: Sequence[float], rows: Sequence[int]) -> float:
 
 
 def _sizes(
-    residuals: Mapping[str, Array],
+    records: Mapping[str, tuple[Array, float]],
     reference: _Reference,
-    references: Mapping[str, _Reference],
     effective: float,
     rho: float,
     scale: _Scale,
 ) -> tuple[ResidualSize, FrozenMap[ResidualSize]]:
     """Return the size of an output's residual, and that in each of its records.
 
-    residuals: by experiment, in units of the noise. reference: of all records; references: of each. A record can be too large by
-    itself. Where only all of them together are, those are that have `MATTERS` times the noise: at least one has.
+    records: by experiment the residual, and the standard deviation that it is in units of. A record can be too large by itself.
+    Where only all of them together are, those are that have `MATTERS` times the noise: at least one has.
     """
+    residuals = {e: reference.scaled(residual, sigma) for e, (residual, sigma) in records.items()}
     together = np.concatenate(list(residuals.values()))
     whole = _size(together, reference, effective, rho, scale, LEVEL * scale.together)
     signals = {}
     for name, residual in residuals.items():
         own = effective * residual.size / together.size
-        size = _size(residual, references[name], own, rho, scale, LEVEL * scale.alone)
+        size = _size(residual, reference.of(records[name][1]), own, rho, scale, LEVEL * scale.alone)
         if size.verdict == "fits" and whole.verdict in TOO_LARGE and size.ratio is not None and size.ratio > MATTERS:
             size = replace(size, verdict=whole.verdict)
         signals[name] = replace(size, record=name)

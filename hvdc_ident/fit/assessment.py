@@ -53,6 +53,11 @@ class Curve:
         """Measured - model over the compared rows."""
         return self.measured[self.rows] - self.model[self.rows]
 
+    @property
+    def rmse(self) -> float:
+        """Root mean square of the misfit, in the output's unit."""
+        return float(np.sqrt(np.mean(self.misfit**2)))
+
 
 def assessed(problem: Problem, result: FitResult) -> FitResult:
     """Return the result with `goodness` and `validation`; errors of held-out experiments are taken with their own nuisances."""
@@ -62,7 +67,7 @@ def assessed(problem: Problem, result: FitResult) -> FitResult:
     for e in problem.experiments:
         if nuisances.get(e.name):
             for output, c in by_experiment.get(e.name, {}).items():
-                rmse[output][e.name] = float(np.sqrt(np.mean(c.misfit**2)))
+                rmse[output][e.name] = c.rmse
     result = replace(result, rmse=rmse)
     held_out = {e.name for e in problem.experiments if e.role == "holdout"}
     return replace(
@@ -195,10 +200,9 @@ def _quality(c: Curve) -> dict[str, Any]:
     e, y = c.misfit, c.measured[c.rows]
     moved = float(np.sum((y - y.mean()) ** 2))
     squares = float(e @ e)
-    rmse = float(np.sqrt(squares / e.size))
     return {
         "n": int(e.size),
-        "rmse": rmse,
+        "rmse": c.rmse,
         "rmse_per_sigma": float(np.sqrt(np.mean(c.residual**2))),
         "r2": 1.0 - squares / moved if moved > 0 else None,
         "fit_percent": 100.0 * (1.0 - np.sqrt(squares / moved)) if moved > 0 else None,

@@ -21,7 +21,7 @@ from hvdc_ident.immutable import FrozenMap
 
 Span = tuple[float, float]
 Yardstick = Literal["noise", "tolerance", "windows"]
-"""What the error of a signal is held against."""
+"""The measure that the error of a signal is held against."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,27 @@ class SignalJudgement:
 
 
 @dataclass(frozen=True)
+class Count:
+    """How many signals passed, failed and were not judged."""
+
+    passed: int
+    failed: int
+    not_judged: int
+
+    @property
+    def judged(self) -> int:
+        """How many were judged."""
+        return self.passed + self.failed
+
+    @property
+    def verdict(self) -> bool | None:
+        """False where a signal fails, None where one is not judged and no other fails, or where there is none; else True."""
+        return False if self.failed else None if self.not_judged or not self.passed else True
+
+
+@dataclass(frozen=True)
 class Judgement:
-    """Whether the model follows its recordings with one set of values.
+    """The verdict on the model with one set of values: whether it follows its recordings.
 
     by: what the verdict is held against: the study's tolerance where it states one, else the windows of a profile that it names,
     else the noise. signals: by output and experiment, of those that were compared.
@@ -53,21 +72,20 @@ class Judgement:
 
     @property
     def follows(self) -> bool | None:
-        """The verdict: False where a signal fails, None where one is not judged and no other fails, or where there is none."""
-        count = self.count(self.by)
-        return False if count["failed"] else None if count["not_judged"] or not count["passed"] else True
+        """The verdict by what the errors are held against."""
+        return self.count(self.by).verdict
 
-    def count(self, by: Yardstick) -> dict[str, int]:
+    def count(self, by: Yardstick) -> Count:
         """Return how many signals passed, failed and were not judged."""
         each = [s.follows[by] for line in self.signals.values() for s in line.values()]
-        return {"passed": each.count(True), "failed": each.count(False), "not_judged": each.count(None)}
+        return Count(each.count(True), each.count(False), each.count(None))
 
     def to_dict(self) -> dict[str, Any]:
         """Return the verdict, the counts by what the errors are held against, and the signals, as JSON takes it."""
         signals = {
             o: {e: vars(s) | {"follows": dict(s.follows)} for e, s in line.items()} for o, line in self.signals.items()
         }
-        counts = {by: self.count(by) for by in ("noise", "tolerance", "windows")}
+        counts = {by: vars(self.count(by)) for by in ("noise", "tolerance", "windows")}
         return {"by": self.by, "follows": self.follows, "counts": counts, "signals": signals}
 
 
@@ -105,7 +123,7 @@ def judge(
 
 
 def _signal(curve: Curve, size: ResidualSize, tolerance: float | None, windows: Mapping[str, Any]) -> SignalJudgement:
-    rmse = float(np.sqrt(np.mean(curve.misfit**2)))
+    rmse = curve.rmse
     follows = FrozenMap(
         {
             "noise": size.follows,

@@ -22,7 +22,7 @@ from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import Estimate
 from hvdc_ident.fit.simulator import unit_of, unknown_of
-from hvdc_ident.fit.whitening import autocorrelation
+from hvdc_ident.fit.whitening import independent_samples
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures
 
@@ -187,8 +187,7 @@ def _samples(blocks: Sequence[ResidualBlock], p: int) -> tuple[dict[str, float],
     for output in dict.fromkeys(b.output for b in blocks):
         records = [b.score[part] for b in blocks if b.output == output for part in b.stretches]
         n = sum(r.size for r in records)
-        rho[output] = autocorrelation(records, p * n / total)
-        effective[output] = n * (1.0 - rho[output]) / (1.0 + rho[output])
+        rho[output], effective[output] = independent_samples(records, p * n / total)
     return rho, effective
 
 

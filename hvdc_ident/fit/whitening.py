@@ -40,6 +40,12 @@ def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
     return float(min(rho + (unknowns + (unknowns + 2.0) * rho) / n, 1.0 - 2.0 / n))
 
 
+def independent_samples(residuals: Sequence[Array], unknowns: float) -> tuple[float, float]:
+    """Return the AR(1) coefficient of several records together (`autocorrelation`), and the independent samples they are worth."""
+    rho = autocorrelation(residuals, unknowns)
+    return rho, sum(r.size for r in residuals) * (1.0 - rho) / (1.0 + rho)
+
+
 def autoregression(records: Sequence[Array], most: int = MOST) -> AR:
     """Return the AR model of the noise in several records together, its order by BIC; () where it is white.
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.fit.judgement import Count
 from hvdc_ident.report.overlay import STAGES, Overlay, overlay_of
 from hvdc_ident.report.results import Results
 from hvdc_ident.report.values_that_count import ValuesThatCount, values_that_count
@@ -26,20 +27,6 @@ ADDED = {"term": "formula", "filter": "filter", "curve": "curve"}
 """Words for what stands in the model in place of an effect of the catalogue."""
 AT_BOUND = "at its bound"
 """Note on a value that stands on a bound of the search."""
-
-
-@dataclass(frozen=True)
-class Count:
-    """How many signals passed, failed and were not judged."""
-
-    passed: int
-    failed: int
-    not_judged: int
-
-    @property
-    def judged(self) -> int:
-        """How many were judged."""
-        return self.passed + self.failed
 
 
 @dataclass(frozen=True)
@@ -59,6 +46,11 @@ class Errors:
     by_limits: bool
     on_noise: Count
     in_limits: Count
+
+    @property
+    def deciding(self) -> Count:
+        """The signals that the verdict is by."""
+        return self.in_limits if self.by_limits else self.on_noise
 
 
 @dataclass(frozen=True)
@@ -136,8 +128,12 @@ class Answers:
 
     def signals(self, name: str) -> dict[Signal, Mapping[str, Any]]:
         """The judgement of each signal with a set of values, empty without one."""
-        table = (self.judgements.get(name) or {}).get("signals") or {}
-        return {(o, e): about for o, line in table.items() for e, about in line.items()}
+        return self._signals.get(name, {})
+
+    @cached_property
+    def _signals(self) -> dict[str, dict[Signal, Mapping[str, Any]]]:
+        tables = {n: judgement["signals"] for n, judgement in self.judgements.items()}
+        return {n: {(o, e): about for o, line in t.items() for e, about in line.items()} for n, t in tables.items()}
 
     @property
     def fitted(self) -> tuple[str, ...]:
@@ -210,7 +206,7 @@ class Answers:
 
     @cached_property
     def _about(self) -> Mapping[str, Any]:
-        """What the errors were held against, by the last stage that judged."""
+        """The tolerance and the profile that the errors were held against, by the last stage that judged."""
         return next((j for stage in reversed(STAGES.values()) if (j := self._judged(stage))), {})
 
     @property

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from hvdc_ident.report.answers import AT_BOUND, Answers, Count, Errors, Value
+from hvdc_ident.fit.judgement import Count
+from hvdc_ident.report.answers import AT_BOUND, Answers, Errors, Value
 from hvdc_ident.report.html import badge, estimate, number, percent, prose, rough, share, table, text
 from hvdc_ident.report.overlay import WORDS, Sheet
 from hvdc_ident.report.results import Results
@@ -88,11 +89,10 @@ def _counted(count: Count) -> str:
 def _sentence(found: Answers, judged: Errors) -> str:
     which = "The fitted model" if judged.name == "fitted" else "The model with its given values"
     held = judged.by_limits
-    signals_of = judged.in_limits if held else judged.on_noise
-    count = signals_of.judged
+    count = judged.deciding.judged
     if not count:
         return f"{which} is not judged: neither the noise of the recordings nor a tolerance is known."
-    if not signals_of.failed:
+    if not judged.deciding.failed:
         rest = text(found.not_judged(judged, limits=held))
         signals = f"the {count} signal{'s' if count > 1 else ''} that {'are' if count > 1 else 'is'} judged"
         if held:
@@ -267,12 +267,7 @@ def _undiagnosed(found: Answers) -> str:
     command = "<code>hvdc-ident diagnose STUDY</code> looks for what is missing."
     if found.follows is False:
         return f"<p class='answer'>Not asked yet. {command}</p>"
-    if (
-        found.follows is True
-        and found.judged is not None
-        and not found.judged.on_noise.not_judged
-        and not found.judged.on_noise.failed
-    ):
+    if found.follows is True and found.judged is not None and found.judged.on_noise.verdict:
         return "<p class='answer'>No sign of anything: what is left is noise.</p>"
     return f"<p class='answer'>Not asked. {command}</p>"
 

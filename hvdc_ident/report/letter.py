@@ -150,9 +150,7 @@ def _given(answers: Answers) -> Errors | None:
 def _passed(answers: Answers) -> bool | None:
     """The verdict on the model as it was given."""
     errors = _given(answers)
-    if errors is None:
-        return None
-    return errors.follows
+    return None if errors is None else errors.follows
 
 
 def _missed(answers: Answers) -> str:
@@ -162,8 +160,7 @@ def _missed(answers: Answers) -> str:
         return "The model could not be compared with the recordings at its given values."
     mine = "With the values it came with, your model"
     held = errors.by_limits
-    signals_of = errors.in_limits if held else errors.on_noise
-    failed, count = signals_of.failed, signals_of.judged
+    failed, count = errors.deciding.failed, errors.deciding.judged
     rest = answers.not_judged(errors, limits=held)
     if count and not failed:
         kind = ("keeps the tolerance in", "") if held else ("follows", " to its noise")

@@ -70,7 +70,7 @@ def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dic
     rmse: dict[str, dict[str, float]] = {}
     for name, line in curves.items():
         for output, curve in line.items():
-            rmse.setdefault(output, {})[name] = float(np.sqrt(np.mean(curve.misfit**2)))
+            rmse.setdefault(output, {})[name] = curve.rmse
     data = {
         "rmse_after": rmse,
         "judgement": fitting.judgement_of(study, {**sets, "effect": curves}),

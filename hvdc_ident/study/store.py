@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.errors import ComputationError, InputError
-from hvdc_ident.executor import Outcome, TolerantExecutor, in_order
+from hvdc_ident.executor import Identified, Outcome, TolerantExecutor, in_order
 from hvdc_ident.files import digest, make_folder
 from hvdc_ident.immutable import FrozenMap
 
@@ -224,7 +224,8 @@ class CachingExecutor:
     def _keys(self, function: Callable[[Any], Any]) -> Callable[[int, Any], bytes]:
         """Return the function that gives an item its key, by its place and content."""
         if self._by_item:
-            work = _short_digest(function.identity)  # type: ignore[attr-defined]
+            assert isinstance(function, Identified)
+            work = _short_digest(function.identity)
             return lambda index, item: f"{work}/{_short_digest(item)}".encode()
         call = self._calls
         return lambda index, item: f"{call}/{index}/{_item_digest(item)}".encode()

@@ -13,7 +13,7 @@ from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.fit import tolerance_profile
 from hvdc_ident.fit.assessment import Curve
-from hvdc_ident.fit.judgement import event_end, judge
+from hvdc_ident.fit.judgement import Count, event_end, judge
 from hvdc_ident.fit.tolerance_profile import shipped, tolerance
 from tests.fit.simulators import recorded
 
@@ -90,7 +90,7 @@ def test_what_is_not_judged_is_not_passed():
     assert {o: a["within"] for o, a in lines.items()} == {"P": None, "valve": True, "spare": False, "dumb": None}
     assert lines["P"]["reason"] == "the limits are in pu, the output is in MW"
     assert lines["dumb"]["reason"] == "no row in any window" and lines["valve"]["reason"] == ""
-    assert found.count("windows") == {"passed": 1, "failed": 1, "not_judged": 2}
+    assert found.count("windows") == Count(passed=1, failed=1, not_judged=2)
     assert (found.by, found.follows) == ("windows", False)
     kept = judge({"e": {n: curves[n] for n in ("P", "valve")}}, (e,), units, PROFILE, named=True)
     assert (kept.by, kept.follows) == ("windows", None)

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hvdc_ident.report.answers import Answers, Count, beyond_noise
+from hvdc_ident.fit.judgement import Count
+from hvdc_ident.report.answers import Answers, beyond_noise
 from hvdc_ident.report.first_screen import first_screen
 from hvdc_ident.report.html import estimate, number
 from hvdc_ident.report.letter import letter_of, write_letter
