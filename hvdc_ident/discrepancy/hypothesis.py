@@ -30,7 +30,8 @@ from hvdc_ident.simulate import ModelSimulator, Tolerance, equilibria, simulate
 PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=20_000)
 """Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""
 FAR = 5.0
-"""Times a probe's size at most, or this share of it at least, that a refit begins at: a score far from its size says little."""
+"""Times a probe's size at most, or this share of it at least, that a refit begins at: a score far from its size says little. Where the
+score asks for another size, that is a second start: a dead band far from 0 is an offset, and its score is exact."""
 EXACT = 1e3
 """Largest such factor for an effect in proportion to its size, whose score at one size is that at every."""
 ROOM = 3.0
@@ -89,11 +90,14 @@ def reaching(candidate: CandidateEffect, probe: int, factor: float) -> Candidate
     return replace(candidate, probes=(*candidate.probes[:probe], wider, *candidate.probes[probe + 1 :]))
 
 
-def moved(candidate: CandidateEffect, probe: int, factor: float) -> dict[str, float]:
-    """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant."""
+def moved(candidate: CandidateEffect, probe: int, factor: float, most: float | None = None) -> dict[str, float]:
+    """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant.
+
+    most: the largest factor, and the inverse of the least; left out, as far as a score of the effect's size can be trusted.
+    """
     values, free = candidate.probes[probe].values, candidate.probes[probe].free
     entry, found = effects()[candidate.effect], dict(values)
-    most = EXACT if in_proportion(candidate, probe) else FAR
+    most = most or (EXACT if in_proportion(candidate, probe) else FAR)
     size = float(np.clip(abs(factor), 1.0 / most, most)) if np.isfinite(factor) and factor else 1.0
     if factor < 0 and "phase" in found:
         found["phase"] += np.pi if found["phase"] <= 0 else -np.pi
@@ -510,8 +514,9 @@ def job(
     )
     placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values), movable=movable is not None)
     k = len(before.problem.free)
-    begin = np.concatenate([theta[:k], [f.start for f in free], theta[k:]])
-    return RefitJob(model, (*before.placed, placed), problem, (begin,), before.noise)
+    asked = moved(candidate, probe, factor, EXACT)
+    begins = tuple(np.concatenate([theta[:k], [size[n] for n in bounds], theta[k:]]) for size in (values, asked))
+    return RefitJob(model, (*before.placed, placed), problem, begins, before.noise)
 
 
 BIASED = 0.4
