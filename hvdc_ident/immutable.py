@@ -1,10 +1,12 @@
-"""An immutable mapping that keeps its order, can be hashed and sent to another process."""
+"""An immutable mapping that keeps its order, can be hashed and sent to another process; frozen results of parts as one."""
 
 from __future__ import annotations
 
-from collections.abc import ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
-from typing import Any, TypeVar
+from collections.abc import ItemsView, Iterable, Iterator, KeysView, Mapping, Sequence, ValuesView
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar, cast
 
+T = TypeVar("T")
 V = TypeVar("V")
 
 
@@ -62,3 +64,34 @@ class FrozenMap(Mapping[str, V]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FrozenMap, (self._items,)
+
+
+def joined(parts: Sequence[T]) -> T:
+    """Return results of one kind as one.
+
+    A mapping has the items of all, those of one name joined; a tuple or list the items of all, each once; a text those that
+    differ, with semicolons between; a flag is true where one is; frozen values are joined field by field. Of anything else the
+    first that is not None stands.
+    """
+    known = [p for p in parts if p is not None]
+    if not known:
+        return parts[0]
+    one: Any = known[0]
+    whole: Any = one
+    if isinstance(one, Mapping):
+        names = dict.fromkeys(n for p in known for n in cast("Mapping[str, Any]", p))
+        items = {n: joined([p[n] for p in cast("list[Mapping[str, Any]]", known) if n in p]) for n in names}
+        whole = FrozenMap(items) if isinstance(one, FrozenMap) else items
+    elif isinstance(one, (tuple, list)):
+        whole = type(one)(_each_once([item for p in cast("list[Sequence[Any]]", known) for item in p]))
+    elif isinstance(one, str):
+        whole = "; ".join(_each_once([p for p in known if p]))
+    elif isinstance(one, bool):
+        whole = any(known)
+    elif is_dataclass(one) and not isinstance(one, type):
+        whole = replace(one, **{f.name: joined([getattr(p, f.name) for p in known]) for f in fields(one)})
+    return cast("T", whole)
+
+
+def _each_once(items: Sequence[Any]) -> list[Any]:
+    return [item for k, item in enumerate(items) if not any(item is other or item == other for other in items[:k])]

@@ -28,8 +28,10 @@ from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import Covariance, FitResult, StartOutcome, Status
 from hvdc_ident.fit.simulator import unknown_of
 from hvdc_ident.fit.uncertainty import NO_INTERVAL
-from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.immutable import FrozenMap, joined
 
+_OF_EACH = ("estimates", "nuisance", "noise_source", "rho", "effective_samples", "correlation", "whitening")
+"""Fields of a result that each group fills for its own parameters and outputs."""
 _WORST: tuple[Status, ...] = ("failed", "not-converged", "two-optima", "at-bound", "converged")
 
 
@@ -123,9 +125,8 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
     """Return the groups' results as one, judged on the whole problem."""
     status: Status = min((r.status for r in results), key=_WORST.index)
     message = "; ".join(f"group {i + 1}: {r.status}, {r.message}" for i, r in enumerate(results))
-    nuisance: FrozenMap = FrozenMap()
-    for r in results:
-        nuisance = nuisance | r.nuisance
+    found: dict[str, Any] = {n: joined([getattr(r, n) for r in results]) for n in _OF_EACH}
+    nuisance = found["nuisance"]
     whole = replace(
         reduce(in_final_weights, results, problem),
         experiments=tuple(
@@ -135,30 +136,25 @@ def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, f
     )
     estimated = current | {unknown_of(e, n): v.value for e, own in nuisance.items() for n, v in own.items()}
     theta = np.array([estimated.get(u.name, u.start) for u in whole.unknowns])
+    found["estimates"] = FrozenMap(
+        {f.name: found["estimates"][f.name] for f in problem.free if f.name in found["estimates"]}
+    )
     result = FitResult(
         status=status,
         message=message,
         fitted=tuple(f.name for f in problem.free),
         held=FrozenMap({n: w for n, w in results[0].held.items() if n not in current}),
         values=FrozenMap(whole.values(theta)),
-        estimates=FrozenMap(
-            {f.name: r.estimates[f.name] for f in problem.free for r in results if f.name in r.estimates}
-        ),
-        nuisance=nuisance,
         rmse=whole.rmse(theta),
         rmse_start=problem.rmse_start,
         rmse_given=problem.rmse_given,
-        noise_source=FrozenMap({k: v for r in results for k, v in r.noise_source.items()}),
         sigma=whole.sigma,
-        rho=FrozenMap({k: v for r in results for k, v in r.rho.items()}),
-        effective_samples=FrozenMap({k: v for r in results for k, v in r.effective_samples.items()}),
-        correlation={k: v for r in results for k, v in r.correlation.items()},
         starts=tuple(replace(s, group=i) for i, r in enumerate(results) for s in r.starts),
         search_doubt="; ".join(f"group {i + 1}: {r.search_doubt}" for i, r in enumerate(results) if r.search_doubt),
         loss=problem.loss.name,
-        whitening={o: m for r in results for o, m in r.whitening.items()},
         dof=min((r.dof for r in results if r.dof is not None), default=None),
         covariance=_joint(results),
+        **found,
     )
     try:
         cost = whole.cost(theta)

@@ -44,7 +44,7 @@ from hvdc_ident.identifiability.practical import (
 from hvdc_ident.identifiability.report import IdentifiabilityReport
 from hvdc_ident.identifiability.structural import StructuralAnalysis, structural_analysis
 from hvdc_ident.identifiability.verdicts import WIDE, scale_of, unjudged_verdict, with_misfit_remark
-from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.immutable import FrozenMap, joined
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import LocalSensitivities, collinear_subsets, sensitivities
 from hvdc_ident.simulate import ModelSimulator
@@ -355,14 +355,20 @@ def identifiability_by_group(
 
 
 def _noted(report: IdentifiabilityReport, group: Group, part: Problem) -> IdentifiabilityReport:
-    """Return a group's report, each note begun with the group's parameters."""
+    """Return what a group's report brings to that of all, each note begun with the group's parameters."""
     mine = ", ".join(group.parameters)
     data = f"{', '.join(part.outputs)} in {', '.join(e.name for e in part.fitted_experiments)}"
     first = f"{mine}: judged alone, on {data}, the other candidates held."
-    notes = (first, *(f"{mine}: {n}" for n in report.notes))
-    signs = tuple(f"{mine}: {s}" for s in report.misspecification.signs)
-    pilot = {"groups": [{"parameters": list(group.parameters), **report.pilot}]}
-    return replace(report, notes=notes, misspecification=replace(report.misspecification, signs=signs), pilot=pilot)
+    return replace(
+        report,
+        notes=(first, *(f"{mine}: {n}" for n in report.notes)),
+        misspecification=replace(
+            report.misspecification, signs=tuple(f"{mine}: {s}" for s in report.misspecification.signs)
+        ),
+        pilot={"groups": [{"parameters": list(group.parameters), **report.pilot}]},
+        bootstrap=None,  # of experiments and of a model that the groups share
+        sensitivities=None,
+    )
 
 
 def _merged(reports: Sequence[IdentifiabilityReport], names: Sequence[str]) -> IdentifiabilityReport:
@@ -370,50 +376,18 @@ def _merged(reports: Sequence[IdentifiabilityReport], names: Sequence[str]) -> I
 
     What to measure next is that of the first group that needs it; the notes say what the others would.
     """
-
-    def joined(field: str) -> tuple[Any, ...]:
-        return tuple(item for r in reports for item in getattr(r, field))
-
-    def by_name(field: str) -> dict[str, Any]:
-        return {n: item for r in reports for n, item in getattr(r, field).items()}
-
-    parameters, held, identifiable = by_name("parameters"), by_name("held"), joined("identifiable")
-    shares = {e: {n: s for r in reports for n, s in r.shares.get(e, {}).items()} for e in by_name("shares")}
-    structures, signs = [r.structure for r in reports], [r.misspecification for r in reports]
     settled = ("identifiable", "at-bound")
     advised = next((r for r in reports if any(v.verdict not in settled for v in r.parameters.values())), reports[0])
-    advice = [
-        f"To measure next for {', '.join(r.parameters)}: {r.recommended.text}"
-        for r in reports
-        if r is not advised and r.recommended is not None
-    ]
-    return IdentifiabilityReport(
-        parameters=FrozenMap({n: parameters[n] for n in names}),
-        identifiable=tuple(n for n in names if n in identifiable),
-        held=FrozenMap({n: held[n] for n in names if n in held}),
-        structure=StructuralAnalysis(
-            "decided" if all(s.status == "decided" for s in structures) else "not decided",
-            "; ".join(dict.fromkeys(s.method for s in structures)),
-            tuple(n for s in structures for n in s.admissible),
-            tuple(c for s in structures for c in s.combinations),
-            "; ".join(s.note for s in structures if s.note),
-            tuple(n for s in structures for n in s.unmoved),
-        ),
-        combinations=joined("combinations"),
-        collinear=joined("collinear"),
-        correlation=by_name("correlation"),
-        shares=FrozenMap({e: FrozenMap({n: line.get(n, 0.0) for n in names}) for e, line in shares.items()}),
-        heterogeneity=FrozenMap(by_name("heterogeneity")),
-        misspecification=Misspecification(
-            any(s.flag for s in signs),
-            tuple(sign for s in signs for sign in s.signs),
-            next((s.pointer for s in signs if s.pointer), ""),
-        ),
+    others = [(r, r.recommended.text) for r in reports if r is not advised and r.recommended is not None]
+    advice = [f"To measure next for {', '.join(r.parameters)}: {text}" for r, text in others]
+    whole = joined([replace(r, recommended=None) for r in reports])
+    decided = all(r.structure.status == "decided" for r in reports)
+    return replace(
+        whole,
+        parameters=FrozenMap({n: whole.parameters[n] for n in names}),
+        identifiable=tuple(n for n in names if n in whole.identifiable),
+        structure=replace(whole.structure, status="decided" if decided else "not decided"),
+        shares=FrozenMap({e: FrozenMap({n: own.get(n, 0.0) for n in names}) for e, own in whole.shares.items()}),
         recommended=advised.recommended,
-        thresholds=FrozenMap(by_name("thresholds")),
-        pilot={"groups": [group for r in reports for group in r.pilot["groups"]]},
-        notes=(*joined("notes"), *advice),
-        pair=next((r.pair for r in reports if r.pair is not None), None),
-        not_judged=joined("not_judged"),
-        optima=joined("optima"),
+        notes=(*whole.notes, *advice),
     )
