@@ -19,8 +19,6 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Delay, Model, Sampled, Signal, State, fresh
 
 INSERTION_POINT_KINDS = ("input", "signal", "algebraic", "state", "output")
-TRACKING_TIME = 2e-4
-"""Time constant, s, with which a rate limit follows its signal, and a quantiser within an algebraic loop its level."""
 
 Measure = Literal[
     "one",

@@ -5,13 +5,13 @@ from collections.abc import Mapping
 import sympy as sp
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.expression import clip
+from hvdc_ident.expression import deadband
 from hvdc_ident.immutable import FrozenMap
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     """Return the part of u that lies beyond the band."""
-    return u - clip(u, -p["width"], p["width"])
+    return deadband(u, p["width"])
 
 
 EFFECT = Effect(

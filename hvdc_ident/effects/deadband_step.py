@@ -4,25 +4,20 @@ from collections.abc import Mapping
 
 import sympy as sp
 
-from hvdc_ident.effects.base import TRACKING_TIME, Additions, Effect, EffectParameter
-from hvdc_ident.expression import clip, where
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.expression import TRACKING_TIME, deadband_step, where
 from hvdc_ident.immutable import FrozenMap
-
-EDGE = 2e-4
-"""Width of the edge inside the model, of the deadband's own width (a recorded output jumps)."""
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
-    """Return u outside the band and 0 inside, over an edge from width to (1 + EDGE) width.
+    """Return u outside the band and 0 inside, inside the model over a narrow edge (a recorded output jumps).
 
-    A loop that is driven back into the band by its own reaction never rests at an ideal step: it slides along the edge. An
-    edge of finite width has that sliding rest as its steady state (Filippov's solution, up to the width). Within an
-    algebraic loop a jump may leave no solution at all: there the value is reached within 0.2 ms.
+    Within an algebraic loop a jump may leave no solution at all: there the value is reached within 0.2 ms.
     """
     width = p["width"]
     if add.kind == "output":
         return where(sp.Abs(u) > width, u, 0)
-    outside = u * clip((sp.Abs(u) / width - 1) / EDGE, 0, 1)
+    outside = deadband_step(u, width)
     if not add.circular:
         return outside
     outside = add.signal("outside", outside)

@@ -5,13 +5,9 @@ from collections.abc import Mapping
 
 import sympy as sp
 
-from hvdc_ident.effects.base import TRACKING_TIME, Additions, Effect, EffectParameter
-from hvdc_ident.expression import where
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.expression import nonwindup
 from hvdc_ident.immutable import FrozenMap
-
-NEAR = 1e-8
-"""Distance from a limit, of 1 and its magnitude, from which on the state counts as being at it. A state held exactly there would
-lie on the switch itself, where there is no linear model."""
 
 
 def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
@@ -28,18 +24,7 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
         return sp.Max(below, p["low"] - x) if "low" in p else below
 
     add.rest(x, u, held)
-    derivative = u
-    if "high" in p:
-        left = p["high"] - x
-        derivative = where(left <= _near(p["high"]), sp.Min(derivative, left / TRACKING_TIME), derivative)
-    if "low" in p:
-        left = p["low"] - x
-        derivative = where(left >= -_near(p["low"]), sp.Max(derivative, left / TRACKING_TIME), derivative)
-    return derivative
-
-
-def _near(level: sp.Expr) -> sp.Expr:
-    return NEAR * (1 + sp.Abs(level))
+    return nonwindup(u, x, p.get("low"), p.get("high"))
 
 
 EFFECT = Effect(

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import sympy as sp
 
-from hvdc_ident.effects.base import TRACKING_TIME, Additions, Effect, EffectParameter, Extent
-from hvdc_ident.expression import clip, where
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter, Extent
+from hvdc_ident.expression import TRACKING_TIME, clip, where
 from hvdc_ident.immutable import FrozenMap
 
 BITS = 24

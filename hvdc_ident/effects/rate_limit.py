@@ -5,8 +5,8 @@ from collections.abc import Mapping
 
 import sympy as sp
 
-from hvdc_ident.effects.base import TRACKING_TIME, Additions, Effect, EffectParameter
-from hvdc_ident.expression import clip
+from hvdc_ident.effects.base import Additions, Effect, EffectParameter
+from hvdc_ident.expression import TRACKING_TIME, clip
 from hvdc_ident.immutable import FrozenMap
 
 

@@ -5,7 +5,10 @@ sum        := product (("+" | "-") product)*
 product    := signed (("*" | "/") signed)*
 signed     := ("+" | "-") signed | power
 power      := primary ["**" signed]
-primary    := number | name | function "(" comparison ("," comparison)* ")" | "(" comparison ")"
+primary    := number | name | function "(" argument ("," argument)* ")" | "(" comparison ")"
+argument   := comparison | "[" sum ("," sum)* "]"                      lists only in table
+
+A name may have parts with dots between: `gen.H` is H of the component gen.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from itertools import accumulate, pairwise
 from typing import NamedTuple, NoReturn
 
 from hvdc_ident.errors import ExpressionError
+from hvdc_ident.expression.blocks import BLOCKS
 from hvdc_ident.expression.functions import FUNCTIONS
 
 MAX_LENGTH = 100_000
@@ -24,28 +28,29 @@ MAX_TOKENS = 10_000
 MAX_DEPTH = 100
 MAX_CALLS = 32
 MAX_COMPARISONS = 1024
+MAX_POINTS = 64
 CONSTANTS = ("pi", "time")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 _OPERATORS = ("+", "-", "*", "/", *COMPARISONS)
-IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*", re.ASCII)
+IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*)*", re.ASCII)
 # A quantifier that gives nothing back: no text makes the scan slower than linear.
 _TOKEN = re.compile(
     r"(?P<space>[ \t\r\n]+)"
     r"|(?P<number>(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?)"
-    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*+)"
-    r"|(?P<mark>\*\*|<=|>=|==|!=|[-+*/(),<>])",
+    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*+(?:\.[A-Za-z_][A-Za-z0-9_]*+)*+)"
+    r"|(?P<mark>\*\*|<=|>=|==|!=|[-+*/(),<>\[\]])",
     re.ASCII,
 )
 
 
 def is_identifier(name: object) -> bool:
-    """True for a text that can name a variable: letters, digits and _, no digit first."""
+    """True for a text that can name a variable: letters, digits and _, no digit first; parts with dots between."""
     return isinstance(name, str) and IDENTIFIER.fullmatch(name) is not None
 
 
 def is_reserved(name: object) -> bool:
     """True for the name of a function or a constant of the grammar, which no variable can have."""
-    return name in FUNCTIONS or name in CONSTANTS
+    return name in FUNCTIONS or name in BLOCKS or name in CONSTANTS
 
 
 class Token(NamedTuple):
@@ -98,10 +103,10 @@ def _stray(text: str, at: int) -> str:
     character = text[at]
     if character in "'\"":
         return "texts are no part of an expression"
-    if character in "[]{}":
+    if character in "{}":
         return f"'{character}' is no part of an expression; group with ( )"
     if character == ".":
-        return "'.' is no part of an expression; names have letters, digits and _ only"
+        return "'.' stands between the parts of a name only, as in gen.H"
     if character == "^":
         return "'^' is no part of an expression; a power is written **"
     if character in "&|!~=":
@@ -133,9 +138,11 @@ class SyntaxTree:
 
 
 class _Level(NamedTuple):
-    """An open parenthesis: whether a function's arguments stand in it, and the scan's counts before it."""
+    """An open parenthesis or list: whether arguments stand in it and may be lists, what closes it, and the counts before it."""
 
     call: bool
+    lists: bool
+    close: str
     depth: int
     calls: int
     compared: bool
@@ -159,7 +166,7 @@ class _Scan:
         before, value_due = Token("start", "", 0), True
         for token, following in pairwise((*found, found[-1])):
             if token.text == "(" and before.kind == "name":
-                self._open(token, call=True)
+                self._open(token, call=True, lists=before.text == "table")
                 value_due = True
             elif value_due and not (token.text == ")" and before.text == "(" and self.open[-1].call):
                 value_due = self._begin(token, following)
@@ -175,6 +182,8 @@ class _Scan:
             self._deeper(token)
         elif token.text == "(":
             self._open(token, call=False)
+        elif token.text == "[" and self.open and self.open[-1].lists:
+            self._open(token, call=True)
         elif token.kind != "number":
             self._unexpected(token, "a number, a name or '('")
         return token.kind == "mark"
@@ -183,20 +192,22 @@ class _Scan:
         """Take a token where a value has ended; True where another one must follow."""
         if token.text == "**":
             self._deeper(token, call=True)
-        elif token.text == ")" and self.open:
-            _, self.depth, self.calls, self.compared = self.open.pop()
+        elif self.open and token.text == self.open[-1].close:
+            *_, self.depth, self.calls, self.compared = self.open.pop()
         elif token.text in _OPERATORS or (token.text == "," and self.open and self.open[-1].call):
             if token.text in COMPARISONS and self.compared:
                 self.source.fail("comparisons cannot be chained; nest two where", token.position)
             self.compared = token.text in COMPARISONS or (self.compared and token.text != ",")
             self._leave_signs_and_powers()
         elif token.kind != "end" or self.open:
-            inside = "',' or ')'" if self.open and self.open[-1].call else "')'"
+            close = f"'{self.open[-1].close}'" if self.open else ""
+            inside = f"',' or {close}" if self.open and self.open[-1].call else close
             self._unexpected(token, inside if self.open else "an operator or the end")
-        return token.text not in (")", "the end")
+        return token.text not in (")", "]", "the end")
 
-    def _open(self, token: Token, call: bool) -> None:
-        self.open.append(_Level(call, self.depth, self.calls, self.compared))
+    def _open(self, token: Token, call: bool, lists: bool = False) -> None:
+        close = "]" if token.text == "[" else ")"
+        self.open.append(_Level(call, lists, close, self.depth, self.calls, self.compared))
         self._deeper(token, call)
         self.compared = False
 
@@ -210,17 +221,22 @@ class _Scan:
             self.source.fail(what, token.position)
 
     def _leave_signs_and_powers(self) -> None:
-        level = self.open[-1] if self.open else _Level(False, -1, 0, False)
+        level = self.open[-1] if self.open else _Level(False, False, "", -1, 0, False)
         self.depth, self.calls = level.depth + 1, level.calls + level.call
 
     def _check_name(self, token: Token, called: bool) -> None:
-        if called and token.text not in FUNCTIONS:
-            near = difflib.get_close_matches(token.text, FUNCTIONS, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(FUNCTIONS)}"
+        known = (*FUNCTIONS, *BLOCKS)
+        if called and token.text not in known:
+            near = difflib.get_close_matches(token.text, known, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(known)}"
             self.source.fail(f"no function '{token.text[:40]}' ({hint})", token.position)
-        if not called and token.text in FUNCTIONS:
+        if not called and token.text in known:
             self.source.fail(f"'{token.text}' is a function and cannot stand alone", token.position)
 
     def _unexpected(self, token: Token, expected: str) -> NoReturn:
+        if token.text in ("[", "]"):
+            self.source.fail(
+                f"a list stands in table only, as in table(x, [0, 1], [0, 2]), not '{token.text}'", token.position
+            )
         shown = token.text if token.kind == "end" else f"'{token.text[:30]}'"
         self.source.fail(f"unexpected {shown}, expected {expected}", token.position)

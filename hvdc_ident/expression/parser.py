@@ -7,6 +7,7 @@ import math
 import operator
 from collections.abc import Callable, Mapping
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, NoReturn
 
 import sympy as sp
@@ -14,8 +15,9 @@ from sympy.core.function import AppliedUndef
 from sympy.logic.boolalg import And
 
 from hvdc_ident.errors import ExpressionError
+from hvdc_ident.expression.blocks import BLOCKS
 from hvdc_ident.expression.functions import FUNCTIONS, function_of, symbol
-from hvdc_ident.expression.grammar import MAX_COMPARISONS, Source, SyntaxTree
+from hvdc_ident.expression.grammar import MAX_COMPARISONS, MAX_POINTS, Source, SyntaxTree
 
 EXACT = 2**53
 """Integers up to here are exact, as in a double; beyond it numbers are floats."""
@@ -44,7 +46,8 @@ def parse(text: str, *, where: str = "") -> sp.Expr:
     """Return the sympy expression that the text of the card's grammar stands for.
 
     text: numbers, names, + - * / **, where(condition, a, b) with one comparison as its condition, clip, min, max, abs,
-    sign, sqrt, exp, log, sin, cos, tan, tanh, asin, acos, atan, atan2, pi and `time`. where: its place, for messages.
+    sign, sqrt, exp, log, sin, cos, tan, tanh, asin, acos, atan, atan2, pi and `time`; blocks as deadband(u, width) and
+    table(x, [0, 1], [0, 2]), which are written with these. where: its place, for messages.
 
     Integers up to 2**53 stay exact, every other number is the double that Python reads. Raises ExpressionError for
     text outside the grammar, too long or too deep, and for constants that are not finite or not real.
@@ -130,6 +133,8 @@ class _Builder:
 
     def _call(self, node: ast.Call) -> sp.Expr:
         name, count = self.tree.token(node).text, len(node.args)
+        if name in BLOCKS:
+            return self._block(node)
         low, high = FUNCTIONS[name].arity
         if not low <= count <= high:
             counts = f"{low}" if low == high else f"{low} to {high}"
@@ -140,6 +145,26 @@ class _Builder:
         if name in ("min", "max"):
             self._count_comparisons(node, arguments)
         return self._guarded(lambda: checked(call(name, arguments)), node)
+
+    def _block(self, node: ast.Call) -> sp.Expr:
+        name = self.tree.token(node).text
+        block = BLOCKS[name]
+        lists = [isinstance(a, ast.List) for a in node.args]
+        if lists != [a.startswith("[") for a in block.arguments]:
+            self._fail(f"'{name}' takes {name}({', '.join(block.arguments)})", node)
+        arguments: list[Any] = [
+            [self.value(item) for item in a.elts] if isinstance(a, ast.List) else self.value(a) for a in node.args
+        ]
+        if name == "table":
+            self._check_table(arguments[1], arguments[2], node)
+        return self._guarded(lambda: finish(block.write(*arguments)), node)
+
+    def _check_table(self, at: list[sp.Expr], values: list[sp.Expr], node: ast.expr) -> None:
+        if len(at) != len(values) or not 2 <= len(at) <= MAX_POINTS:
+            self._fail(f"a table has 2 to {MAX_POINTS} points, got {len(at)} arguments and {len(values)} values", node)
+        for low, high in pairwise(at):
+            if low.is_number and high.is_number and not constant(low) < constant(high):
+                self._fail(f"the arguments of a table rise; {high} follows {low}", node)
 
     def _count_comparisons(self, node: ast.Call, arguments: list[sp.Expr]) -> None:
         """Refuse more pairs of values than sympy, which compares them slowly, has time for."""
