@@ -13,23 +13,28 @@ from typing import Any
 import sympy as sp
 
 from hvdc_ident.errors import ExpressionError, InputError, ModelError, unknown_name
-from hvdc_ident.expression import to_text
+from hvdc_ident.expression import parse, to_text
 from hvdc_ident.files import write_text
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model.check import SECTIONS, required_keys
+from hvdc_ident.model.check import expression as expression_of
+from hvdc_ident.model.components import PARTS, Component, ComponentEntry, Connection, assembled
 from hvdc_ident.model.definition import Model, Parameterisation
+from hvdc_ident.shelf import card_of, components, is_component
 
 SCHEMA = 1
 MAX_BYTES = 5_000_000
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
-_TOP = ("schema", "name", "description", *SECTIONS)
+_TOP = ("schema", "name", "description", *SECTIONS, *PARTS)
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 _SHORT = frozenset(("signals", "outputs"))
 
 
-def read_card(path: str | Path) -> Model:
+def read_card(path: str | Path, inside: tuple[Path, ...] = ()) -> Model:
     """Return the model of a card, a TOML file.
 
+    inside: the cards that this one is a component of, the outermost first.
     Raises ModelError for a file that is missing, over 5 MB, not UTF-8 or not TOML, and ModelError, UnknownNameError
     or ExpressionError with the file and the place in it for what it says.
     """
@@ -47,11 +52,15 @@ def read_card(path: str | Path) -> Model:
     except UnicodeDecodeError as e:
         what = f"the model card is no UTF-8 text (byte {e.start + 1})"
         raise ModelError(what, where=str(path), hint="save it as UTF-8") from None
-    return parse_card(text, str(path))
+    return parse_card(text, str(path), (*inside, path))
 
 
-def parse_card(text: str, where: str = "model card") -> Model:
-    """Return the model of a card's text. where: what to call the card in errors, which are those of `read_card`."""
+def parse_card(text: str, where: str = "model card", inside: tuple[Path, ...] = ()) -> Model:
+    """Return the model of a card's text.
+
+    where: what to call the card in errors, which are those of `read_card`. inside: the card itself, after those that it is a component
+    of; a relative path of a component begins beside it.
+    """
     try:
         card = tomllib.loads(text)
     except tomllib.TOMLDecodeError as e:
@@ -59,12 +68,23 @@ def parse_card(text: str, where: str = "model card") -> Model:
     except (RecursionError, ValueError):
         raise ModelError("the model card is not TOML: nested too deeply or a number too long", where=where) from None
     try:
-        return _model(card)
+        return _model(card, inside)
     except InputError as e:
-        raise e.at(where) from None
+        raise e.at(f"{where}{_line(text, e)}") from None
 
 
-def _model(card: dict[str, Any]) -> Model:
+def _line(text: str, error: InputError) -> str:
+    """Return ", line N" of the component or connection that an error is about; empty for another."""
+    found = re.match(r"\[components\.([^\]]+)\]|\[connections\] '([^']+)'", error.where)
+    if found is None:
+        return ""
+    key = re.escape(found[1] or found[2])
+    begin = rf"\s*\[components\.{key}[.\]]|\s*{key}\s*=" if found[1] else rf"\s*[\"']?{key}[\"']?\s*="
+    lines = text.splitlines()
+    return next((f", line {n}" for n, line in enumerate(lines, 1) if re.match(begin, line)), "")
+
+
+def _model(card: dict[str, Any], inside: tuple[Path, ...]) -> Model:
     for key in card:
         if key not in _TOP:
             raise unknown_name("key", key, _TOP)
@@ -78,7 +98,60 @@ def _model(card: dict[str, Any]) -> Model:
     if "name" not in card:
         raise ModelError("the card has no name", expected='name = "..."')
     sections: dict[str, Any] = {s: _section(s, card[s]) for s in SECTIONS if s in card}
-    return Model(name=card["name"], description=card.get("description", ""), **sections)
+    if "components" not in card and "connections" not in card:
+        return Model(name=card["name"], description=card.get("description", ""), **sections)
+    parts = {n: _component(n, c, inside) for n, c in _table(card, "components").items()}
+    connections = {n: _connection(n, c) for n, c in _table(card, "connections").items()}
+    return assembled(sections, parts, connections, name=card["name"], description=card.get("description", ""))
+
+
+def _table(card: dict[str, Any], section: str) -> dict[str, Any]:
+    found = card.get(section, {})
+    if not isinstance(found, dict):
+        raise ModelError(f"'{section}' is no table", expected=f"[{section}]", got=_kind(found))
+    return found
+
+
+def _component(name: str, item: object, inside: tuple[Path, ...]) -> Component:
+    """Return a component: a shipped one, or that of a card beside this one, with its values."""
+    place = f"[components.{name}]"
+    if not isinstance(item, dict) or not isinstance(item.get("source"), str):
+        raise ModelError("the component has no source", where=place, expected='source = "genrou" or a card\'s path')
+    required_keys(item, ComponentEntry, place)
+    source, values = item["source"], item.get("parameters", {})
+    if not isinstance(values, dict):
+        raise ModelError("its parameters are no table", where=place, expected="{H = 4.2}", got=_kind(values))
+    given: dict[str, float | sp.Expr] = {}
+    for n, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            raise ModelError(
+                f"the value of '{n}' is of the wrong kind", where=place, expected="a number or text", got=_kind(value)
+            )
+        given[n] = parse(value, where=f"{place}, '{n}'") if isinstance(value, str) else float(value)
+    path = card_of(source) if is_component(source) else Path(source)
+    if path.suffix != ".toml":
+        raise unknown_name("shipped component", source, components(), where=place)
+    if not path.is_absolute() and inside:
+        path = inside[-1].parent / path
+    if path.resolve() in [p.resolve() for p in inside]:
+        raise ModelError("the card is a component of itself", where=place, got=str(path))
+    try:
+        return Component(read_card(path, inside), FrozenMap(given))
+    except InputError as e:
+        raise e.at(place) from None
+
+
+def _connection(name: str, item: object) -> Connection:
+    """Return a connection: an expression, or {value = expression, start = number} where it is an unknown of a circle."""
+    place = f"[connections] '{name}'"
+    table = item if isinstance(item, dict) else {"value": item}
+    required_keys(table, Connection, place)
+    value, start = table.get("value"), table.get("start")
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise ModelError("the connection is no expression", where=place, expected='"bus.V"', got=_kind(value))
+    if start is not None and (isinstance(start, bool) or not isinstance(start, int | float)):
+        raise ModelError("the start is no number", where=place, expected="start = 1.0", got=_kind(start))
+    return Connection(expression_of(value, place), None if start is None else float(start))
 
 
 def _section(section: str, table: object) -> dict[str, Any]:

@@ -127,10 +127,10 @@ def _field(kind: type[Any], key: str, value: object, place: str) -> Any:
         return value
     if key in EXPRESSIONS or (key == "value" and kind not in (Parameter, Input)):
         return expression(value, place if key in ("value", "derivative", "equation", "of") else f"{place}, {key}")
-    if kind is State and key in ("guess", "rest") and value is None:
+    if kind is State and key in ("guess", "rest", "vanishes") and value is None:
         return None
-    if kind is State and key == "rest":
-        return expression(value, f"{place}, rest")
+    if kind is State and key in ("rest", "vanishes"):
+        return expression(value, f"{place}, {key}")
     if kind is State and (value is None or (key == "start" and isinstance(value, str) and value == "free")):
         return value
     if kind is State and key in ("start", "rest"):
@@ -267,6 +267,8 @@ def _expressions(model: Model) -> Iterator[tuple[str, str, str, sp.Expr, bool]]:
             yield "states", name, "start", state.start, True
         if state.rest is not None:
             yield "states", name, "rest", state.rest, False
+        if state.vanishes is not None:
+            yield "states", name, "vanishes", state.vanishes, True
     for name, signal in model.signals.items():
         yield "signals", name, "", signal.value, False
     for name, unknown in model.algebraic.items():
@@ -322,6 +324,10 @@ def _unknown(model: Model, name: str, place: str) -> UnknownNameError:
 
 
 def _check_constants(model: Model) -> None:
+    for name, state in model.states.items():
+        if state.vanishes is not None and state.rest is None:
+            place = _place(model, "states", name)
+            raise ModelError("a state that vanishes has no rest", where=place, expected='rest = "..."')
     for name, delay in model.delays.items():
         _bounded(delay.time, False, _place(model, "delays", name, "time"))
     for name, sampled in model.sampled.items():
@@ -403,5 +409,6 @@ def _circle(model: Model, names: list[str]) -> ModelError:
         f"signals run in a circle: {' -> '.join([*shown, names[0]])}",
         where=_model(model),
         expected="signals that lead to states, inputs and parameters",
-        hint=f"make one of them an unknown: move '{names[0]}' from signals to `algebraic`, or put a state or delay in",
+        hint=f"make one of them an unknown: move '{names[0]}' from signals to `algebraic` (give a connection a start), "
+        "or put a state or delay in",
     )

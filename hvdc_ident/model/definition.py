@@ -27,6 +27,7 @@ class State:
 
     guess: where the search for the steady state begins; None: at `rest` where that is given, else several places are tried.
     rest: what the state equals at rest, which a derivative may leave open (0 wherever the state is) or hide (clipped).
+    vanishes: an expression of parameters, a time constant in s: where it is 0 the state is a signal that equals its rest.
     """
 
     derivative: sp.Expr
@@ -35,6 +36,7 @@ class State:
     rest: sp.Expr | None = None
     unit: str = ""
     description: str = ""
+    vanishes: sp.Expr | None = None
 
 
 @dataclass(frozen=True)
@@ -168,8 +170,11 @@ class Model(Shown):
             known = [*self.parameters, *self.inputs]
             return unknown_name("parameter or input", name, known, where=f"model '{self.name}'")
 
+        from hvdc_ident.model.transform import without_vanished
+
         parameters, inputs = with_values(self.parameters, self.inputs, values, unknown)
-        return replace(self, parameters=parameters, inputs=inputs, origin=self.origin or ModelOrigin(self))
+        changed = replace(self, parameters=parameters, inputs=inputs, origin=self.origin or ModelOrigin(self))
+        return without_vanished(changed)
 
     def driven(self, points: Iterable[str]) -> Model:
         """Return the model in which these insertion points are inputs that follow a recorded column, not their equation."""

@@ -14,7 +14,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model.definition import Algebraic, Model, ModelOrigin, Signal
 from hvdc_ident.parameters import Input, Parameter
 
-Renaming = Mapping[sp.Symbol, sp.Symbol]
+Renaming = Mapping[sp.Symbol, sp.Expr]
 
 
 def fresh(model: Model, name: str) -> str:
@@ -41,6 +41,17 @@ def substituted(model: Model, renaming: Renaming) -> dict[str, Any]:
         "delays": FrozenMap({n: replace(d, of=new(d.of)) for n, d in model.delays.items()}),
         "sampled": FrozenMap({n: replace(s, value=new(s.value)) for n, s in model.sampled.items()}),
     }
+
+
+CONSTANT = ("start", "vanishes", "time", "period", "compute")
+"""Fields of a model's objects that are expressions of parameters alone."""
+
+
+def with_constants(item: Any, written: Renaming) -> Any:
+    """Return an object of a model in whose constant fields parameters are expressions of other parameters."""
+    fields = {n: getattr(item, n, None) for n in CONSTANT}
+    changed = {n: e.xreplace(written) for n, e in fields.items() if isinstance(e, sp.Basic)}
+    return replace(item, **changed) if changed else item
 
 
 def insertion_point(model: Model, name: str) -> tuple[str, str]:
@@ -119,6 +130,38 @@ def without_delays(model: Model, names: Collection[str]) -> Model:
         algebraic=model.algebraic | unknowns,
         origin=model.origin or ModelOrigin(model),
     )
+
+
+def without_vanished(model: Model) -> Model:
+    """Return the model in which each state whose time constant `vanishes` is 0 at the parameters' values is a signal, its rest.
+
+    A lag of 0 s is a wire. Where the time constant is a parameter, conditions on it are decided and it cannot leave 0: the block
+    that it belongs to is gone. Raises ModelError where what is left runs in a circle.
+    """
+    gone = {n for n, s in model.states.items() if s.vanishes is not None and _is_zero(model, s.vanishes)}
+    if not gone:
+        return model
+    times = {s.vanishes for n, s in model.states.items() if n in gone and isinstance(s.vanishes, sp.Symbol)}
+    zero = {t: sp.S.Zero for t in times if t.name in model.parameters}
+    wires = {}
+    for n in gone:
+        state = model.states[n]
+        assert state.rest is not None  # the model was checked
+        wires[n] = Signal(state.rest, state.unit, state.description)
+    fixed = {t.name: replace(model.parameters[t.name], min=0.0, max=0.0) for t in zero}
+    kept = replace(
+        model,
+        parameters=model.parameters | fixed,
+        states=model.states.without(*gone),
+        signals=FrozenMap({**wires, **model.signals}),
+        origin=model.origin or ModelOrigin(model),
+    )
+    return replace(kept, **substituted(kept, zero))
+
+
+def _is_zero(model: Model, time: sp.Expr) -> bool:
+    """Return True where a time constant is 0 at the parameters' values."""
+    return float(time.xreplace({symbol(n): sp.Float(v) for n, v in model.values.items()})) == 0.0
 
 
 def with_derivative_signal(model: Model, state: str) -> tuple[Model, str]:
@@ -260,8 +303,14 @@ def tied(model: Model, ties: Mapping[str, sp.Expr]) -> Model:
         for n, e in ties.items()
     }
     others = {k: v for k, v in model.parameterisations.items() if not set(v.replaces) & set(ties)}
+    written = {symbol(n): e for n, e in ties.items()}
+    constants: dict[str, Any] = {
+        section: FrozenMap({n: with_constants(i, written) for n, i in getattr(model, section).items()})
+        for section in ("states", "delays", "sampled")
+    }
     return replace(
         _derived(model),
+        **constants,
         parameters=model.parameters.without(*ties),
         signals=FrozenMap({**signals, **model.signals}),
         parameterisations=FrozenMap(others),

@@ -22,6 +22,7 @@ from pydantic import BaseModel
 from hvdc_ident.files import write_text
 from hvdc_ident.model.card import SCHEMA
 from hvdc_ident.model.check import EXPRESSIONS, SECTIONS
+from hvdc_ident.model.components import PARTS
 from hvdc_ident.study.schema import StudyFile
 
 FOLDER = "schema"
@@ -31,7 +32,7 @@ SCHEMA_LINE = f"#:schema ./{FOLDER}/study.json"
 copied or sent takes its schema along, and no file names a folder of one machine."""
 NAMES = ("study", "model-card")
 _DRAFT = "https://json-schema.org/draft/2020-12/schema"
-_SHORT = ("signals", "outputs")
+_SHORT = ("signals", "outputs", "connections")
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,9 @@ def _tables_in(annotation: Any, named: bool = False) -> Iterator[tuple[type[Base
 
 # --- model cards ---
 
+CARD = {**SECTIONS, **PARTS}
+"""Sections of a card with their entries' classes."""
+
 
 def card_keys() -> dict[str, list[Key]]:
     """Return the keys of every section of a model card, by the section's name ("card" for the top), with their texts."""
@@ -131,7 +135,7 @@ def card_keys() -> dict[str, list[Key]]:
             _key(f.name, texts[section][f.name], f.default is MISSING, f.default, _card_value(section, f))
             for f in fields(kind)
         ]
-        for section, (kind, _, _) in SECTIONS.items()
+        for section, (kind, _, _) in CARD.items()
     }
 
 
@@ -147,14 +151,14 @@ def card_schema() -> dict[str, Any]:
         "additionalProperties": False,
         "required": ["schema", "name"],
         "properties": properties,
-        "$defs": {section: _card_item(section) for section in SECTIONS},
+        "$defs": {section: _card_item(section) for section in CARD},
     }
 
 
 def _top_kind(key: str) -> dict[str, Any]:
     if key == "schema":
         return {"const": SCHEMA, "type": "integer"}
-    if key not in SECTIONS:
+    if key not in CARD:
         return {"type": "string"}
     item: dict[str, Any] = {"$ref": f"#/$defs/{key}"}
     if key in _SHORT:
@@ -163,7 +167,7 @@ def _top_kind(key: str) -> dict[str, Any]:
 
 
 def _card_item(section: str) -> dict[str, Any]:
-    kind = SECTIONS[section][0]
+    kind = CARD[section][0]
     keys = {k.name: k for k in card_keys()[section]}
     return {
         "type": "object",
@@ -175,18 +179,23 @@ def _card_item(section: str) -> dict[str, Any]:
 
 def _card_value(section: str, field: Field[Any]) -> dict[str, Any]:
     """Return the JSON type of a field: an expression is a text or a number, as is a state's start."""
-    if field.name in ("unit", "description"):
+    if field.name in ("unit", "description", "source"):
         return {"type": "string"}
+    if (section, field.name) == ("components", "parameters"):
+        return {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
     if field.name in ("parameters", "replaces"):
         item = {"$ref": "#/$defs/parameters"} if field.name == "parameters" else {"type": ["string", "number"]}
         return {"type": "object", "additionalProperties": item}
     if field.name in ("min", "max"):
         return {"type": ["number", "null"]}  # taplo takes TOML's inf for null
-    is_number = section in ("parameters", "inputs") or (section, field.name) == ("algebraic", "start")
+    is_number = section in ("parameters", "inputs") or (section, field.name) in (
+        ("algebraic", "start"),
+        ("connections", "start"),
+    )
     if (
         is_number
         or field.name == "guess"
-        or (field.name not in EXPRESSIONS and field.name not in ("value", "start", "rest"))
+        or (field.name not in EXPRESSIONS and field.name not in ("value", "start", "rest", "vanishes"))
     ):
         return {"type": "number"}
     return {"type": ["string", "number"]}

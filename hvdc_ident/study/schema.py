@@ -21,11 +21,51 @@ from pydantic import (
 def _column_by_name(value: Any) -> Any:
     """A list of names as a table from each name to the column of the same name."""
     if not isinstance(value, list):
-        return value
+        return _numbers_with_dots(value)
     doubled = sorted({str(v) for v in value if value.count(v) > 1})
     if doubled:
         raise ValueError(f"'{doubled[0]}' is listed twice")
     return {v if isinstance(v, str) else _not_text(v): v for v in value}
+
+
+def _with_dots(value: Any) -> Any:
+    """The table with a key a name, where TOML nests the names of a component, gen.H, in a table gen.
+
+    A table nests names where it holds tables alone or no tables are what is expected; `prior` is a key of a parameter's table.
+    """
+    if not isinstance(value, dict):
+        return value
+    flat: dict[Any, Any] = {}
+    for name, item in value.items():
+        inner = _with_dots(item) if isinstance(item, dict) else item
+        if _nests_names(inner):
+            flat |= {f"{name}.{n}": v for n, v in inner.items()}
+        else:
+            flat[name] = item
+    return flat
+
+
+def _nests_names(item: Any) -> bool:
+    return (
+        isinstance(item, dict)
+        and bool(item)
+        and "prior" not in item
+        and all(isinstance(v, dict) for v in item.values())
+    )
+
+
+def _numbers_with_dots(value: Any) -> Any:
+    """The table of numbers or texts with a key a name, where TOML nests the names of a component."""
+    if not isinstance(value, dict):
+        return value
+    flat: dict[Any, Any] = {}
+    for name, item in value.items():
+        flat |= (
+            {f"{name}.{n}": v for n, v in _numbers_with_dots(item).items()}
+            if isinstance(item, dict) and item
+            else {name: item}
+        )
+    return flat
 
 
 def _one_or_three(value: Any) -> Any:
@@ -112,6 +152,7 @@ Columns = Annotated[
     BeforeValidator(_column_by_name),
     WithJsonSchema({"anyOf": [_TEXTS, {"type": "object", "additionalProperties": _TEXT}]}),
 ]
+Numbers = Annotated[dict[Name, FiniteFloat], BeforeValidator(_numbers_with_dots)]
 Interpolation = Literal["hold", "linear"]
 
 
@@ -143,7 +184,7 @@ class ModelTable(TomlTable):
     deadline: Positive | None = None
     load: Positive | None = None
     memory: Positive | None = None
-    values: dict[Name, FiniteFloat] = {}
+    values: Numbers = {}
     effect: list[EffectTable] = []
 
 
@@ -270,8 +311,8 @@ class ExperimentTable(TomlTable):
     noise: dict[Name, Annotated[float | NoiseTable, BeforeValidator(_known_noise)]] = {}
     event: FiniteFloat | None = None
     window: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2), AfterValidator(_rising)] | None = None
-    values: dict[Name, FiniteFloat] = {}
-    columns: dict[Name, ColumnTable] = {}
+    values: Numbers = {}
+    columns: Annotated[dict[Name, ColumnTable], BeforeValidator(_with_dots)] = {}
     nuisance: list[Name] = []
     drive: Columns = {}
     instrument: dict[Name, InstrumentTable] = {}
@@ -294,8 +335,8 @@ class TrimTable(TomlTable):
     inputs: values of other inputs. free: inputs or parameters to be found; left out, the inputs that move the outputs.
     """
 
-    outputs: Annotated[dict[Name, FiniteFloat], Field(min_length=1)]
-    inputs: dict[Name, FiniteFloat] = {}
+    outputs: Annotated[Numbers, Field(min_length=1)]
+    inputs: Numbers = {}
     free: Names | None = None
 
 
@@ -403,7 +444,7 @@ class ResponseTable(TomlTable):
     noise: Positive | None = None
     relative_noise: Positive | None = None
     band: Band | None = None
-    values: dict[Name, FiniteFloat] = {}
+    values: Numbers = {}
     trim: TrimTable | None = None
 
     @model_validator(mode="after")
@@ -553,7 +594,7 @@ class StudyFile(TomlTable):
     version: Literal[1] = Field(alias="schema")
     name: Name | None = None
     model: ModelTable
-    parameters: dict[Name, ParameterTable] = {}
+    parameters: Annotated[dict[Name, ParameterTable], BeforeValidator(_with_dots)] = {}
     experiment: list[ExperimentTable] = []
     response: list[ResponseTable] = []
     linearize: LinearizeTable | None = None

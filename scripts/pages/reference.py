@@ -13,7 +13,7 @@ import typer
 
 import hvdc_ident
 from hvdc_ident.cli import app
-from hvdc_ident.expression import FUNCTIONS
+from hvdc_ident.expression import BLOCKS, FUNCTIONS
 from hvdc_ident.fit.likelihood import LOSSES
 from hvdc_ident.fit.optimisers import catalogue
 from hvdc_ident.formats import formats
@@ -76,7 +76,12 @@ def model_card() -> str:
         "",
         "## Expressions",
         "",
-        f"Numbers, names of the card, `time`, `pi`, `+ - * / **`, comparisons, and the functions {functions}.",
+        f"Numbers, names of the card, `time`, `pi`, `+ - * / **`, comparisons, and the functions {functions}. `H` of the component `gen` "
+        "is `gen.H`.",
+        "",
+        "| block | value |",
+        "|---|---|",
+        *(f"| `{name}({', '.join(b.arguments)})` | {_cell(b.summary)} |" for name, b in BLOCKS.items()),
         "",
     ]
     for section, keys in card_keys().items():

@@ -24,6 +24,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.errors import InputError
 from hvdc_ident.formats import formats
 from hvdc_ident.model.check import SECTIONS
+from hvdc_ident.model.components import PARTS
 from hvdc_ident.study.json_schema import card_keys, study_keys, study_tables
 from hvdc_ident.study.stages import stages
 
@@ -102,7 +103,7 @@ def test_the_tables_of_keys_are_those_of_the_readers() -> None:
     assert {f.alias or n for t in study_tables().values() for n, f in t.model_fields.items()} == {
         k.name for keys in study_keys().values() for k in keys
     }
-    assert set(card_keys()) == {"card", *SECTIONS}
+    assert set(card_keys()) == {"card", *SECTIONS, *PARTS}
 
 
 def test_every_effect_has_its_picture_and_every_format_its_line(site: Path) -> None:

@@ -93,4 +93,4 @@ outputs = {x = "x"}
     ]
     assert np.abs(run["x"] - expected).max() < 1e-5
     held = hi.linearize(hi.load_model(card).with_values({"u": 2.0}))
-    assert held.x0[held.states.index("x")] == pytest.approx(0.5)
+    assert held.x0[held.state_names.index("x")] == pytest.approx(0.5)

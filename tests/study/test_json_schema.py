@@ -66,10 +66,10 @@ def test_every_key_of_the_readers_has_a_text_and_no_other() -> None:
         p: set(keys) for p, keys in texts.items()
     }
     texts = json_schema.key_texts("model-card")
-    assert {s: {f.name for f in fields(kind)} for s, (kind, _, _) in SECTIONS.items()} == {
+    assert {s: {f.name for f in fields(kind)} for s, (kind, _, _) in json_schema.CARD.items()} == {
         s: set(keys) for s, keys in texts.items() if s != "card"
     }
-    assert set(texts["card"]) == {"schema", "name", "description", *SECTIONS}
+    assert set(texts["card"]) == {"schema", "name", "description", *json_schema.CARD}
 
 
 @pytest.mark.parametrize("kind", ["study", "model-card"])

@@ -98,7 +98,7 @@ class _Writer:
         at = len(rest) - len(m.sampled)
         for k, n in enumerate(m.sampled):
             held = f"(start = {float(rest[at + k])!r}, fixed = true)"
-            yield f"discrete Real {identifier(n)}_taken{held};"
+            yield f"discrete Real {identifier(f'{n}_taken')}{held};"
             yield f"discrete Real {identifier(n)}{held};"
         for n, o in m.outputs.items():
             if n not in self.shown:
@@ -118,7 +118,7 @@ class _Writer:
         for n, d in m.delays.items():
             yield f"{identifier(n)} = delay({text(d.of)}, {text(d.time)});"
         for n, q in m.sampled.items():
-            taken, period, compute = f"{identifier(n)}_taken", text(q.period), text(q.compute)
+            taken, period, compute = identifier(f"{n}_taken"), text(q.period), text(q.compute)
             yield f"when sample(0, {period}) then {taken} = {text(q.value)}; end when;"
             if q.compute == 0:
                 yield f"when sample(0, {period}) then {identifier(n)} = {text(q.value)}; end when;"
@@ -173,8 +173,8 @@ KEYWORDS = frozenset(
 
 
 def identifier(name: str) -> str:
-    """Return a variable's name in Modelica, quoted where it is a keyword or a built-in function."""
-    return f"'{name}'" if name in KEYWORDS else name
+    """Return a variable's name in Modelica, quoted where it is a keyword, a built-in function or that of a component's part."""
+    return f"'{name}'" if name in KEYWORDS or "." in name else name
 
 
 class ModelicaPrinter:

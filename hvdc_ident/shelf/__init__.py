@@ -1,0 +1,26 @@
+"""The shelf: standard components of plants, one model card each, named as in the standards and as in .dyr files."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+from hvdc_ident.errors import unknown_name
+
+
+@cache
+def components() -> tuple[str, ...]:
+    """Return the names of the components."""
+    return tuple(sorted(p.stem for p in Path(__file__).parent.glob("*.toml")))
+
+
+def is_component(name: str) -> bool:
+    """Return True where a component of that name is on the shelf."""
+    return name in components()
+
+
+def card_of(name: str) -> Path:
+    """Return the path of a component's card. Raises UnknownNameError for a name that is not on the shelf."""
+    if not is_component(name):
+        raise unknown_name("component", name, components())
+    return Path(__file__).parent / f"{name}.toml"
