@@ -12,7 +12,7 @@ from typing import Any
 
 import sympy as sp
 
-from hvdc_ident.errors import ExpressionError, InputError, ModelError, unknown_name
+from hvdc_ident.errors import ExpressionError, InputError, ModelError, require_known, unknown_name
 from hvdc_ident.expression import parse, to_text
 from hvdc_ident.files import write_text
 from hvdc_ident.immutable import FrozenMap
@@ -26,7 +26,7 @@ SCHEMA = 1
 MAX_BYTES = 5_000_000
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
-_TOP = ("schema", "name", "description", *SECTIONS, *PARTS)
+_TOP = ("schema", "name", "description", "record", *SECTIONS, *PARTS)
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 _SHORT = frozenset(("signals", "outputs"))
 
@@ -98,11 +98,19 @@ def _model(card: dict[str, Any], inside: tuple[Path, ...]) -> Model:
     if "name" not in card:
         raise ModelError("the card has no name", expected='name = "..."')
     sections: dict[str, Any] = {s: _section(s, card[s]) for s in SECTIONS if s in card}
+    _check_record(card.get("record", []), sections.get("parameters", {}))
     if "components" not in card and "connections" not in card:
         return Model(name=card["name"], description=card.get("description", ""), **sections)
     parts = {n: _component(n, c, inside) for n, c in _table(card, "components").items()}
     connections = {n: _connection(n, c) for n, c in _table(card, "connections").items()}
     return assembled(sections, parts, connections, name=card["name"], description=card.get("description", ""))
+
+
+def _check_record(record: object, parameters: dict[str, Any]) -> None:
+    """Refuse a record that is no list of parameters' names; "-" stands for a value that no parameter has."""
+    if not isinstance(record, list) or not all(isinstance(n, str) for n in record):
+        raise ModelError("the record is no list of names", expected='record = ["H", "D"]', got=_kind(record))
+    require_known("parameter", [n for n in record if n != "-"], parameters, "record")
 
 
 def _table(card: dict[str, Any], section: str) -> dict[str, Any]:

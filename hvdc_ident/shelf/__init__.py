@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from functools import cache
 from pathlib import Path
 
@@ -24,3 +25,9 @@ def card_of(name: str) -> Path:
     if not is_component(name):
         raise unknown_name("component", name, components())
     return Path(__file__).parent / f"{name}.toml"
+
+
+@cache
+def record_of(name: str) -> tuple[str, ...]:
+    """Return a component's parameters in the order of the values of its .dyr record; "-" for a value that it does not use."""
+    return tuple(tomllib.loads(card_of(name).read_text(encoding="utf-8")).get("record", ()))

@@ -158,6 +158,8 @@ def card_schema() -> dict[str, Any]:
 def _top_kind(key: str) -> dict[str, Any]:
     if key == "schema":
         return {"const": SCHEMA, "type": "integer"}
+    if key == "record":
+        return {"type": "array", "items": {"type": "string"}}
     if key not in CARD:
         return {"type": "string"}
     item: dict[str, Any] = {"$ref": f"#/$defs/{key}"}

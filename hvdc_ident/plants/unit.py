@@ -1,0 +1,151 @@
+"""The card of one unit: a machine or converter with its controls, at an infinite bus or played back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Literal
+
+from hvdc_ident.errors import ModelError
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import Model, read_card
+from hvdc_ident.model.card import toml_key, toml_string
+from hvdc_ident.parameters import Input
+from hvdc_ident.shelf import card_of, record_of
+
+UNCONNECTED = FrozenMap({"Vs": "0", "Voel": "0", "Vuel": "0", "dwn": "0", "Paux": "0"})
+"""What an input is that no other component gives: no stabiliser, no limiter, a network of nominal frequency."""
+SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu"})
+"""Outputs of a unit, where one of its components has them, with their units."""
+
+
+NAMES = FrozenMap({"Ir": "gen", "Efd": "avr", "Pm": "gov", "Vs": "pss"})
+"""Name of a part in a unit by the output that it gives; another goes by the name of its component."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A component of a unit. source: its name on the shelf; values: parameters that differ from its card's."""
+
+    source: str
+    values: Mapping[str, float] = field(default_factory=FrozenMap)
+
+
+def unit_card(
+    parts: Mapping[str, Part],
+    *,
+    name: str = "unit",
+    network: Literal["infinite-bus", "playback"] = "infinite-bus",
+    R: float = 0.0,
+    X: float = 0.2,
+    f0: float = 50.0,
+) -> str:
+    """Return the text of the card of a unit.
+
+    parts: by name, among them one with a current into the network. An input of a part follows the output of its name that another part
+    has; one that none has is an input of the unit with that name (a reference), or what `UNCONNECTED` says.
+    network: an infinite bus behind the impedance R + jX (pu of the system base), or the recorded voltage and frequency at the terminals.
+    f0: nominal frequency, Hz. Raises ModelError where no part or several give a current.
+    """
+    models = {n: shelf_model(p.source) for n, p in parts.items()}
+    machine = _one_that_gives(models, "Ir")
+    lines = ["schema = 1", f"name = {toml_string(name)}"]
+    inputs = {"E": Input(1.0, "pu", "voltage of the infinite bus")} if network == "infinite-bus" else {}
+    if network == "playback":
+        inputs |= {"V": Input(1.0, "pu", "recorded voltage"), "f": Input(f0, "Hz", "recorded frequency")}
+    connections = _network(machine, network)
+    for part, model in models.items():
+        for u, quantity in model.inputs.items():
+            target = f"{part}.{u}"
+            if target in connections:
+                continue
+            sources = [n for n, other in models.items() if n != part and u in other.outputs]
+            if len(sources) > 1:
+                raise ModelError(f"'{target}' may follow several parts", expected="one", got=", ".join(sources))
+            connections[target] = f"{sources[0]}.{u}" if sources else UNCONNECTED.get(u, u)
+            if not sources and u not in UNCONNECTED:
+                inputs.setdefault(u, quantity)
+    lines += ["", "[inputs]", *(_input_line(n, i) for n, i in inputs.items())]
+    shared = {"f0": f0}
+    for part, p in parts.items():
+        own = {n: v for n, v in shared.items() if n in models[part].parameters} | dict(p.values)
+        lines += ["", f"[components.{part}]", f"source = {toml_string(p.source)}"]
+        lines += (
+            [f"parameters = {{{', '.join(f'{toml_key(n)} = {float(v)!r}' for n, v in own.items())}}}"] if own else []
+        )
+    if network == "playback":
+        lines += ["", "[components.bus]", 'source = "playback"', f"parameters = {{f0 = {f0!r}}}"]
+    else:
+        lines += ["", "[components.grid]", 'source = "infinite-bus"']
+        lines += ["", "[components.line]", 'source = "line"', f"parameters = {{R = {R!r}, X = {X!r}}}"]
+    lines += ["", "[connections]"]
+    lines += [f"{toml_key(n)} = {e if e.startswith('{') else toml_string(e)}" for n, e in connections.items()]
+    lines += ["", "[outputs]"]
+    for n, unit in SHOWN.items():
+        source = next((part for part, model in models.items() if n in model.outputs), None)
+        lines += [f'{n} = {{value = "{source}.{n}", unit = "{unit}"}}'] if source else []
+    return "\n".join(lines) + "\n"
+
+
+def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, Part]:
+    """Return the parts of a unit by name. records: by model (GENROU, SEXS), the values of its .dyr record in their order."""
+    parts = {}
+    for model, values in records.items():
+        source = model.lower()
+        names = record_of(source)
+        if len(values) != len(names):
+            raise ModelError(
+                f"the record of {model} has another number of values",
+                expected=f"{len(names)}: {', '.join(names)}",
+                got=str(len(values)),
+            )
+        outputs = shelf_model(source).outputs
+        name = next((n for o, n in NAMES.items() if o in outputs), source)
+        parts[name] = Part(source, {n: float(v) for n, v in zip(names, values, strict=True) if n != "-"})
+    return parts
+
+
+def _network(machine: str, network: str) -> dict[str, str]:
+    """Return the connections of the machine with the network."""
+    if network == "playback":
+        return {
+            "bus.V": "V",
+            "bus.f": "f",
+            f"{machine}.Vr": "bus.Vr",
+            f"{machine}.Vi": "bus.Vi",
+            f"{machine}.dwn": "bus.dwn",
+        }
+    return {
+        "grid.V": "E",
+        "grid.theta": "0",
+        "line.Vr_far": "grid.Vr",
+        "line.Vi_far": "grid.Vi",
+        "line.Ir": f"{machine}.Ir",
+        "line.Ii": f"{machine}.Ii",
+        f"{machine}.Vr": '{value = "line.Vr", start = 1.0}',
+        f"{machine}.Vi": '{value = "line.Vi", start = 0.2}',
+    }
+
+
+@cache
+def shelf_model(name: str) -> Model:
+    """Return a component of the shelf. Raises UnknownNameError for a name that is not there."""
+    return read_card(card_of(name))
+
+
+def _one_that_gives(models: Mapping[str, Model], output: str) -> str:
+    found = [n for n, m in models.items() if output in m.outputs]
+    if len(found) != 1:
+        got = ", ".join(found) or "none"
+        raise ModelError(
+            "a unit has one part with a current into the network", expected="one machine or converter", got=got
+        )
+    return found[0]
+
+
+def _input_line(name: str, quantity: Input) -> str:
+    return (
+        f"{toml_key(name)} = {{value = {quantity.value!r}, unit = {toml_string(quantity.unit)}, "
+        f"description = {toml_string(quantity.description)}}}"
+    )
