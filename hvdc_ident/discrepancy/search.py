@@ -134,10 +134,17 @@ def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -
     ]
     opened, trials = _led_on(stand, opened, stand.refitted(found, _field(search, found, hopeful), text), number)
     given = as_given(opened.before)
-    if not search.spent and all_far(opened.before, trials, near=TOLERANCE):
-        # Bends are missed between two sizes, and gains that make up for an effect may leave no trace of it.
+    far = not search.spent and all_far(opened.before, trials, near=TOLERANCE)
+    if far:
+        # Bends are missed between two sizes.
         opened = replace(opened, candidates=tuple(map(_denser, opened.candidates)))
+        # A form tells by a few refits whether the catalogue lacks something, before all of it is looked at more closely.
+        opened, trials = _outside(search, stand, opened, trials, number)
+        if opened.form is not None:
+            return opened, trials
+    if far and not search.spent:
         found = opened.candidates
+        # Gains that make up for an effect may leave no trace of it.
         for point in (None,) if given is None else (None, given):
             where = f"{text}: {'once more' if point is None else 'from the given values'}"
             shots = _field(search, found, stand.screen(found, where, point=point).shots)
@@ -151,11 +158,7 @@ def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -
         opened, trials = _led_on(stand, opened, best_each([*trials, *more]), number)
     if not search.spent:
         opened, trials = met(stand, opened, trials, number, far=all_far(opened.before, trials))
-    if number == 1 and search.options.fallback and not search.spent and _tells(opened, trials):
-        best = next(iter(by_cost(trials)), None)
-        if best is not None and not is_noise(best.refit, search.seed):
-            opened, trials = _outside(search, stand, opened, trials)
-    return opened, trials
+    return _outside(search, stand, opened, trials, number)
 
 
 def _field(search: SearchContext, found: Sequence[CandidateEffect], shots: Sequence[Shot]) -> list[Shot]:
@@ -264,16 +267,23 @@ def _delaying(candidate: CandidateEffect, late: float) -> list[dict[str, float]]
 
 
 def _outside(
-    search: SearchContext, stand: Stand, opened: Round, trials: list[CandidateFit]
+    search: SearchContext, stand: Stand, opened: Round, trials: list[CandidateFit], number: int
 ) -> tuple[Round, list[CandidateFit]]:
     """Return the round with the refits of forms outside the catalogue, and the form that comes nearer than any effect, if one does.
 
     A form with many values finds the place and the gains where an effect, beside biased gains, did not: a filter whose poles and zeros
-    meet is a gain. So every effect is tried there, begun with the gains that the form came to. Where one of them comes near the
-    noise too, the catalogue lacks nothing.
+    meet is a gain. So every effect is tried there, begun with the gains that the form came to. Where one of them
+    comes near the noise too, the catalogue lacks nothing. Forms are looked for in the first round, where the best refit takes away
+    some of the misfit and leaves more than noise.
     """
-    opened = replace(opened, forms=tried(search, opened))
-    form = standing(search, opened, opened.forms or (), by_cost(trials)[0].refit)
+    best = next(iter(by_cost(trials)), None)
+    if number > 1 or not search.options.fallback or search.spent or best is None or not _tells(opened, trials):
+        return opened, trials
+    if is_noise(best.refit, search.seed):
+        return opened, trials
+    if opened.forms is None:
+        opened = replace(opened, forms=tried(search, opened))
+    form = standing(search, opened, opened.forms or (), best.refit)
     if form is None or search.spent:
         return opened, trials
     at = form.refit.placed[-1].candidate.at
