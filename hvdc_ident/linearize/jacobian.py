@@ -51,6 +51,7 @@ def linearize(
     [4.87, 4.87]
     """
     at = find_operating_point(model) if point is None else point
+    model, at = _with_constants_as_inputs(model, at)
     inputs = [inputs] if isinstance(inputs, str) else inputs
     outputs = [outputs] if isinstance(outputs, str) else outputs
     if not isinstance(model, Model):
@@ -73,6 +74,24 @@ def linearize(
     closed = _closed(s, at.p, parts, names)
     gradient = _gradient(s, at, parts, jac, modes, reduced, names, chosen, closed) if names else {}
     return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side, closed)
+
+
+def _with_constants_as_inputs(model: AnyModel, at: OperatingPoint) -> tuple[AnyModel, OperatingPoint]:
+    """Return the model and its point with states that never move as inputs: a reference that the start is found with is no mode."""
+    if not isinstance(model, Model):
+        return model, at
+    constants = _constants(model)
+    if not constants:
+        return model, at
+    held = model.with_values({**at.parameters, **at.inputs}).driven(constants)
+    values = {n: at.states[n] for n in constants}
+    guess = {n: v for n, v in (at.states | at.unknowns).items() if n not in constants}
+    return held.with_values(values), find_operating_point(held.with_values(values), guess=guess)
+
+
+def _constants(model: Model) -> list[str]:
+    """Return the states that stand where the start puts them."""
+    return [n for n, s in model.states.items() if s.derivative == 0 and s.rest is not None]
 
 
 def _closed(s: CompiledSystem, p: Array, parts: Blocks, names: Sequence[str]) -> tuple[int, ...]:
@@ -100,7 +119,7 @@ def _eliminated(
 
 
 def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, pade_order: int = 5) -> Array:
-    """Return A, (states, states), at a point given by its vectors. Raises as `linearize` does."""
+    """Return A, (states, states), at a point given by its vectors, without states that never move. Raises as `linearize` does."""
     _, _, parts, reduced = _eliminated(model, s, y, w, p, "refuse", pade_order)
     if reduced.condition > WELL_POSED:
         raise LinearizationError(
@@ -109,7 +128,8 @@ def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, 
             got=f"condition number {reduced.condition:.2g}",
             hint="use linearize(), which keeps it as a descriptor",
         )
-    return np.asarray(reduced.result[: parts.n, : parts.n])
+    constant = [s.states.index(n) for n in _constants(model)]
+    return np.delete(np.delete(reduced.result[: parts.n, : parts.n], constant, 0), constant, 1)
 
 
 def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Characteristic:

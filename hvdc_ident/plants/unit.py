@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal
 
@@ -16,6 +16,12 @@ from hvdc_ident.shelf import card_of, record_of
 
 UNCONNECTED = FrozenMap({"Vs": "0", "Voel": "0", "Vuel": "0", "dwn": "0", "Paux": "0"})
 """What an input is that no other component gives: no stabiliser, no limiter, a network of nominal frequency."""
+REFERENCES = (
+    ("P0", "P", "MW", ("Pref", "Plant_pref", "Pm")),
+    ("Q0", "Q", "Mvar", ("Vref", "Qref", "Qext", "Efd")),
+)
+"""Of a unit that is played back: the input with the recorded level before the event, its output and unit, and the reference that is
+found from it, the first that the unit has."""
 SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu"})
 """Outputs of a unit, where one of its components has them, with their units."""
 
@@ -45,7 +51,8 @@ def unit_card(
 
     parts: by name, among them one with a current into the network. An input of a part follows the output of its name that another part
     has; one that none has is an input of the unit with that name (a reference), or what `UNCONNECTED` says.
-    network: an infinite bus behind the impedance R + jX (pu of the system base), or the recorded voltage and frequency at the terminals.
+    network: an infinite bus behind the impedance R + jX (pu of the system base), or the recorded voltage at the terminals and its angle
+    or frequency.
     f0: nominal frequency, Hz. Raises ModelError where no part or several give a current.
     """
     models = {n: shelf_model(p.source) for n, p in parts.items()}
@@ -53,7 +60,7 @@ def unit_card(
     lines = ["schema = 1", f"name = {toml_string(name)}"]
     inputs = {"E": Input(1.0, "pu", "voltage of the infinite bus")} if network == "infinite-bus" else {}
     if network == "playback":
-        inputs |= {"V": Input(1.0, "pu", "recorded voltage"), "f": Input(f0, "Hz", "recorded frequency")}
+        inputs |= {n: replace(i, value=f0) if n == "f" else i for n, i in shelf_model("playback").inputs.items()}
     connections = _network(machine, network)
     for part, model in models.items():
         for u, quantity in model.inputs.items():
@@ -66,6 +73,7 @@ def unit_card(
             connections[target] = f"{sources[0]}.{u}" if sources else UNCONNECTED.get(u, u)
             if not sources and u not in UNCONNECTED:
                 inputs.setdefault(u, quantity)
+    found = _references(inputs) if network == "playback" else {}
     lines += ["", "[inputs]", *(_input_line(n, i) for n, i in inputs.items())]
     shared = {"f0": f0}
     for part, p in parts.items():
@@ -81,6 +89,12 @@ def unit_card(
         lines += ["", "[components.line]", 'source = "line"', f"parameters = {{R = {R!r}, X = {X!r}}}"]
     lines += ["", "[connections]"]
     lines += [f"{toml_key(n)} = {e if e.startswith('{') else toml_string(e)}" for n, e in connections.items()]
+    for reference, (level, output, quantity) in found.items():
+        # It never moves; where it stands follows from the level of the output.
+        rest = f"{reference} + ({level} - {machine}.{output})/{machine}.Sn"
+        lines += ["", f"[states.{toml_key(reference)}]", 'derivative = "0"', f"rest = {toml_string(rest)}"]
+        lines += [f"guess = {quantity.value!r}", f"unit = {toml_string(quantity.unit)}"]
+        lines += [f"description = {toml_string(quantity.description)}"]
     lines += ["", "[outputs]"]
     for n, unit in SHOWN.items():
         source = next((part for part, model in models.items() if n in model.outputs), None)
@@ -106,11 +120,23 @@ def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, Part]:
     return parts
 
 
+def _references(inputs: dict[str, Input]) -> dict[str, tuple[str, str, Input]]:
+    """Return by reference its level's name, its output and what it was; the levels take the places of the references among the inputs."""
+    found = {}
+    for level, output, unit, names in REFERENCES:
+        reference = next((n for n in names if n in inputs), None)
+        if reference is not None:
+            found[reference] = (level, output, inputs.pop(reference))
+            inputs[level] = Input(0.0, unit, f"{output} before the event")
+    return found
+
+
 def _network(machine: str, network: str) -> dict[str, str]:
     """Return the connections of the machine with the network."""
     if network == "playback":
         return {
             "bus.V": "V",
+            "bus.theta": "theta",
             "bus.f": "f",
             f"{machine}.Vr": "bus.Vr",
             f"{machine}.Vi": "bus.Vi",

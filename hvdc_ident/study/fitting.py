@@ -14,7 +14,6 @@ from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.files import csv_columns
 from hvdc_ident.fit import FitResult, Group, Problem, StartOutcome, fit, fit_each, fit_individually
 from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
-from hvdc_ident.fit.frequency_data import with_responses
 from hvdc_ident.fit.judgement import judge
 from hvdc_ident.fit.likelihood import loss
 from hvdc_ident.fit.partial_fits import part_of
@@ -25,6 +24,7 @@ from hvdc_ident.identifiability.gate import searched
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.checks import need_candidates, need_experiments, need_start
+from hvdc_ident.study.recorded_inputs import fitted_records
 from hvdc_ident.study.schema import FitTable
 from hvdc_ident.study.study import priors
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 def problem_of(study: Study) -> Problem:
     """Return the fit of all candidates to the study's recordings and measured frequency responses."""
-    simulator, experiments = with_responses(study.model, study.experiments, study.responses)
+    simulator, experiments = fitted_records(study)
     return Problem(simulator, experiments, tuple(study.candidates.values()))
 
 

@@ -167,12 +167,14 @@ def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> 
             hint="[model.values] for parameters",
         )
     require_known("input", table.values, model.inputs, f"{place}.values")
+    require_known("input", table.trim, model.inputs, f"{place}.trim")
+    require_known("measured output", table.trim.values(), table.outputs, f"{place}.trim")
     require_known(
         "nuisance", table.nuisance, [TIME_SHIFT, *model.inputs, *table.drive, *model.states], f"{place}.nuisance"
     )
     if isinstance(table.interpolation, dict):
         require_known("input", table.interpolation, [*table.inputs, *table.drive], f"{place}.interpolation")
-    for kind, names in (("values", table.values), ("drive", table.drive)):
+    for kind, names in (("values", table.values), ("drive", table.drive), ("trim", table.trim)):
         if both := [n for n in names if n in table.inputs]:
             raise StudyError(f"'{both[0]}' stands in inputs and in {kind}", where=place, expected="one of them")
 
@@ -242,7 +244,29 @@ def _experiment(
         instrument=instrument,
         nuisance=tuple(dict.fromkeys(table.nuisance)),
     )
-    return with_noise(experiment, stated)
+    experiment, notes = with_noise(experiment, stated)
+    return (_trimmed(experiment, table, mapped) if table.trim else experiment), notes
+
+
+def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapping[str, Array]) -> Experiment:
+    """Return the experiment whose start stands at the levels before the event, of the outputs to be met and of the inputs played in.
+
+    One row of a noisy input would put the references off by its noise, which a voltage control multiplies.
+    """
+    levels = {n: level_before(experiment.time, v, experiment.event) for n, v in mapped.items()}
+    inputs = {
+        n: replace(i, values=np.concatenate([[levels[n]], i.values[1:]])) if i.times.size > 1 else i
+        for n, i in experiment.inputs.items()
+    }
+    values = {n: levels[o] for n, o in table.trim.items()}
+    return experiment.with_(inputs=inputs, values=experiment.values | values)
+
+
+def level_before(time: Array, values: Array, event: float | None) -> float:
+    """Return the mean of the rows before the event, the first recorded row where there is none, in the values' unit."""
+    known = np.isfinite(values)
+    rows = known & before_event(time, values, event)
+    return float(values[rows].mean() if rows.any() else values[known][0])
 
 
 def _time(table: schema.ExperimentTable, data: Trajectory, place: str) -> Array:

@@ -300,6 +300,7 @@ class NoiseTable(TomlTable):
 class ExperimentTable(TomlTable):
     """[[experiment]]: one recording and what to make of it.
 
+    trim: by input, the recorded output at whose level before the event it stands, in the model's unit.
     noise: the standard deviation of an output in the model's unit, or the column that holds it in that of the output's.
     """
 
@@ -312,6 +313,7 @@ class ExperimentTable(TomlTable):
     event: FiniteFloat | None = None
     window: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2), AfterValidator(_rising)] | None = None
     values: Numbers = {}
+    trim: Columns = {}
     columns: Annotated[dict[Name, ColumnTable], BeforeValidator(_with_dots)] = {}
     nuisance: list[Name] = []
     drive: Columns = {}

@@ -40,8 +40,8 @@ def judged(
     study: Study, *, seed: int = 0, executor: Executor | None = None, progress: Progress | None = None
 ) -> IdentifiabilityReport:
     """Return the report on the study's candidates. The study has data and candidates (`fitting.need`)."""
-    from hvdc_ident.fit.frequency_data import with_responses
     from hvdc_ident.identifiability import identifiability, identifiability_by_group
+    from hvdc_ident.study.recorded_inputs import fitted_records
 
     pair = study.settings.identifiability.pair if study.settings.identifiability else None
     common: dict[str, Any] = {
@@ -51,7 +51,7 @@ def judged(
         "progress": progress,
         "pair": (pair[0], pair[1]) if pair else None,
     }
-    simulator, experiments = with_responses(study.model, study.experiments, study.responses)
+    simulator, experiments = fitted_records(study)
     subject = simulator if study.responses else study.model
     asked = (subject, experiments, tuple(study.candidates.values()))
     groups = groups_of(study)
@@ -68,13 +68,13 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     """Tell and keep the local analysis at the given values, where the search will take longer than `SOON`."""
     from hvdc_ident.errors import SimulationError
     from hvdc_ident.fit import Problem
-    from hvdc_ident.fit.frequency_data import with_responses
     from hvdc_ident.identifiability.pilot_fit import cramer_rao_bounds
     from hvdc_ident.processes import available_cores
+    from hvdc_ident.study.recorded_inputs import fitted_records
     from hvdc_ident.study.study import candidate_lines
     from hvdc_ident.text import duration
 
-    simulator, experiments = with_responses(study.model, study.experiments, study.responses)
+    simulator, experiments = fitted_records(study)
     options.progress(0, 1, "first answer: the model and its derivatives at the given values")
     try:
         first = cramer_rao_bounds(Problem(simulator, experiments, tuple(study.candidates.values())))
