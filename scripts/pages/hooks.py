@@ -15,12 +15,13 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
 from hvdc_ident.study.json_schema import NAMES, schema_text  # noqa: E402
-from pages import effects, gallery, notebook, reference, results  # noqa: E402
+from pages import effects, gallery, notebook, reference, results, shelf  # noqa: E402
 
 PAGES: dict[str, Callable[[], str]] = {
     "reference/study-file.md": reference.study_file,
     "reference/model-card.md": reference.model_card,
     "reference/effects.md": effects.page,
+    "reference/components.md": shelf.page,
     "reference/formats.md": reference.waveform_formats,
     "reference/results.md": results.page,
     "reference/python.md": reference.python_names,

@@ -25,6 +25,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.formats import formats
 from hvdc_ident.model.check import SECTIONS
 from hvdc_ident.model.components import PARTS
+from hvdc_ident.shelf import components, record_of
 from hvdc_ident.study.json_schema import card_keys, study_keys, study_tables
 from hvdc_ident.study.stages import stages
 
@@ -104,6 +105,12 @@ def test_the_tables_of_keys_are_those_of_the_readers() -> None:
         k.name for keys in study_keys().values() for k in keys
     }
     assert set(card_keys()) == {"card", *SECTIONS, *PARTS}
+
+
+def test_every_component_has_its_picture_and_its_parameters(site: Path) -> None:
+    page = _text(site, "reference/components")
+    assert page.count('<svg class="drawing flow"') == len(components())
+    assert all(f"<code>{n}</code>" in page for name in components() for n in record_of(name))
 
 
 def test_every_effect_has_its_picture_and_every_format_its_line(site: Path) -> None:
