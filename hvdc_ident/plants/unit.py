@@ -114,10 +114,14 @@ def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, Part]:
                 expected=f"{len(names)}: {', '.join(names)}",
                 got=str(len(values)),
             )
-        outputs = shelf_model(source).outputs
-        name = next((n for o, n in NAMES.items() if o in outputs), source)
-        parts[name] = Part(source, {n: float(v) for n, v in zip(names, values, strict=True) if n != "-"})
+        parts[part_name(source)] = Part(source, {n: float(v) for n, v in zip(names, values, strict=True) if n != "-"})
     return parts
+
+
+def part_name(source: str) -> str:
+    """Return the name of a component in a unit."""
+    outputs = shelf_model(source).outputs
+    return next((n for o, n in NAMES.items() if o in outputs), source)
 
 
 def _references(inputs: dict[str, Input]) -> dict[str, tuple[str, str, Input]]:
