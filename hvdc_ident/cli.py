@@ -19,6 +19,7 @@ from hvdc_ident.command import (
     FmuFormat,
     Open,
     Out,
+    PsseUnit,
     Seed,
     StudyFile,
     Work,
@@ -33,7 +34,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.study.stages import stages
 
 if TYPE_CHECKING:
-    pass
+    from hvdc_ident.study.new_study import NewStudy
 
 app = typer.Typer(
     name="hvdc-ident",
@@ -65,13 +66,20 @@ def new(
         option("--from", "FILE", "A recording to make an experiment of, of any waveform format; may be repeated."),
     ] = None,
     model: Annotated[str | None, option("--model", "MODEL", "With --from: a shipped model, or a path.")] = None,
+    unit: PsseUnit,
     console: Console,
     access: Access,
 ) -> None:
     """Write a commented study to start from: an example with data, or one of recordings and a model.
 
-    With --from and --model, columns are mapped to the model's inputs and outputs by name and unit.
+    With --from and --model, columns are mapped to the model's inputs and outputs by name and unit. With --dyr and --bus in
+    place of --model, the model is the unit of that bus, played back: recorded V and theta or f give P and Q.
     """
+    if unit.dyr is not None or unit.bus is not None:
+        written = _new_unit(folder, recordings or [], model, unit)
+        console.print_json(written.to_dict())
+        console.say(*written.lines)
+        return
     if (recordings is None) != (model is None):
         raise InputError(
             "--from and --model go together",
@@ -92,6 +100,24 @@ def new(
     path = write_starter(folder)
     console.print_json({"schema": 1, "study": path.as_posix()})
     console.say(f"{path} is written. Next: hvdc-ident run {path}")
+
+
+def _new_unit(folder: Path, recordings: list[Path], model: str | None, unit: PsseUnit) -> NewStudy:
+    """Return the study of a unit of a .dyr file. Raises InputError where an option is missing, or one of another kind of study is there."""
+    from hvdc_ident.study.new_unit import UnitAsked, new_unit_study
+
+    if unit.dyr is None or unit.bus is None or not recordings or model is not None:
+        given = {"--dyr": unit.dyr, "--bus": unit.bus, "--from": recordings or None, "--model": model}
+        raise InputError(
+            "--dyr, --bus and --from go together, without --model",
+            where="the command line",
+            expected="a .dyr file, the unit's bus and recordings at its terminals",
+            got=", ".join(n for n, v in given.items() if v is not None),
+            hint="--dyr plant.dyr --raw grid.raw --bus 101 --from event.csv",
+        )
+    return new_unit_study(
+        folder, recordings, UnitAsked(unit.dyr, unit.bus, unit.machine, unit.raw, unit.base, unit.frequency)
+    )
 
 
 def check(

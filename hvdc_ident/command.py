@@ -135,6 +135,38 @@ class Console:
 
 
 @dataclass(frozen=True)
+class PsseUnit:
+    """Options that name a unit of PSS/E's files."""
+
+    dyr: Annotated[Path | None, option("--dyr", "FILE", "PSS/E's dynamic data; with --bus and --from.")] = None
+    bus: Annotated[int | None, option("--bus", "N", "With --dyr: the unit's bus.")] = None
+    machine: Annotated[str | None, option("--machine", "ID", "With --dyr: the machine, where the bus has several.")] = (
+        None
+    )
+    raw: Annotated[
+        Path | None, option("--raw", "FILE", "With --dyr: PSS/E's power flow, which has the machine's base.")
+    ] = None
+    base: Annotated[
+        float | None,
+        option(
+            "--base",
+            "MVA",
+            "With --dyr, without --raw: the machine's base.",
+            parser=_number("--base", "MVA", "250", 0, 1e9),
+        ),
+    ] = None
+    frequency: Annotated[
+        float | None,
+        option(
+            "--frequency",
+            "HZ",
+            "With --dyr, without --raw; default 50.",
+            parser=_number("--frequency", "Hz", "60", 0, 1e4),
+        ),
+    ] = None
+
+
+@dataclass(frozen=True)
 class Work:
     """Options of the stages' work."""
 

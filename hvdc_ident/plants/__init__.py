@@ -1,5 +1,16 @@
 """Plants of standard components: units at an infinite bus or at a recorded voltage, wired by the names of their signals."""
 
-from hvdc_ident.plants.unit import Part, parts_of, unit_card
+from hvdc_ident.plants.records import RecordedUnit, recorded_unit, with_unit_values
+from hvdc_ident.plants.unit import LEVELS, MACHINE, Part, parts_of, shelf_model, unit_card
 
-__all__ = ["Part", "parts_of", "unit_card"]
+__all__ = [
+    "LEVELS",
+    "MACHINE",
+    "Part",
+    "RecordedUnit",
+    "parts_of",
+    "recorded_unit",
+    "shelf_model",
+    "unit_card",
+    "with_unit_values",
+]

@@ -22,11 +22,16 @@ REFERENCES = (
 )
 """Of a unit that is played back: the input with the recorded level before the event, its output and unit, and the reference that is
 found from it, the first that the unit has."""
+LEVELS = FrozenMap({level: output for level, output, _, _ in REFERENCES})
+"""By input with a level the output that has it."""
+LOADED = 0.8
+"""Share of its base that a unit delivers where its level is not known."""
 SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu"})
 """Outputs of a unit, where one of its components has them, with their units."""
 
 
-NAMES = FrozenMap({"Ir": "gen", "Efd": "avr", "Pm": "gov", "Vs": "pss"})
+MACHINE = "gen"
+NAMES = FrozenMap({"Ir": MACHINE, "Efd": "avr", "Pm": "gov", "Vs": "pss"})
 """Name of a part in a unit by the output that it gives; another goes by the name of its component."""
 
 
@@ -46,6 +51,7 @@ def unit_card(
     R: float = 0.0,
     X: float = 0.2,
     f0: float = 50.0,
+    levels: Mapping[str, float] = FrozenMap(),
 ) -> str:
     """Return the text of the card of a unit.
 
@@ -53,7 +59,8 @@ def unit_card(
     has; one that none has is an input of the unit with that name (a reference), or what `UNCONNECTED` says.
     network: an infinite bus behind the impedance R + jX (pu of the system base), or the recorded voltage at the terminals and its angle
     or frequency.
-    f0: nominal frequency, Hz. Raises ModelError where no part or several give a current.
+    f0: nominal frequency, Hz. levels: of inputs before the event, from which the search for a start sets out. Raises ModelError where
+    no part or several give a current.
     """
     models = {n: shelf_model(p.source) for n, p in parts.items()}
     machine = _one_that_gives(models, "Ir")
@@ -73,7 +80,8 @@ def unit_card(
             connections[target] = f"{sources[0]}.{u}" if sources else UNCONNECTED.get(u, u)
             if not sources and u not in UNCONNECTED:
                 inputs.setdefault(u, quantity)
-    found = _references(inputs) if network == "playback" else {}
+    found = _references(inputs, parts[machine]) if network == "playback" else {}
+    inputs = {n: replace(i, value=levels.get(n, i.value)) for n, i in inputs.items()}
     lines += ["", "[inputs]", *(_input_line(n, i) for n, i in inputs.items())]
     shared = {"f0": f0}
     for part, p in parts.items():
@@ -124,14 +132,15 @@ def part_name(source: str) -> str:
     return next((n for o, n in NAMES.items() if o in outputs), source)
 
 
-def _references(inputs: dict[str, Input]) -> dict[str, tuple[str, str, Input]]:
+def _references(inputs: dict[str, Input], machine: Part) -> dict[str, tuple[str, str, Input]]:
     """Return by reference its level's name, its output and what it was; the levels take the places of the references among the inputs."""
     found = {}
     for level, output, unit, names in REFERENCES:
         reference = next((n for n in names if n in inputs), None)
         if reference is not None:
             found[reference] = (level, output, inputs.pop(reference))
-            inputs[level] = Input(0.0, unit, f"{output} before the event")
+            base = machine.values.get("Sn", shelf_model(machine.source).values.get("Sn", 100.0))
+            inputs[level] = Input(LOADED * base if output == "P" else 0.0, unit, f"{output} before the event")
     return found
 
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import write_bytes
 from hvdc_ident.text import listed
@@ -76,13 +78,14 @@ class DyrFile:
     def with_values(self, record: DyrRecord, values: Mapping[int, float]) -> DyrFile:
         """Return the file with other numbers in a record, by their places among its values; every other byte stays.
 
+        They are written in single precision, in which PSS/E holds them.
         The record is one of the file, or was before values in other records were exchanged.
         """
         place = next(k for k, r in enumerate(self.records) if r.line == record.line and r.model == record.model)
         own = self.records[place]
         text = self.text
         for k in sorted(values, key=lambda k: own.spans[k].begin, reverse=True):
-            text = text[: own.spans[k].begin] + repr(float(values[k])) + text[own.spans[k].end :]
+            text = text[: own.spans[k].begin] + str(np.float32(values[k])) + text[own.spans[k].end :]
         return replace(self, text=text, records=tuple(_records(text, str(self.path))))
 
     def save(self, path: str | Path) -> Path:

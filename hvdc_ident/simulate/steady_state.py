@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any, Literal
 
 import numpy as np
@@ -30,6 +30,8 @@ Branch = Literal["own", "unconnected"]
 CLOSE = 1e-3  # a guess that is not 0 tells a state's size up to 1 / CLOSE times
 HALVES = 0.5
 """The most that an undamped Newton correction may keep of the one before: Kantorovich's condition (`rest` says how)."""
+AWAY = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
+"""How far from its guess a reference is looked for, of 1 and its size: a control's range is some per cent of its reference wide."""
 ROOM = 256
 DOUBLINGS = 11  # of a hundredth of a state's size: to ten times that, beyond which a state is hardly a neighbour
 
@@ -373,12 +375,25 @@ class Equilibria:
 
     @cached_property
     def _guesses(self) -> list[Array]:
-        """The model's own guesses, then the unknown ones at 0, at 1 and at seeded random places; nan where `rest` tells."""
+        """The model's own guesses, then the unknown ones at 0, at 1 and at seeded random places; nan where `rest` tells.
+
+        References that the start is found with are moved a little either way, too: at their guess a limit may hold, behind which
+        nothing tells in which direction they are.
+        """
         m = self.structure.model
         given = [np.nan if s.guess is None and _tells_place(n, s) else s.guess for n, s in m.states.items()]
         tail = [m.algebraic[n].start for n in self.structure.unknowns]
         if all(g is not None for g in given):
-            return [np.array([*given, *tail], dtype=float)]
+            own = np.array([*given, *tail], dtype=float)
+            references = [k for k, s in enumerate(m.states.values()) if s.derivative == 0 and s.rest is not None]
+            moves = sorted(
+                product((0.0, *AWAY, *(-a for a in AWAY)), repeat=min(len(references), 2)), key=np.linalg.norm
+            )
+            found = [own.copy() for _ in moves]
+            for guess, move in zip(found, moves, strict=True):
+                for k, share in zip(references, move, strict=False):
+                    guess[k] += share * (1.0 + abs(own[k]))
+            return found
         random = np.random.default_rng(0)
         fills = [np.zeros(len(given)), np.ones(len(given)), *(random.normal(size=(4, len(given))))]
         return [np.array([f if g is None else g for g, f in zip(given, fill, strict=True)] + tail) for fill in fills]

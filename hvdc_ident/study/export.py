@@ -190,11 +190,35 @@ def _parameters(source: Study | Model, selected: ValueSet | None, path: Path, _:
     return Written(write_text(path, ssv(values, source.name, selected.note if selected else "")))
 
 
+def _dyr(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOptions) -> Written:
+    """Write the .dyr file that the study's unit is from, with the selected values in its records."""
+    from hvdc_ident.plants import with_unit_values
+    from hvdc_ident.psse import read_dyr
+
+    asked = source.settings.model.dyr if isinstance(source, Study) else None
+    if asked is None or not isinstance(source, Study):
+        raise StudyError(
+            "the study does not say which .dyr file its unit is from",
+            where=f"{source.path.name}, model.dyr" if isinstance(source, Study) else "",
+            expected='dyr = {file = "plant.dyr", bus = 101, machine = "1"} in [model]',
+            hint="`hvdc-ident new DIR --dyr plant.dyr --bus 101 --from event.csv` writes such a study",
+        )
+    file = read_dyr(source.path.parent / asked.file)
+    fitted = dict(selected.values) if selected else {}
+    values = {n: v for n, v in fitted.items() if n in source.candidates}
+    changed, left = with_unit_values(file, file.at(asked.bus, asked.machine), values)
+    note = f"no record has {', '.join(left)}" if left else ""
+    if selected is not None and selected.of == "effect":
+        note = "; ".join(t for t in (note, "a .dyr file has no place for the effect that the values hold with") if t)
+    return Written(changed.save(path), note)
+
+
 _WRITERS: dict[str, Callable[[Study | Model, ValueSet | None, Path, FmuOptions], Written]] = {
     ".toml": _card,
     ".fmu": _fmu,
     ".mo": _modelica,
     ".ssv": _parameters,
+    ".dyr": _dyr,
 }
 
 

@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from hvdc_ident.formats import read_waveforms
 from hvdc_ident.model import AnyModel
 from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.models import is_shipped, load_model
+from hvdc_ident.plants import LEVELS
 from hvdc_ident.study import schema
 from hvdc_ident.study.column_matching import (
     Match,
@@ -40,6 +41,21 @@ COLUMNS_SHOWN = 8
 
 
 @dataclass(frozen=True)
+class DyrOfStudy:
+    """Where a study's unit comes from: a .dyr file, the bus and the machine; unknown: models of its that the unit lacks.
+
+    candidates: parameters that are asked about first, with their bounds. places: patterns of insertion points that are tried.
+    """
+
+    file: Path
+    bus: int
+    machine: str
+    unknown: tuple[str, ...] = ()
+    candidates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    places: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Mapped:
     """One recording of a new study: its experiment's name, its file, its columns, and what was found in it as `check` finds it.
 
@@ -57,11 +73,12 @@ class Mapped:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NewStudy(Shown):
-    """A study that was written. path: its file. model: of the study. recordings: one for each experiment."""
+    """A study that was written. path: its file. model: of the study. recordings: one for each experiment. dyr: where its unit is from."""
 
     path: Path
     model: AnyModel
     recordings: tuple[Mapped, ...]
+    dyr: DyrOfStudy | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return by experiment which column is which signal, the candidates of the others, and what is not used."""
@@ -77,11 +94,14 @@ class NewStudy(Shown):
                 "event": e.event if e else None,
                 "noise": {o: n.std for o, n in r.noise.items()},
             }
-        return {"schema": 1, "study": self.path.as_posix(), "model": self.model.name, "experiments": experiments}
+        found = {"schema": 1, "study": self.path.as_posix(), "model": self.model.name, "experiments": experiments}
+        return found if self.dyr is None else found | {"unknown_models": list(self.dyr.unknown)}
 
     def _screen(self) -> Iterator[str]:
         number = len(self.recordings)
         yield f"{self.path} is written: model {self.model.name}, {number} experiment{'s' if number > 1 else ''}"
+        if self.dyr is not None and self.dyr.unknown:
+            yield _left_out(self.dyr)
         for r in self.recordings:
             yield _found(r)
             used = [
@@ -100,11 +120,13 @@ def new_study(
     *,
     trust: bool = False,
     limits: Mapping[str, float] | None = None,
+    dyr: DyrOfStudy | None = None,
 ) -> NewStudy:
     """Write a study of recordings and a model into a folder, and return what was mapped and what was not.
 
     recordings: files of any known waveform format, one experiment each. model: a shipped name, or the path of a card, an
-    FMU or a Python file (trust: it may run). limits: of an FMU. The study refers to the files where they are.
+    FMU or a Python file (trust: it may run). limits: of an FMU. dyr: where a unit of a .dyr
+    file is from. The study refers to the files where they are.
 
     Columns are mapped to inputs and outputs by name, exactly or but for case and punctuation; units are converted. Where a
     signal and a column are each other's only candidates by unit, and the levels before the event agree, they are mapped too.
@@ -133,8 +155,8 @@ def new_study(
     mapped = tuple(_mapped(path.parent, file, name, plant) for file, name in zip(files, names, strict=True))
     source = str(model) if is_shipped(str(model)) else _relative(Path(model), path.parent)
     write_schemas(path.parent)
-    write_text(path, "\n".join(_study_text(path, source, plant, mapped)) + "\n")
-    return NewStudy(path, plant, mapped)
+    write_text(path, "\n".join(_study_text(path, source, plant, mapped, dyr)) + "\n")
+    return NewStudy(path, plant, mapped, dyr)
 
 
 def matched(record: Trajectory, model: AnyModel) -> tuple[Matching, str]:
@@ -263,25 +285,43 @@ def _base_words(match: Match) -> str:
     return "" if match.base is None else f": base = {match.base:g} {match.column.unit}?"
 
 
-def _study_text(path: Path, source: str, model: AnyModel, recordings: Sequence[Mapped]) -> Iterator[str]:
+def _left_out(dyr: DyrOfStudy) -> str:
+    models = listed(list(dyr.unknown))
+    return f"{models} of bus {dyr.bus} in {dyr.file.name}: not on the shelf, left out of the unit"
+
+
+def _study_text(
+    path: Path, source: str, model: AnyModel, recordings: Sequence[Mapped], dyr: DyrOfStudy | None
+) -> Iterator[str]:
     yield SCHEMA_LINE
     yield f"# A study of {listed(_comment(r.source.name) for r in recordings)}, written by `hvdc-ident new --from`."
     yield "# Read it from top to bottom, take out the # before what is right, then: hvdc-ident check study.toml"
     yield from ("schema = 1", f"name = {toml_string(path.parent.resolve().name or 'study')}", "")
-    yield from ("[model]", f"source = {toml_string(source)}", "")
+    yield from ("[model]", f"source = {toml_string(source)}")
+    if dyr is not None:
+        file = toml_string(_relative(dyr.file, path.parent))
+        yield f"dyr = {{file = {file}, bus = {dyr.bus}, machine = {toml_string(dyr.machine)}}}   # where `export --to FILE.dyr` writes to"
+        yield from [f"# {_left_out(dyr)}"] if dyr.unknown else []
+    yield ""
     yield "# What may be estimated: take out the # of some parameters, and narrow their bounds."
     yield "[parameters]"
-    for name, p in list(model.parameters.items())[:MOST_LISTED]:
+    asked = {} if dyr is None else dyr.candidates
+    yield from (f"{toml_key(n)} = {{min = {low:g}, max = {high:g}}}" for n, (low, high) in asked.items())
+    for name, p in [(n, p) for n, p in model.parameters.items() if n not in asked][:MOST_LISTED]:
         bounds = "" if math.isinf(p.min) and math.isinf(p.max) else f"within [{p.min:g}, {p.max:g}]"
         about = ", ".join(t for t in (p.unit, bounds, p.description) if t)
         yield f"# {toml_key(name)} = {{start = {p.value!r}}}" + (f"   # {_comment(about)}" if about else "")
-    more = len(model.parameters) - MOST_LISTED
+    more = len(model.parameters) - len(asked) - MOST_LISTED
     yield from [f"# and {more} more parameters of the model"] if more > 0 else []
     for r in recordings:
         yield from ("", *_experiment_text(r))
     yield ""
     yield "# The stages. A stage runs if its table is in this file; `simulate` always runs."
-    yield from ("# [fit]            # needs some [parameters]", "# [diagnose]       # what the model lacks")
+    mark = "" if asked and any(r.experiment is not None for r in recordings) else "# "
+    yield from (f"{mark}[identifiability]", f"{mark}[fit]            # needs some [parameters]")
+    yield f"{mark}[diagnose]       # what the model lacks"
+    if dyr is not None and dyr.places:
+        yield f"{mark}places = [{', '.join(map(toml_string, dyr.places))}]   # the controls, and what they act on"
 
 
 def _experiment_text(r: Mapped) -> Iterator[str]:
@@ -296,6 +336,9 @@ def _experiment_text(r: Mapped) -> Iterator[str]:
         yield f"# event = {r.experiment.event!r}   # s, as found from the inputs"
     if r.levels:
         yield f"# {_comment(r.levels)}"
+    trim = _trim(r)
+    if trim:
+        yield f"{mark}trim = {{{', '.join(f'{level} = {toml_string(o)}' for level, o in trim.items())}}}   # the level before the event"
     bases: list[Match] = []
     for kind in ("input", "output"):
         mapped = [m for m in r.columns.mapped if m.target.kind == kind]
@@ -321,6 +364,13 @@ def _experiment_text(r: Mapped) -> Iterator[str]:
             yield f"# {toml_key(m.target.name)} = {{unit = {toml_string(m.column.unit)}, base = {base}}}"
     if r.columns.unused:
         yield f"# columns not used: {_comment(', '.join(r.columns.unused[:MOST_LISTED]))}{_more(r.columns.unused)}"
+
+
+def _trim(r: Mapped) -> dict[str, str]:
+    """Return by input with a level of a unit that is played back its output, where that is mapped."""
+    inputs = {t.name for t in r.columns.missing if t.kind == "input"}
+    outputs = {m.target.name for m in r.columns.mapped if m.target.kind == "output"}
+    return {level: output for level, output in LEVELS.items() if level in inputs and output in outputs}
 
 
 def _unit_words(match: Match) -> str:

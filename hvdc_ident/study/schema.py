@@ -172,6 +172,14 @@ class EffectTable(TomlTable):
     expression: Annotated[str, StringConstraints(max_length=2000)] | None = None
 
 
+class DyrTable(TomlTable):
+    """[model] dyr: the .dyr file that the unit is from, its bus and the machine's identifier."""
+
+    file: Name
+    bus: int
+    machine: Name
+
+
 class ModelTable(TomlTable):
     """[model]: where the model comes from and what differs from it.
 
@@ -186,6 +194,7 @@ class ModelTable(TomlTable):
     memory: Positive | None = None
     values: Numbers = {}
     effect: list[EffectTable] = []
+    dyr: DyrTable | None = None
 
 
 class PriorTable(TomlTable):
@@ -556,9 +565,11 @@ class FitTable(TomlTable):
 class DiagnoseTable(TomlTable):
     """[diagnose]: which effects to try ("all" may stand beside others), by output the error below which a gap is of no interest
     (`tolerance`; `material` is its earlier name), how many effects may be missing at most, whether what promises little is
-    refitted too where nothing comes near the noise, and the seconds after which nothing further is looked for."""
+    refitted too where nothing comes near the noise, the seconds after which nothing further is looked for, and the insertion points
+    that are tried, by name or pattern (avr.*), left out all."""
 
     effects: Annotated[Literal["all"] | list[Name], BeforeValidator(_effect_names)] = "all"
+    places: Names | None = None
     tolerance: dict[Name, Positive] = {}
     material: dict[Name, Positive] = {}
     most: Annotated[int, Field(ge=1)] = 3

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import fnmatch
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.errors import ComputationError
+from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 from hvdc_ident.text import form_of, percentage, value_by_place
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy import Diagnosis
     from hvdc_ident.executor import Executor, Progress
+    from hvdc_ident.model import AnyModel
     from hvdc_ident.study.study import Study
 
 
@@ -84,6 +86,7 @@ def diagnosed(
         study.experiments,
         tuple(study.candidates.values()),
         effects="all" if asked.effects == "all" else list(asked.effects),
+        places=None if asked.places is None else places_of(study.model, asked.places),
         tolerance=asked.tolerances,
         report=report,
         options=DiagnosisOptions(most=asked.most, thorough=asked.thorough, budget=budget or asked.budget),
@@ -96,6 +99,17 @@ def diagnosed(
     names = ", ".join(r.name for r in study.responses)
     note = f"The measured frequency responses ({names}) are not used here: an effect is looked for in recordings alone."
     return replace(found, notes=(*found.notes, note))
+
+
+def places_of(model: AnyModel, patterns: Sequence[str]) -> list[str]:
+    """Return the insertion points that one of the patterns matches. Raises UnknownNameError for a pattern without one."""
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        matched = fnmatch.filter(model.insertion_points, pattern)
+        if not matched:
+            raise unknown_name("insertion point", pattern, model.insertion_points, where="diagnose.places")
+        found |= dict.fromkeys(matched)
+    return list(found)
 
 
 def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:

@@ -1,0 +1,101 @@
+"""From a .dyr file and a record at the terminals to a fitted .dyr, as the commands do it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import hvdc_ident as hi
+from hvdc_ident.cli import app
+from hvdc_ident.data import InputSignal
+from hvdc_ident.model import parse_card
+from hvdc_ident.plants import Part, unit_card
+from hvdc_ident.psse import read_dyr
+
+DYR = """// a plant
+101 'GENROU' 1  7.0 0.03 0.75 0.05 3.0 0.0 2.1 2.0 0.2 0.5 0.18 0.15 0.05 0.3 / machine
+101 'SEXS' 1  0.1 10.0 100.0 0.1 0.0 5.0 /   exciter
+102 'GENCLS' 1 4.0 0.0 /
+101 'TGOV1' 1 0.05 0.5 1.0 0.0 2.0 6.0 0.0 /
+101 'XYZ9' 1 1 2 3 /
+"""
+RAW = """0, 100.0, 33, 0, 0, 50.0 / case
+one
+two
+101,'UNIT', 20.0,2,1,1,1,1.02,10.5
+0 / END OF BUS DATA
+0 / END OF LOAD DATA
+0 / END OF FIXED SHUNT DATA
+101,'1 ',200.0,31.5,120.0,-80.0,1.02,0,250.0,0.0,0.25
+0 / END OF GENERATOR DATA
+Q
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The files of a unit of 250 MVA whose inertia is 3.6 s and whose exciter's gain is 140, and its record of a voltage dip."""
+    folder = tmp_path_factory.mktemp("plant")
+    (folder / "plant.dyr").write_text(DYR, encoding="utf-8")
+    (folder / "grid.raw").write_text(RAW, encoding="utf-8")
+    parts = {"gen": Part("genrou", {"Sn": 250.0, "H": 3.6}), "avr": Part("sexs", {"K": 140.0}), "gov": Part("tgov1")}
+    card = unit_card(parts, R=0.004, X=0.12)
+    card = card.replace(
+        "[outputs]", '[outputs]\nVr = {value = "line.Vr", unit = "pu"}\nVi = {value = "line.Vi", unit = "pu"}'
+    )
+    model = parse_card(card)
+    point = hi.find_operating_point(model, outputs={"P": 200.0, "Vt": 1.02}, free=["Pref", "Vref"])
+    times = np.arange(0.0, 5.0, 0.01)
+    dip = InputSignal.corners([(1.0, 1.0), (1.2, 0.96)])
+    run = hi.simulate(model.with_values(point.inputs), times, inputs={"E": dip})
+    rng = np.random.default_rng(2)
+    angle = np.unwrap(np.arctan2(run["Vi"], run["Vr"]))
+    columns = [(run["Vt"], 1e-4), (angle - angle[0], 1e-4), (run["P"], 0.1), (run["Q"], 0.1)]
+    table = np.column_stack([times, *(v + s * rng.standard_normal(times.size) for v, s in columns)])
+    np.savetxt(folder / "event.csv", table, delimiter=",", header="time,V,theta,P,Q", comments="")
+    return folder
+
+
+def called(*arguments: object) -> tuple[int, str, str]:
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    return result.exit_code, result.stdout, result.stderr
+
+
+def test_from_a_dyr_file_to_a_fitted_one(folder) -> None:
+    unit = folder / "unit12"
+    new = ["new", unit, "--dyr", folder / "plant.dyr", "--raw", folder / "grid.raw", "--bus", 101]
+    code, out, _ = called(*new, "--from", folder / "event.csv", "--json")
+    assert code == 0 and json.loads(out)["unknown_models"] == ["XYZ9"]
+    study = hi.load_study(unit / "study.toml")
+    assert study.model.values["gen.Sn"] == 250.0 and set(study.candidates) == {"gen.H", "avr.K", "gov.R"}
+    assert study.experiments[0].values["P0"] == pytest.approx(200.0, abs=0.05)
+    assert study.model.inputs["P0"].value == pytest.approx(200.0, abs=0.05)
+    assert called("fit", unit / "study.toml", "--quiet")[0] == 0
+    assert called("export", unit / "study.toml", "--to", folder / "fitted.dyr", "--quiet")[0] == 0
+    before, after = read_dyr(folder / "plant.dyr"), read_dyr(folder / "fitted.dyr")
+    assert after.records[0].values[4] == pytest.approx(3.6, rel=0.02)
+    assert after.records[1].values[2] == pytest.approx(140.0, rel=0.01)
+    lines = [(a, b) for a, b in zip(before.text.split("\n"), after.text.split("\n"), strict=True) if a != b]
+    assert all(
+        a.split()[1] in ("'GENROU'", "'SEXS'", "'TGOV1'") and a.split("/")[1] == b.split("/")[1] for a, b in lines
+    )
+
+
+def test_what_is_missing_is_told(folder, tmp_path) -> None:
+    event, dyr = folder / "event.csv", folder / "plant.dyr"
+    code, _, err = called("new", tmp_path / "a", "--dyr", dyr, "--bus", 101, "--from", event)
+    assert code == 2 and "the base of the machine is not known" in err and "--raw FILE" in err
+    code, _, err = called("new", tmp_path / "b", "--dyr", dyr, "--from", event)
+    assert code == 2 and "--dyr, --bus and --from go together" in err
+    code, _, err = called("new", tmp_path / "c", "--dyr", dyr, "--bus", 7, "--base", 1, "--from", event)
+    assert code == 2 and "no record of bus 7" in err
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_study_without_a_dyr_file_writes_none(tmp_path) -> None:
+    called("new", tmp_path / "x", "--quiet")
+    code, _, err = called("export", tmp_path / "x" / "study.toml", "--to", tmp_path / "y.dyr")
+    assert code == 2 and "does not say which .dyr file" in err
