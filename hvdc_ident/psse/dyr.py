@@ -19,6 +19,7 @@ from hvdc_ident.files import write_bytes
 from hvdc_ident.psse.free_format import (
     BLANKS,
     ENCODING,
+    SHOWN,
     Item,
     Token,
     content_of,
@@ -27,7 +28,7 @@ from hvdc_ident.psse.free_format import (
     start_of,
     tokens,
 )
-from hvdc_ident.text import listed
+from hvdc_ident.text import one_of
 
 Value = float | str | None
 
@@ -104,9 +105,11 @@ class DyrFile:
         buses = list(dict.fromkeys(str(r.bus) for r in self.records))
         if ids:
             raise ModelError(
-                f"no record of machine '{machine}' at bus {bus}", where=self.path, expected=f"the id {_listed(ids)}"
+                f"no record of machine '{machine}' at bus {bus}",
+                where=self.path,
+                expected=f"the id {one_of(ids, SHOWN)}",
             )
-        raise ModelError(f"no record of bus {bus}", where=self.path, expected=f"the bus {_listed(buses)}")
+        raise ModelError(f"no record of bus {bus}", where=self.path, expected=f"the bus {one_of(buses, SHOWN)}")
 
     def with_values(self, record: DyrRecord, values: Mapping[int, float | str]) -> DyrFile:
         """Return the file with some values of a record changed, by their index, and every other byte as it was.
@@ -282,11 +285,6 @@ def _integer(item: Item | None, what: str, where: str) -> int:
 
 def _shown(value: Value) -> str:
     return "nothing" if value is None else f"'{value}'" if isinstance(value, str) else f"{value:g}"
-
-
-def _listed(names: list[str]) -> str:
-    more = [f"{len(names) - 12} more"] if len(names) > 12 else []
-    return listed(names[:12] + more)
 
 
 def _same(new: float | str, old: Value) -> bool:

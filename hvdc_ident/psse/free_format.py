@@ -19,6 +19,8 @@ Kind = Literal["quoted", "comma", "slash", "line", "quote", "word"]
 
 # Every byte of a file is one character of Latin-1, so that places in the text are places in the file.
 ENCODING: Final = "latin-1"
+SHOWN: Final = 12
+"""How many buses or ids an error names, as `errors.unknown_name` does."""
 BLANKS: Final = " \t\f\v\x1a\xa0"
 _TOKEN = re.compile(
     rf"""[{BLANKS}]+

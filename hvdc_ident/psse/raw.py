@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.psse.free_format import BLANKS, ENCODING, content_of, items_of, start_of, tokens
-from hvdc_ident.text import listed
+from hvdc_ident.psse.free_format import BLANKS, ENCODING, SHOWN, content_of, items_of, start_of, tokens
+from hvdc_ident.text import one_of
 
 VERSIONS: Final = (32, 33, 34, 35, 36)
 
@@ -146,7 +146,9 @@ class RawFile:
         found = next((b for b in self.buses if b.number == number), None)
         if found is None:
             raise ModelError(
-                f"no bus {number}", where=self.path, expected=f"the bus {_listed(str(b.number) for b in self.buses)}"
+                f"no bus {number}",
+                where=self.path,
+                expected=f"the bus {one_of([str(b.number) for b in self.buses], SHOWN)}",
             )
         return found
 
@@ -159,9 +161,9 @@ class RawFile:
         which = f"'{machine}' at bus {bus}" if machine is not None else f"of bus {bus}"
         if there:
             what = f"{len(found)} generators {which}" if found else f"no generator {which}"
-            raise ModelError(what, where=self.path, expected=f"the id {_listed(g.id for g in there)}")
+            raise ModelError(what, where=self.path, expected=f"the id {one_of([g.id for g in there], SHOWN)}")
         buses = dict.fromkeys(str(g.bus) for g in self.generators)
-        raise ModelError(f"no generator {which}", where=self.path, expected=f"the bus {_listed(buses)}")
+        raise ModelError(f"no generator {which}", where=self.path, expected=f"the bus {one_of(list(buses), SHOWN)}")
 
 
 class _Section(NamedTuple):
@@ -352,7 +354,7 @@ def _numbers(buses: Sequence[Bus]) -> Number:
             raise ModelError(
                 f"{r.what} at bus {found_number}, which is not there",
                 where=r.where,
-                expected=f"the bus {_listed(str(n) for n in known)}",
+                expected=f"the bus {one_of([str(n) for n in known], SHOWN)}",
             )
         return found_number
 
@@ -467,9 +469,3 @@ def _two_windings(first: _Record, rest: Sequence[_Record], number: Number, sbase
         windv2=other.number(0, "windv2", nominal),
         nomv2=other.number(1, "nomv2", 0.0),
     )
-
-
-def _listed(names: Iterator[str] | Mapping[str, object]) -> str:
-    every = list(names)
-    more = [f"{len(every) - 12} more"] if len(every) > 12 else []
-    return listed(every[:12] + more)

@@ -96,7 +96,7 @@ def test_records_of_a_bus_and_machine(tmp_path: Path) -> None:
     f = _file(tmp_path, HARD)
     assert [r.model for r in f.at(101)] == ["GENROU", "ESST1A"]
     assert [r.model for r in f.at(102, "G1")] == ["WTG_A"]
-    with pytest.raises(ModelError, match=r"no record of bus 7.*expected the bus 101, 102, 0 and 103"):
+    with pytest.raises(ModelError, match=r"no record of bus 7.*expected the bus 101 or 102 or 0 or 103"):
         f.at(7)
     with pytest.raises(ModelError, match=r"no record of machine '9' at bus 102.*expected the id G1"):
         f.at(102, "9")
