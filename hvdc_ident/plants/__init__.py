@@ -1,6 +1,6 @@
 """Plants of standard components: units at an infinite bus or at a recorded voltage, wired by the names of their signals."""
 
-from hvdc_ident.plants.records import RecordedUnit, recorded_unit, with_unit_values
+from hvdc_ident.plants.records import RecordedUnit, machine_records, recorded_unit, with_unit_values
 from hvdc_ident.plants.unit import LEVELS, MACHINE, Part, parts_of, shelf_model, unit_card
 
 __all__ = [
@@ -8,6 +8,7 @@ __all__ = [
     "MACHINE",
     "Part",
     "RecordedUnit",
+    "machine_records",
     "parts_of",
     "recorded_unit",
     "shelf_model",

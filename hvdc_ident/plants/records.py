@@ -20,6 +20,20 @@ class RecordedUnit:
     unknown: tuple[str, ...]
 
 
+def machine_records(file: DyrFile, bus: int, machine: str | None) -> tuple[DyrRecord, ...]:
+    """Return the records of one machine at a bus. Raises ModelError where there is none, or several and none is named."""
+    records = file.at(bus, machine)
+    machines = list(dict.fromkeys(r.machine for r in records))
+    if len(machines) > 1:
+        raise ModelError(
+            f"bus {bus} has several machines",
+            where=file.path,
+            expected=f"one of {listed(machines)}",
+            hint="--machine ID",
+        )
+    return records
+
+
 def recorded_unit(records: Sequence[DyrRecord], base: float) -> RecordedUnit:
     """Return the unit of a machine's records. base: MVA of the machine.
 
@@ -70,7 +84,7 @@ def with_unit_values(
         for k, parameter in enumerate(record_of(source)):
             value = left.pop(f"{name}.{parameter}", None)
             if value is not None and value != record.values[k]:
-                changed[k] = value
+                changed[k] = float(f"{value:.7g}")  # PSS/E's numbers are of single precision
         if changed:
             file = file.with_values(record, changed)
     return file, tuple(left)

@@ -1,6 +1,20 @@
-"""Files of PSS/E: dynamic data (.dyr), read and written back to the byte, and what a unit needs of a power flow (.raw)."""
+"""Files of PSS/E, versions 32 to 36: dynamic data (.dyr) read and written back to the byte, power-flow data (.raw) read."""
 
-from hvdc_ident.psse.dyr import DyrFile, DyrRecord, read_dyr
-from hvdc_ident.psse.raw import RawFile, RawGenerator, read_raw
+from __future__ import annotations
 
-__all__ = ["DyrFile", "DyrRecord", "RawFile", "RawGenerator", "read_dyr", "read_raw"]
+from hvdc_ident.psse.dyr import DyrFile, DyrRecord, UserModel, read_dyr
+from hvdc_ident.psse.raw import Branch, Bus, Generator, Load, RawFile, Transformer, read_raw
+
+__all__ = [
+    "Branch",
+    "Bus",
+    "DyrFile",
+    "DyrRecord",
+    "Generator",
+    "Load",
+    "RawFile",
+    "Transformer",
+    "UserModel",
+    "read_dyr",
+    "read_raw",
+]

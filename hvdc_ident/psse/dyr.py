@@ -1,193 +1,309 @@
-"""Dynamic data of PSS/E (.dyr): records of models in free format, and values exchanged in them without another byte changed.
+"""Dynamic data of PSS/E (.dyr): `bus 'MODEL' id value value ... /`, read, and written back to the byte.
 
-A record is `BUS 'MODEL' ID value value ... /`: items apart by blanks, commas, tabs or line ends, up to a slash; what follows the slash
-on its line is a comment, and so is a line that begins with a slash or with @!. Two commas leave an item out.
+A record may take several lines. Anything after its `/` on the line is a comment, and so is a line that begins with `//` or `@!`, or,
+between records, with `/`. A record of a user-written model, `bus 'USRMDL' id 'NAME' IC IT NI NC NS NV value ... /`, is a record of the
+model NAME. The events that ANDES adds to such files stay in the text and are no records. Source: PSS/E, Program Operation Manual, DYRE.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
-
-import numpy as np
 
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import write_bytes
-from hvdc_ident.text import listed
+from hvdc_ident.psse.free_format import (
+    BLANKS,
+    ENCODING,
+    SHOWN,
+    Item,
+    Token,
+    content_of,
+    items_of,
+    number_text,
+    start_of,
+    tokens,
+)
+from hvdc_ident.text import one_of
 
-MAX_BYTES = 200_000_000
-_ITEM = re.compile(r"""'[^'\n]*'|"[^"\n]*"|[/,]|[^\s,/'"]+""")
-_COMMENT = re.compile(r"[ \t]*(?:/|@!)")
-_EXPONENT = str.maketrans("dD", "ee")
+Value = float | str | None
+
+_NAME = re.compile(
+    r"[A-Za-z][\w.$+-]{2,}"
+)  # of a model; what circuits and machines are called has two characters at most
+_COMMENT = re.compile(rf"[{BLANKS}]*(?://|@!)[^\r\n]*")
+_COMMENT_BETWEEN = re.compile(rf"[{BLANKS}]*(?:/|@!)[^\r\n]*")
+_REST = re.compile(r"[^\r\n]*")
+_LINE_END = re.compile(r"\r\n|\n|\r")
+_B = f"[{BLANKS}]*"
+_RAW = re.compile(
+    rf"(?i)^{_B}0{_B}/?{_B}END OF BUS DATA|\A{_B}(?:@!{_B}IC|0{_B},{_B}[\d.]+{_B},{_B}\d\d\b)",
+    re.MULTILINE,
+)
+_EVENTS = {
+    "TOGGLE",
+    "FAULT",
+    "ALTER",
+}  # of ANDES, which writes them as `Line 'Toggle' Line_1 1.0 /`: of no bus, of no model
+_FORM = "bus 'MODEL' id value value ... /"
 
 
-class Span(NamedTuple):
-    """Place of an item in the text: from the first to behind the last character."""
+@dataclass(frozen=True)
+class UserModel:
+    """The integers of a record of a user-written model, as PSS/E names them."""
 
-    begin: int
-    end: int
+    ic: int
+    """What kind of model it is: 101 a generator, 104 an exciter, ..."""
+    it: int
+    icons: int
+    """NI: how many of the values that follow are integers (ICONs)."""
+    constants: int
+    """NC: how many of the values after those are constants (CONs)."""
+    states: int
+    variables: int
 
 
 @dataclass(frozen=True)
 class DyrRecord:
-    """One record. bus: its number; model: its name in capitals; machine: the identifier of the machine, as text.
+    """One record of dynamic data."""
 
-    values: what follows, numbers, texts (quoted ones without quotes), or None where an item is left out. spans: where each stands in the
-    file's text. line: that of its first item, from 1. A model of the user's own (USRMDL) goes by its own name, its values begin behind it.
-    """
-
+    number: int
+    """The place among the records of the file, from 0."""
     bus: int
     model: str
+    """In upper case, without quotes; of a user-written model that model's name."""
     machine: str
-    values: tuple[float | str | None, ...]
-    spans: tuple[Span, ...]
+    """The machine's id, without quotes and blanks; empty where a user-written model has none."""
+    values: tuple[Value, ...]
+    """What follows; None where two commas leave a value at its default."""
     line: int
+    """The line that the record begins at, from 1."""
+    spans: tuple[tuple[int, int], ...] = field(repr=False)
+    """The first byte of each value in the file, and the one after its last."""
+    user: UserModel | None = None
+    """Of a user-written model only."""
 
 
 @dataclass(frozen=True)
 class DyrFile:
-    """A file's text, each byte a character, with its records in their order. path: where it was read."""
+    """A file of dynamic data: its bytes, and the records in them."""
 
-    path: Path
-    text: str
+    path: str
+    content: bytes = field(repr=False)
     records: tuple[DyrRecord, ...]
 
     def at(self, bus: int, machine: str | None = None) -> tuple[DyrRecord, ...]:
-        """Return the records of a bus, of one machine where it has several. Raises ModelError where there are none, or several machines."""
-        here = [r for r in self.records if r.bus == bus]
-        if not here:
-            buses = sorted({r.bus for r in self.records})
+        """Return the records of a bus, of all its machines or of one id; ModelError, with those there are, where there is none."""
+        found = tuple(r for r in self.records if r.bus == bus and (machine is None or r.machine == machine.strip()))
+        if found:
+            return found
+        ids = list(dict.fromkeys(r.machine for r in self.records if r.bus == bus))
+        buses = list(dict.fromkeys(str(r.bus) for r in self.records))
+        if ids:
             raise ModelError(
-                f"no record of bus {bus}", where=str(self.path), expected=f"one of {listed(list(map(str, buses[:20])))}"
+                f"no record of machine '{machine}' at bus {bus}",
+                where=self.path,
+                expected=f"the id {one_of(ids, SHOWN)}",
             )
-        machines = list(dict.fromkeys(r.machine for r in here))
-        if machine is None and len(machines) > 1:
-            raise ModelError(
-                f"bus {bus} has several machines", where=str(self.path), expected=f"one of {listed(machines)}"
-            )
-        chosen = machines[0] if machine is None else machine.strip()
-        if chosen not in machines:
-            raise ModelError(
-                f"bus {bus} has no machine '{chosen}'", where=str(self.path), expected=f"one of {listed(machines)}"
-            )
-        return tuple(r for r in here if r.machine == chosen)
+        raise ModelError(f"no record of bus {bus}", where=self.path, expected=f"the bus {one_of(buses, SHOWN)}")
 
-    def with_values(self, record: DyrRecord, values: Mapping[int, float]) -> DyrFile:
-        """Return the file with other numbers in a record, by their places among its values; every other byte stays.
+    def with_values(self, record: DyrRecord, values: Mapping[int, float | str]) -> DyrFile:
+        """Return the file with some values of a record changed, by their index, and every other byte as it was.
 
-        They are written in single precision, in which PSS/E holds them.
-        The record is one of the file, or was before values in other records were exchanged.
+        record: of this file, or of the one that this file is a changed copy of. A number has as few digits as give the same double,
+        and a decimal point; a Python int that replaces an integer has none. A value that is the same already keeps its bytes.
+        ModelError for an index that the record does not have, a number that is not finite, and a text that a record cannot hold.
         """
-        place = next(k for k, r in enumerate(self.records) if r.line == record.line and r.model == record.model)
-        own = self.records[place]
-        text = self.text
-        for k in sorted(values, key=lambda k: own.spans[k].begin, reverse=True):
-            text = text[: own.spans[k].begin] + str(np.float32(values[k])) + text[own.spans[k].end :]
-        return replace(self, text=text, records=tuple(_records(text, str(self.path))))
+        mine = self.records[record.number] if record.number < len(self.records) else None
+        if mine is None or (mine.bus, mine.model, mine.machine) != (record.bus, record.model, record.machine):
+            raise ModelError(f"no {record.model} of bus {record.bus} in this place of the file", where=self.path)
+        where = f"{self.path}:{mine.line}"
+        for index in values:
+            if not 0 <= index < len(mine.values):
+                raise ModelError(
+                    f"{mine.model} of bus {mine.bus} has no value {index}",
+                    where=where,
+                    expected=f"an index from 0 to {len(mine.values) - 1}",
+                )
+        places: dict[tuple[int, int], list[int]] = {}
+        for index, place in enumerate(mine.spans):
+            places.setdefault(place, []).append(index)
+        content = self.content
+        for place, indices in sorted(places.items(), reverse=True):
+            if all(k not in values or _same(values[k], mine.values[k]) for k in indices):
+                continue
+            old = content[slice(*place)].decode(ENCODING)
+            # A repeated value, 3*0.5, is written out.
+            new = " ".join(_text(values.get(k, mine.values[k]), old, where) for k in indices)
+            content = content[: place[0]] + new.encode(ENCODING) + content[place[1] :]
+        return _parsed(self.path, content)
 
-    def save(self, path: str | Path) -> Path:
-        """Write the file; return its path."""
-        return write_bytes(Path(path), self.text.encode("latin-1"))
+    def write(self, path: str | Path) -> Path:
+        """Write the bytes of the file, whole or not at all, and return its path."""
+        return write_bytes(Path(path), self.content)
 
 
 def read_dyr(path: str | Path) -> DyrFile:
     """Return the records of a .dyr file.
 
-    Raises ModelError for a file that cannot be read, holds no record, or a record that does not end or has no model's name and machine.
+    ModelError, with file and line, for a record without `/`, a text where a number is due, a quote without its end, a file that is
+    empty, no text, or power-flow data (.raw).
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(MAX_BYTES + 1)
-    except OSError as e:
-        raise ModelError(f"the .dyr file cannot be read: {(e.strerror or '').lower()}", where=str(path)) from None
-    if len(content) > MAX_BYTES or b"\0" in content:
-        raise ModelError("this is no .dyr file", where=str(path), expected=f"text of at most {MAX_BYTES} bytes")
-    text = content.decode("latin-1")
-    records = tuple(_records(text, str(path)))
-    if not records:
-        raise ModelError("the .dyr file has no record", where=str(path), expected="BUS 'MODEL' ID values /")
-    return DyrFile(path, text, records)
+    return _parsed(str(path), content_of(Path(path)))
 
 
-def _records(text: str, where: str) -> Iterator[DyrRecord]:
-    at = 3 if text.startswith("\xef\xbb\xbf") else 0  # a byte-order mark, byte by byte
-    while True:
-        at = _begin(text, at)
-        if at >= len(text):
-            return
-        items: list[Span] = []
-        begin, due = at, True
-        while True:
-            found = _ITEM.search(text, at)
-            if found is None:
-                raise ModelError(
-                    "the record does not end",
-                    where=_place(text, begin, where),
-                    expected="a slash",
-                    got=_shown(text, begin),
-                )
-            at = found.end()
-            if found.group() == "/":
+def _parsed(path: str, content: bytes) -> DyrFile:
+    text = content.decode(ENCODING)
+    begin = start_of(text)
+    if _RAW.search(text[begin:]):
+        raise ModelError(
+            "this is power-flow data", where=path, expected=f"dynamic data (.dyr): {_FORM}", hint="read_raw reads it"
+        )
+    lines = [begin] + [found.end() for found in _LINE_END.finditer(text)]
+    records: list[DyrRecord] = []
+    for pieces, closed in _records(text, begin):
+        first = bisect_right(lines, pieces[0].start)
+        _check_one(pieces, closed, f"{path}:{first}", lambda place: bisect_right(lines, place))
+        if not _is_event(pieces):
+            records.append(_record(len(records), first, pieces, path))
+    return DyrFile(path, content, tuple(records))
+
+
+def _records(text: str, begin: int) -> Iterator[tuple[list[Token], bool]]:
+    """Yield the tokens of each record, and whether a `/` ends it."""
+    pieces: list[Token] = []
+    place, at_start = begin, True
+    while place < len(text):
+        if at_start:
+            comment = (_COMMENT if pieces else _COMMENT_BETWEEN).match(text, place)
+            place = comment.end() if comment else place
+            at_start = False
+        for piece in tokens(text, place):
+            place = piece.end
+            if piece.kind == "line":
+                at_start = True
+                if pieces:
+                    pieces.append(piece)
                 break
-            if found.group() == ",":
-                items += [Span(found.start(), found.start())] * due  # left out, and nothing stands there
-                due = True
-            else:
-                items.append(Span(*found.span()))
-                due = False
-        end = text.find("\n", at)
-        at = len(text) if end < 0 else end + 1
-        if items and text[items[0].begin : items[0].end].lstrip("-").isdigit():
-            yield _record(text, items, begin, where)
-
-
-def _begin(text: str, at: int) -> int:
-    """Return where the next record begins: behind blanks, and lines of comments."""
-    while at < len(text):
-        if text[at].isspace():
-            at += 1
-        elif _COMMENT.match(text, at):
-            end = text.find("\n", at)
-            at = len(text) if end < 0 else end + 1
+            if piece.kind == "slash":
+                if pieces:
+                    yield pieces, True
+                    pieces = []
+                rest = _REST.match(text, place)
+                place = rest.end() if rest else place
+                break
+            pieces.append(piece)
         else:
             break
-    return at
+    if pieces:
+        yield pieces, False
 
 
-def _record(text: str, items: list[Span], begin: int, where: str) -> DyrRecord:
-    words, place = [text[s.begin : s.end] for s in items], _place(text, begin, where)
-    if len(words) < 3 or not re.search("[A-Za-z]", words[1]):
+def _check_one(pieces: list[Token], closed: bool, where: str, line_of: Callable[[int], int]) -> None:
+    """Raise ModelError where the tokens are those of two records, or their end is the file's."""
+    hint = "end the record with /"
+    values = [p for p in pieces if p.kind not in ("comma", "line")]
+    user = len(values) > 1 and _bare(values[1]).upper().startswith("USR")
+    for k, piece in enumerate(pieces):
+        if piece.kind != "line" or k + 2 >= len(pieces):
+            continue
+        bus, model = pieces[k + 1], pieces[k + 2]
+        named = bus.kind == "word" and bus.text.isdigit() and model.kind in ("quoted", "word")
+        if not named or not _NAME.fullmatch(_bare(model)) or (user and model in values[2:4]):
+            continue
+        at = line_of(bus.start)
         raise ModelError(
-            "this is no record of a model", where=place, expected="BUS 'MODEL' ID values /", got=_shown(text, begin)
+            "a record without its end", where=where, expected="a /", got=f"the next record, at line {at}", hint=hint
         )
-    model, first = _plain(words[1]).upper(), 3
-    if model == "USRMDL" and len(words) > 3:
-        model, first = _plain(words[3]).upper(), 4
-    values = tuple(_value(w) if w else None for w in words[first:])
-    line = text.count("\n", 0, begin) + 1
-    return DyrRecord(int(words[0]), model, _plain(words[2]), values, tuple(items[first:]), line)
+    if not closed:
+        raise ModelError("a record without its end", where=where, expected="a /", got="the end of the file", hint=hint)
 
 
-def _plain(word: str) -> str:
-    return word.strip("'\"").strip()
+def _is_event(pieces: list[Token]) -> bool:
+    words = [_bare(p) for p in pieces if p.kind in ("quoted", "word")][:2]
+    return len(words) == 2 and words[1].upper() in _EVENTS and words[0].isalpha()
 
 
-def _value(word: str) -> float | str:
-    if word[0] in "'\"":
-        return _plain(word)
-    try:
-        return float(word.translate(_EXPONENT))
-    except ValueError:
-        return word
+def _bare(piece: Token) -> str:
+    return piece.text.strip("'\"").strip()
 
 
-def _place(text: str, at: int, where: str) -> str:
-    return f"{where}, line {text.count(chr(10), 0, at) + 1}"
+def _record(number: int, line: int, pieces: list[Token], path: str) -> DyrRecord:
+    where = f"{path}:{line}"
+    items = items_of(pieces, where)
+    bus = _integer(items[0] if items else None, "a bus number", where)
+    model = items[1].value if len(items) > 1 else None
+    if not isinstance(model, str) or not model.strip():
+        raise ModelError("a record without the name of a model", where=where, expected=_FORM, got=_shown(model))
+    name = model.strip().upper()
+    user, machine, rest = None, "", items[2:]
+    own = next((k for k, item in enumerate(rest[:2]) if _is_name(item)), None) if name.startswith("USR") else None
+    if own is not None:
+        numbers: list[Item | None] = [*rest[own + 1 : own + 7], *(6 * [None])]
+        name = str(rest[own].value).strip().upper()
+        user = UserModel(*(_integer(n, f"an integer of {name} (IC IT NI NC NS NV)", where) for n in numbers[:6]))
+        machine, rest = _id(rest[0], pieces) if own else "", rest[own + 7 :]
+    elif rest:
+        machine, rest = _id(rest[0], pieces), rest[1:]
+    else:
+        raise ModelError(f"a record of {name} without a machine id", where=where, expected=_FORM)
+    quoted = {p.start for p in pieces if p.kind == "quoted"}
+    for k, item in enumerate(rest):
+        if isinstance(item.value, str) and item.start not in quoted:
+            raise ModelError(
+                f"a text without quotes where value {k} of {name} is due",
+                where=where,
+                expected="a number",
+                got=_shown(item.value),
+            )
+    return DyrRecord(
+        number, bus, name, machine, tuple(i.value for i in rest), line, tuple((i.start, i.end) for i in rest), user
+    )
 
 
-def _shown(text: str, at: int) -> str:
-    return repr(text[at : at + 40].split("\n")[0])
+def _is_name(item: Item) -> bool:
+    return isinstance(item.value, str) and _NAME.fullmatch(item.value.strip()) is not None
+
+
+def _id(item: Item, pieces: list[Token]) -> str:
+    """Return a machine's id as it is written: 1 stays 1, 01 stays 01."""
+    if isinstance(item.value, str):
+        return item.value.strip()
+    return next((p.text for p in pieces if p.start == item.start and item.value is not None), "1")
+
+
+def _integer(item: Item | None, what: str, where: str) -> int:
+    value = item.value if item else None
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    raise ModelError("not a number where one is due", where=where, expected=what, got=_shown(value))
+
+
+def _shown(value: Value) -> str:
+    return "nothing" if value is None else f"'{value}'" if isinstance(value, str) else f"{value:g}"
+
+
+def _same(new: float | str, old: Value) -> bool:
+    if isinstance(new, str) or isinstance(old, str) or old is None:
+        return new == old
+    return new == old and math.copysign(1.0, new) == math.copysign(1.0, old)
+
+
+def _text(value: Value, old: str, where: str) -> str:
+    if value is None:
+        return "1*"  # a default beside the others of one repeated token
+    if isinstance(value, str):
+        if "\n" in value or "\r" in value or any(ord(c) > 255 or c == "\0" for c in value):
+            raise ModelError(
+                "a text that a record cannot hold", where=where, expected="one line of Latin-1", got=repr(value)
+            )
+        return "'" + value.replace("'", "''") + "'"
+    if not math.isfinite(value):
+        raise ModelError("a number that a record cannot hold", where=where, expected="a finite number", got=str(value))
+    if isinstance(value, int) and old.lstrip("+-").isdigit():
+        return str(int(value))
+    return number_text(value)

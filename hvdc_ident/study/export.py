@@ -210,7 +210,7 @@ def _dyr(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOpt
     note = f"no record has {', '.join(left)}" if left else ""
     if selected is not None and selected.of == "effect":
         note = "; ".join(t for t in (note, "a .dyr file has no place for the effect that the values hold with") if t)
-    return Written(changed.save(path), note)
+    return Written(changed.write(path), note)
 
 
 _WRITERS: dict[str, Callable[[Study | Model, ValueSet | None, Path, FmuOptions], Written]] = {

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
-from hvdc_ident.plants import LEVELS, MACHINE, RecordedUnit, recorded_unit, shelf_model, unit_card
+from hvdc_ident.plants import LEVELS, MACHINE, RecordedUnit, machine_records, recorded_unit, shelf_model, unit_card
 from hvdc_ident.psse import read_dyr, read_raw
 from hvdc_ident.study.new_study import DyrOfStudy, NewStudy, new_study
 from hvdc_ident.study.recordings import level_before
@@ -42,11 +42,11 @@ def new_unit_study(folder: str | Path, recordings: str | Path | Sequence[str | P
     """
     folder = Path(folder)
     file = read_dyr(asked.dyr)
-    records = file.at(asked.bus, asked.machine)
+    records = machine_records(file, asked.bus, asked.machine)
     raw = None if asked.raw is None else read_raw(asked.raw)
     base = asked.base
     if base is None and raw is not None:
-        base = raw.generator(asked.bus, records[0].machine).base
+        base = raw.generator(asked.bus, records[0].machine).mbase
     if base is None:
         raise InputError(
             "the base of the machine is not known",

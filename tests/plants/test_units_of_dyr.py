@@ -78,7 +78,11 @@ def test_from_a_dyr_file_to_a_fitted_one(folder) -> None:
     before, after = read_dyr(folder / "plant.dyr"), read_dyr(folder / "fitted.dyr")
     assert after.records[0].values[4] == pytest.approx(3.6, rel=0.02)
     assert after.records[1].values[2] == pytest.approx(140.0, rel=0.01)
-    lines = [(a, b) for a, b in zip(before.text.split("\n"), after.text.split("\n"), strict=True) if a != b]
+    lines = [
+        (a, b)
+        for a, b in zip(before.content.decode().split("\n"), after.content.decode().split("\n"), strict=True)
+        if a != b
+    ]
     assert all(
         a.split()[1] in ("'GENROU'", "'SEXS'", "'TGOV1'") and a.split("/")[1] == b.split("/")[1] for a, b in lines
     )
