@@ -143,20 +143,19 @@ def without_vanished(model: Model) -> Model:
         return model
     times = {s.vanishes for n, s in model.states.items() if n in gone and isinstance(s.vanishes, sp.Symbol)}
     zero = {t: sp.S.Zero for t in times if t.name in model.parameters}
+    decided = substituted(model, zero)  # before the model is checked: a condition may be what opens a circle
     wires = {}
     for n in gone:
-        state = model.states[n]
+        state = decided["states"][n]
         assert state.rest is not None  # the model was checked
         wires[n] = Signal(state.rest, state.unit, state.description)
     fixed = {t.name: replace(model.parameters[t.name], min=0.0, max=0.0) for t in zero}
-    kept = replace(
-        model,
-        parameters=model.parameters | fixed,
-        states=model.states.without(*gone),
-        signals=FrozenMap({**wires, **model.signals}),
-        origin=model.origin or ModelOrigin(model),
-    )
-    return replace(kept, **substituted(kept, zero))
+    changed = decided | {
+        "parameters": model.parameters | fixed,
+        "states": decided["states"].without(*gone),
+        "signals": FrozenMap({**wires, **decided["signals"]}),
+    }
+    return replace(model, **changed, origin=model.origin or ModelOrigin(model))
 
 
 def _is_zero(model: Model, time: sp.Expr) -> bool:

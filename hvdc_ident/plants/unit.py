@@ -14,8 +14,10 @@ from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.parameters import Input
 from hvdc_ident.shelf import card_of, record_of
 
-UNCONNECTED = FrozenMap({"Vs": "0", "Voel": "0", "Vuel": "0", "dwn": "0", "Paux": "0"})
-"""What an input is that no other component gives: no stabiliser, no limiter, a network of nominal frequency."""
+UNCONNECTED = FrozenMap(
+    {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0"}
+)
+"""What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), a network of nominal frequency."""
 REFERENCES = (
     ("P0", "P", "MW", ("Pref", "Plant_pref", "Pm")),
     ("Q0", "Q", "Mvar", ("Vref", "Qref", "Qext", "Efd")),
@@ -77,7 +79,12 @@ def unit_card(
             sources = [n for n, other in models.items() if n != part and u in other.outputs]
             if len(sources) > 1:
                 raise ModelError(f"'{target}' may follow several parts", expected="one", got=", ".join(sources))
-            connections[target] = f"{sources[0]}.{u}" if sources else UNCONNECTED.get(u, u)
+            if sources:
+                connections[target] = f"{sources[0]}.{u}"
+            elif network == "playback" and u == "dwn":
+                connections[target] = "bus.dwn"
+            else:
+                connections[target] = UNCONNECTED.get(u, u)
             if not sources and u not in UNCONNECTED:
                 inputs.setdefault(u, quantity)
     found = _references(inputs, parts[machine]) if network == "playback" else {}
@@ -153,7 +160,6 @@ def _network(machine: str, network: str) -> dict[str, str]:
             "bus.f": "f",
             f"{machine}.Vr": "bus.Vr",
             f"{machine}.Vi": "bus.Vi",
-            f"{machine}.dwn": "bus.dwn",
         }
     return {
         "grid.V": "E",

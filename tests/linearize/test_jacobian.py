@@ -168,6 +168,19 @@ def test_a_kink_is_refused_with_the_limiter_named():
     np.testing.assert_array_equal(above.B, [[1.0]])
 
 
+def test_a_condition_of_parameters_is_no_kink():
+    """An option stands exactly on the number it is compared with; it does not move with the states."""
+    option = Model(
+        name="option",
+        parameters=FrozenMap({"code": Parameter(1.0)}),
+        inputs=FrozenMap({"u": Input(1.0)}),
+        states=FrozenMap({"x": State(parse("where(code == 1, u, 2*u) - x"), guess=0.0)}),
+        outputs=FrozenMap({"x": Output(parse("x"))}),
+    )
+    np.testing.assert_array_equal(linearize(option).B, [[1.0]])
+    np.testing.assert_array_equal(linearize(option.with_values({"code": 2.0})).B, [[2.0]])
+
+
 def test_unknown_names_are_refused():
     model = load_model("vsc-hvdc-link")
     with pytest.raises(UnknownNameError, match="Vdcref1"):

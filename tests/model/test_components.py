@@ -209,3 +209,26 @@ def test_a_plant_of_components_leaves_as_fmu_and_modelica(folder) -> None:
     assert np.abs(np.interp(TIMES, run["time"], run["V"]) - expected["V"]).max() < 1e-4
     text = modelica(unit)
     assert "der('gen.E') = " in text and "parameter Real 'avr.K'(min = 0.0) = 80.0;" in text
+
+
+def test_a_condition_on_a_time_constant_that_vanishes_opens_a_circle() -> None:
+    """An integral that its limits hold rests where it has led to; without its gain it is 0."""
+    card = """schema = 1
+name = "integral"
+[parameters]
+KI = {value = 2.0, unit = "1/s", min = 0}
+[inputs]
+ref = {value = 0.3, unit = "pu"}
+[states]
+x = {derivative = "KI*e", rest = "where(KI > 0, clip(x + e, -1, 1), 0)", vanishes = "KI", unit = "pu"}
+[signals]
+e = "ref - x"
+[outputs]
+x = {value = "x", unit = "pu"}
+e = {value = "e", unit = "pu"}
+"""
+    model = parse_card(card)
+    assert hi.find_operating_point(model).outputs["x"] == pytest.approx(0.3)
+    without = model.with_values({"KI": 0.0})
+    assert not without.states
+    assert hi.find_operating_point(without).outputs["e"] == pytest.approx(0.3)
