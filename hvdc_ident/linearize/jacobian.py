@@ -135,8 +135,7 @@ def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: A
     g = s.structure.graph
     used = nodes_in_use(s.structure, structure_roots(s.structure), modes > 0.5)
     for n in set(flat) & used:
-        inner = nodes_in_use(s.structure, [g.nodes[n][1]], modes > 0.5)
-        if any(g.nodes[k][0] == "leaf" and g.nodes[k][1] != "p" for k in inner):
+        if _moves(s, g.nodes[n][1], modes):
             names = [name for name, k in s.structure.nodes.items() if k == n]
             raise LinearizationError(
                 f"the square root{f' of {names[0]!r}' if names else ''} stands at 0, where its slope is infinite",
@@ -187,14 +186,18 @@ def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str
 
 
 def modes_at(s: CompiledSystem, y: Array, w: Array, p: Array, side: Side) -> Array:
-    """Return the branch of every switch at a point. Raises LinearizationError on a kink unless a side is chosen."""
+    """Return the branch of every switch at a point. Raises LinearizationError on a kink unless a side is chosen.
+
+    A condition on parameters alone is no kink: it chooses between structures, and no state or input crosses it.
+    """
     values = s.switches(y, w, p)
     modes = s.modes(y, w, p)
     near = np.flatnonzero(np.abs(values) <= ON_KINK)
     if near.size == 0:
         return modes
     used = in_use(s.structure, structure_roots(s.structure), values < 0.0)
-    kinks = [k for k in near if k in used and _matters(s, y, w, p, modes, int(k))]
+    crossed = [k for k in near if k in used and _moves(s, s.structure.graph.switches[k], modes)]
+    kinks = [k for k in crossed if _matters(s, y, w, p, modes, int(k))]
     if kinks and side == "refuse":
         c = s.conditions[kinks[0]]
         raise LinearizationError(
@@ -213,6 +216,12 @@ def modes_at(s: CompiledSystem, y: Array, w: Array, p: Array, side: Side) -> Arr
         upper = s.conditions[k].kind == "upper"
         modes[k] = (inside if upper else beyond) if side == "below" else (beyond if upper else inside)
     return modes
+
+
+def _moves(s: CompiledSystem, node: int, modes: Array) -> bool:
+    """Return True where a node depends on more than parameters."""
+    nodes = s.structure.graph.nodes
+    return any(nodes[k][0] == "leaf" and nodes[k][1] != "p" for k in nodes_in_use(s.structure, [node], modes > 0.5))
 
 
 def _matters(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, k: int) -> bool:
