@@ -143,20 +143,24 @@ def without_vanished(model: Model) -> Model:
         return model
     times = {s.vanishes for n, s in model.states.items() if n in gone and isinstance(s.vanishes, sp.Symbol)}
     zero = {t: sp.S.Zero for t in times if t.name in model.parameters}
+    fields = substituted(model, zero)
     wires = {}
     for n in gone:
         state = model.states[n]
         assert state.rest is not None  # the model was checked
-        wires[n] = Signal(state.rest, state.unit, state.description)
+        wires[n] = Signal(state.rest.xreplace(zero), state.unit, state.description)
     fixed = {t.name: replace(model.parameters[t.name], min=0.0, max=0.0) for t in zero}
-    kept = replace(
+    # In one step: wires may close a circle that the decided conditions open.
+    return replace(
         model,
-        parameters=model.parameters | fixed,
-        states=model.states.without(*gone),
-        signals=FrozenMap({**wires, **model.signals}),
-        origin=model.origin or ModelOrigin(model),
+        **fields
+        | {
+            "parameters": model.parameters | fixed,
+            "states": fields["states"].without(*gone),
+            "signals": FrozenMap({**wires, **fields["signals"]}),
+            "origin": model.origin or ModelOrigin(model),
+        },
     )
-    return replace(kept, **substituted(kept, zero))
 
 
 def _is_zero(model: Model, time: sp.Expr) -> bool:
