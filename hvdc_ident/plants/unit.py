@@ -14,13 +14,13 @@ from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.parameters import Input
 from hvdc_ident.shelf import card_of, record_of
 
-UNCONNECTED = FrozenMap({"Vs": "0", "Voel": "0", "Vuel": "0", "dwn": "0", "Paux": "0"})
-"""What an input is that no other component gives: no stabiliser, no limiter, a network of nominal frequency."""
+UNCONNECTED = FrozenMap({"Vs": "0", "Voel": "0", "Vuel": "0", "dwn": "0", "Paux": "0", "wg": "1"})
+"""What an input is that no other component gives: no stabiliser, no limiter, a network of nominal frequency, rated speed."""
 SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu"})
 """Outputs of a unit, where one of its components has them, with their units."""
 
 
-NAMES = FrozenMap({"Ir": "gen", "Efd": "avr", "Pm": "gov", "Vs": "pss"})
+NAMES = FrozenMap({"Ir": "gen", "Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd": "elec", "Qext": "plant"})
 """Name of a part in a unit by the output that it gives; another goes by the name of its component."""
 
 
@@ -55,6 +55,9 @@ def unit_card(
     if network == "playback":
         inputs |= {"V": Input(1.0, "pu", "recorded voltage"), "f": Input(f0, "Hz", "recorded frequency")}
     connections = _network(machine, network)
+    # The frequency of the network is known where it is recorded; parts without an input for it need none.
+    frequency = [f"{n}.dwn" for n, m in models.items() if "dwn" in m.inputs and network == "playback"]
+    connections |= dict.fromkeys(frequency, "bus.dwn")
     for part, model in models.items():
         for u, quantity in model.inputs.items():
             target = f"{part}.{u}"
@@ -114,7 +117,6 @@ def _network(machine: str, network: str) -> dict[str, str]:
             "bus.f": "f",
             f"{machine}.Vr": "bus.Vr",
             f"{machine}.Vi": "bus.Vi",
-            f"{machine}.dwn": "bus.dwn",
         }
     return {
         "grid.V": "E",

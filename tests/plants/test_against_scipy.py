@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import hvdc_ident as hi
 from hvdc_ident.model import Model, parse_card
-from hvdc_ident.plants import parts_of, unit_card
+from hvdc_ident.plants import Part, parts_of, unit_card
 from hvdc_ident.plants.unit import shelf_model
 
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
@@ -175,3 +175,200 @@ def test_ggov1_follows_its_block_diagram(Rselect, case) -> None:
     )
     expected = ggov1(TIMES, p, Pref, lambda t: 0.0 if t < 1.0 else 0.01, dw)
     assert apart(run, "Pm", expected) < 2e-3
+
+
+# --- converters ---
+
+REGCA1 = [0, 0.02, 10.0, 0.9, 0.4, 1.22, 1.2, 0.8, 0.4, -1.3, 0.02, 0.7, 99.0, -99.0, 0.7]
+LOOPS = {"Kqp": 0.2, "Kqi": 2.0, "Kvp": 1.0, "Kvi": 20.0, "Trv": 0.02, "Tpord": 0.05, "Tpfilt": 0.0, "Imax": 1.3}
+LOOPS |= {"QMax": 0.4, "QMin": -0.4, "VMAX": 1.1, "VMIN": 0.9, "Vdip": 0.85, "PQFLAG": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("source", "VFLAG", "E"), [("reeca1", 1, 0.97), ("reecb1", 1, 0.97), ("reecb1", 0, 0.97), ("reeca1", 1, 0.7)]
+)
+def test_loops_of_reactive_power_and_voltage(source, VFLAG, E) -> None:
+    """A converter behind j0.3 pu, where V = E cos(a) + 0.3 Iq with sin(a) = 0.3 Ip/E. E = 0.7: a dip that freezes the states."""
+    table = {f"I{k}{i}": 1.3 for k in "qp" for i in range(1, 5)} if source == "reeca1" else {}
+    values = {**LOOPS, **table, "VFLAG": VFLAG, "QFLAG": 1.0, "Kqv": 0.0 if source == "reecb1" else 2.0, "Vref0": 1.02}
+    values |= {} if VFLAG else {"QMax": 1.2}  # which limit the voltage reference, too
+    parts = parts_of({"REGCA1": REGCA1}) | {"elec": Part(source, values)}
+    model = parse_card(unit_card(parts, f0=60.0, X=0.3)).with_values({"Qext": 0.1 if VFLAG else 1.02})
+    point = hi.find_operating_point(model, outputs={"P": 80.0, "Vt": 1.02}, free=["Pref", "Qext"])
+    model, reference = model.with_values(point.inputs), point.inputs["Qext"]
+    p = {n.removeprefix("elec."): v for n, v in model.values.items()}
+
+    def voltage(y: np.ndarray, bus: float) -> tuple[float, float, float]:
+        """Return V and the currents into the network."""
+        V = y[5]
+        for _ in range(50):  # the low-voltage management of the active current depends on V
+            i_p = y[4] * float(np.clip((V - 0.4) / 0.4, 0.0, 1.0))
+            V = bus * np.sqrt(1 - (0.3 * i_p / bus) ** 2) + 0.3 * y[6]
+        return V, i_p, y[6]
+
+    def rates(t: float, y: np.ndarray, bus: float) -> list[float]:
+        Vm, xq, xv, Pord, Ip, _, Iq = y
+        V, _, i_q = voltage(y, bus)
+        dip = not p["Vdip"] <= V <= p["Vup"]
+        err_q = min(max(reference, p["QMin"]), p["QMax"]) - V * i_q
+        wanted = p["Kqp"] * err_q + xq if VFLAG else reference
+        err_v = min(max(wanted, p["VMIN"]), p["VMAX"]) - Vm
+        active = min(Pord / Vm, p["Imax"])
+        limit = np.sqrt(p["Imax"] ** 2 - active**2)
+        error = 1.02 - Vm
+        injected = p["Kqv"] * (error - np.clip(error, p["dbd1"], p["dbd2"])) if dip or source == "reecb1" else 0.0
+        reactive = np.clip(np.clip(p["Kvp"] * err_v + xv, -limit, limit) + injected, -limit, limit)
+        free = 0.0 if dip else 1.0
+        return [
+            (V - Vm) / p["Trv"],
+            free * p["Kqi"] * err_q * VFLAG,
+            free * p["Kvi"] * err_v,
+            free * (point.inputs["Pref"] - Pord) / p["Tpord"],
+            min((active - Ip) / 0.02, 10.0),
+            0.0,
+            (reactive - Iq) / 0.02,
+        ]
+
+    start = point.states
+    y0 = [
+        start["elec.Vmeas"],
+        start.get("elec.xq", 0.0),
+        *(start[f"elec.{n}"] for n in ("xv", "Pord")),
+        start["gen.Ip"],
+        1.02,
+        start["gen.Iq"],
+    ]
+    assert np.abs(rates(0.0, np.array(y0), 1.0)).max() < 1e-6
+    found = solve_ivp(rates, (0, 5), y0, args=(E,), t_eval=TIMES, rtol=1e-8, atol=1e-10, max_step=0.01)
+    V = np.array([voltage(y, E)[0] for y in found.y.T])
+    run = hi.simulate(model, TIMES, inputs={"E": hi.step(1.0, E, at=0.0)})
+    assert np.abs(run["Vt"] - V)[1:].max() < 1e-3 * np.ptp(V)
+
+
+# --- wind turbines ---
+
+
+def test_the_drive_train_swings_at_its_frequency() -> None:
+    """Two free masses with a shaft: the torsional mode is at Freq1, damped by Dshaft (1/(2 Ht) + 1/(2 Hg))/2; one mass has none."""
+    values = {"H": 5.0, "Htfrac": 0.8, "Freq1": 2.0, "Dshaft": 1.0, "DAMP": 0.5, "Pm": 0.0, "Pe": 0.0}
+    modes = np.linalg.eigvals(hi.linearize(shelf_model("wtdta1").with_values(values)).A)
+    mode = modes[modes.imag > 0][0]
+    assert abs(mode) == pytest.approx(2 * np.pi * 2.0, rel=2e-3)
+    assert -mode.real == pytest.approx((1.0 / 8 + 1.0 / 2 + 0.5 / 2 * 0.8) / 2, rel=0.01)
+    single = hi.linearize(shelf_model("wtdta1").with_values({**values, "Htfrac": 0.0})).A
+    assert single == pytest.approx(np.array([[-0.5 / 10]]))
+
+
+def test_pitch_control_follows_its_block_diagram() -> None:
+    """The speed rises and falls: the pitch leaves its lowest angle, comes to its highest rate and back."""
+    model = shelf_model("wtpta1").with_values({"wt": 0.98, "Pset": 0.9, "TetaMax": 8.0, "Kcc": 0.1})
+    p = model.values
+    speed = [(0.0, 0.98), (0.5, 0.98), (1.5, 1.06), (2.5, 1.06), (3.5, 0.99), (5.0, 0.99)]
+
+    def rates(t: float, y: np.ndarray) -> list[float]:
+        xw, xc, theta = y
+        err_c = 0.8 - 0.9
+        err_w = np.interp(t, *zip(*speed, strict=True)) + p["Kcc"] * err_c - 1.0
+
+        def held(rate: float, x: float) -> float:
+            return max(rate, 0.0) if x <= p["TetaMin"] else min(rate, 0.0) if x >= p["TetaMax"] else rate
+
+        demand = np.clip(p["Kpw"] * err_w + xw, 0.0, 8.0) + np.clip(p["Kpc"] * err_c + xc, 0.0, 8.0)
+        rate = float(np.clip((demand - theta) / p["Tp"], p["RTetaMin"], p["RTetaMax"]))
+        return [held(p["Kiw"] * err_w, xw), held(p["Kic"] * err_c, xc), held(rate, theta)]
+
+    found = solve_ivp(rates, (0, 5), [0.0, 0.0, 0.0], t_eval=TIMES, rtol=1e-7, atol=1e-9, max_step=2e-3)
+    wt = hi.InputSignal.corners(speed)
+    run = hi.simulate(model, TIMES, inputs={"wt": wt})
+    assert apart(run, "theta", found.y[2]) < 2e-3
+
+
+TORQUE = """
+schema = 1
+name = "torque"
+[inputs]
+wg = {value = 0.9, unit = "pu"}
+Vt = {value = 1.0, unit = "pu"}
+[states]
+Pe = {derivative = "(torque.Pref - Pe)/0.1", guess = 0.65, unit = "pu"}
+[components.torque]
+source = "wttqa1"
+parameters = {Twref = 5.0}
+[connections]
+"torque.Pe" = "Pe"
+"torque.wg" = "wg"
+"torque.Vt" = "Vt"
+"torque.Pref0" = "0.8"
+[outputs]
+Pe = "Pe"
+wref = "torque.wref"
+"""
+
+
+@pytest.mark.parametrize("Vt", [1.0, 0.5])
+def test_torque_control_follows_its_block_diagram(Vt) -> None:
+    """The speed steps; in a dip the integral of the torque stays."""
+    p = shelf_model("wttqa1").values
+    points = [p[f"p{k}"] for k in range(1, 5)], [p[f"spd{k}"] for k in range(1, 5)]
+    power = float(np.interp(0.9, points[1], points[0]))
+
+    def rates(t: float, y: np.ndarray) -> list[float]:
+        Pe, measured, wref, xt = y
+        err = 0.92 - wref
+        torque = min(max(p["Kpp"] * err + xt, p["Temin"]), p["Temax"])
+        speed = np.interp(measured, *points)
+        return [
+            (0.92 * torque - Pe) / 0.1,
+            (Pe - measured) / p["Tp"],
+            (speed - wref) / 5.0,
+            p["Kip"] * err if Vt > p["Vdip"] else 0.0,
+        ]
+
+    found = solve_ivp(rates, (0, 5), [power, power, 0.9, power / 0.9], t_eval=TIMES, rtol=1e-8, atol=1e-10)
+    steps = {"wg": hi.step(0.9, 0.92, at=0.0), "Vt": hi.step(1.0, Vt, at=0.0)}
+    run = hi.simulate(parse_card(TORQUE), TIMES, inputs=steps)
+    assert apart(run, "Pe", found.y[0]) < 1e-4
+    assert apart(run, "wref", found.y[2]) < 1e-4
+
+
+def test_aerodynamics_fall_with_the_pitch() -> None:
+    model = shelf_model("wtara1").with_values({"theta0": 2.0, "theta": 5.0, "Pm0": 0.9})
+    assert hi.find_operating_point(model).outputs["Pm"] == pytest.approx(0.9 - 0.007 * 5.0 * 3.0)
+
+
+# --- network ---
+
+
+@pytest.mark.parametrize(
+    ("V", "P", "Q"),
+    [(1.1, 0.4 * 1.21 + 0.3 * 1.1 + 0.3, 1.21), (0.35, 0.4 * 0.1225 + 0.3 * 0.175 + 0.3 * 0.25, 0.1225)],
+)
+def test_a_load_takes_its_shares(V, P, Q) -> None:
+    """S = V conj(I) of the current that it gives is minus what it takes; at half of Vbrk current and power are at 1/2 and 1/4."""
+    model = shelf_model("load").with_values({"P0": 1.0, "Q0": 1.0, "Vr": 0.6 * V, "Vi": 0.8 * V, "Sb": 1.0})
+    found = hi.find_operating_point(model).outputs
+    power = -complex(0.6 * V, 0.8 * V) * complex(found["Ir"], -found["Ii"])
+    assert (found["P"], found["Q"]) == pytest.approx((P, Q))
+    assert power == pytest.approx(complex(P, Q))
+
+
+def test_a_transformer_loses_what_its_impedance_takes() -> None:
+    """The complex powers of both ends differ by Z |I|^2 of the far side; without current the ratio is that of the taps."""
+    values = {
+        "R": 0.01,
+        "X": 0.1,
+        "tap": 1.05,
+        "shift": 0.3,
+        "Sn": 50.0,
+        "Vr_far": 0.9,
+        "Vi_far": -0.2,
+        "Ir": 0.5,
+        "Ii": -0.3,
+    }
+    found = hi.find_operating_point(shelf_model("transformer").with_values(values)).outputs
+    near, far = complex(found["Vr"], found["Vi"]) * complex(0.5, 0.3), complex(found["Ir_far"], found["Ii_far"])
+    loss = near - complex(0.9, -0.2) * far.conjugate()
+    assert loss == pytest.approx(complex(0.02, 0.2) * abs(far) ** 2)
+    idle = hi.find_operating_point(shelf_model("transformer").with_values({**values, "Ir": 0.0, "Ii": 0.0})).outputs
+    ratio = complex(idle["Vr"], idle["Vi"]) / complex(0.9, -0.2)
+    assert ratio == pytest.approx(1.05 * np.exp(0.3j))
