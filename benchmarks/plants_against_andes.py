@@ -19,8 +19,12 @@ import andes
 import numpy as np
 
 HERE = Path(__file__).resolve().parents[1] / "tests" / "plants"
-STEPS = {"Vref": 0.02, "Pref": 0.05, "E": -0.05}
+STEPS = {"Vref": 0.02, "Pref": 0.05, "nref": 0.0025, "E": -0.05}
 """Steps at 0.5 s of the references and of the infinite bus, pu."""
+REFERENCES = {"HYGOV": ("nref", "q0"), "IEEEG1": ("Pref", "tm012")}
+"""By model of andes: the reference that it takes, and the name of the constant that holds it; q0 is nref/R."""
+OF_GROUP = {"Exciter": ("Vref", "vref0"), "TurbineGov": ("Pref", "pref0")}
+"""The same for the other models of a group."""
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
 RAW = """0, 100.00, 32, 0, 1, 60.00 / two buses
 a unit at an infinite bus
@@ -30,7 +34,7 @@ a unit at an infinite bus
 0 / END OF BUS DATA
 0 / END OF LOAD DATA
 0 / END OF FIXED SHUNT DATA
-1,'1', 80.0, 0.0, 999.0, -999.0, 1.02, 0, 100.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1, 100.0, 999.0, -999.0, 1, 1.0
+1,'1', 80.0, 0.0, 999.0, -999.0, 1.02, 0, 100.0, 0.0, 0.3, 0.0, 0.0, 1.0, 1, 100.0, 999.0, -999.0, 1, 1.0
 2,'1', 0.0, 0.0, 999.0, -999.0, 1.0, 0, 100.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1, 100.0, 999.0, -999.0, 1, 1.0
 0 / END OF GENERATOR DATA
 1, 2, '1 ', 0.01, 0.3, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1, 1, 0.0, 1, 1.0
@@ -57,7 +61,7 @@ def system(records: dict[str, list[float]], folder: Path) -> Any:
     (folder / "unit.dyr").write_text("\n".join(lines) + "\n", encoding="utf-8")
     found = andes.load(str(folder / "unit.raw"), addfile=str(folder / "unit.dyr"), no_output=True, default_config=True)
     found.PFlow.run()
-    found.TDS.config.fixt, found.TDS.config.shrinkt, found.TDS.config.tstep = 1, 0, 0.002
+    found.TDS.config.fixt, found.TDS.config.shrinkt, found.TDS.config.tstep = 1, 0, 0.001
     found.TDS.config.criteria = 0
     found.TDS.init()
     return found
@@ -79,11 +83,17 @@ def response(records: dict[str, list[float]], step: str, folder: Path) -> dict[s
     if step == "E":
         found.Slack.v0.v[:] += STEPS[step]
     else:
-        group, name = {"Vref": ("Exciter", "vref0"), "Pref": ("TurbineGov", "pref0")}[step]
-        model = next((m for m in found.groups[group].models.values() if m.n), None)
-        if model is None:
+        named = [
+            (m, *REFERENCES.get(m.class_name, reference))
+            for group, reference in OF_GROUP.items()
+            for m in found.groups[group].models.values()
+            if m.n
+        ]
+        taken = next(((m, constant) for m, reference, constant in named if reference == step), None)
+        if taken is None:
             return None
-        getattr(model, name).v[:] += STEPS[step]
+        model, constant = taken
+        getattr(model, constant).v[:] += STEPS[step] / (model.R.v if step == "nref" else 1.0)
     found.TDS.config.tf = float(TIMES[-1]) + 0.01
     found.TDS.run()
     series = found.dae.ts

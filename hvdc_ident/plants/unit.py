@@ -15,9 +15,9 @@ from hvdc_ident.parameters import Input
 from hvdc_ident.shelf import card_of, record_of
 
 UNCONNECTED = FrozenMap(
-    {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0"}
+    {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0", "wg": "1"}
 )
-"""What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), a network of nominal frequency."""
+"""What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), nominal frequency and speed."""
 REFERENCES = (
     ("P0", "P", "MW", ("Pref", "Plant_pref", "Pm")),
     ("Q0", "Q", "Mvar", ("Vref", "Qref", "Qext", "Efd")),
@@ -33,7 +33,7 @@ SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", 
 
 
 MACHINE = "gen"
-NAMES = FrozenMap({"Ir": MACHINE, "Efd": "avr", "Pm": "gov", "Vs": "pss"})
+NAMES = FrozenMap({"Ir": MACHINE, "Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd": "elec", "Qext": "plant"})
 """Name of a part in a unit by the output that it gives; another goes by the name of its component."""
 
 

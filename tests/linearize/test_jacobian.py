@@ -181,6 +181,20 @@ def test_a_condition_of_parameters_is_no_kink():
     np.testing.assert_array_equal(linearize(option.with_values({"code": 2.0})).B, [[2.0]])
 
 
+def test_a_condition_on_parameters_alone_is_no_kink():
+    model = Model(
+        name="flag",
+        parameters=FrozenMap({"band": Parameter(0.0)}),
+        inputs=FrozenMap({"u": Input(0.0)}),
+        states=FrozenMap({"x": State(parse("where(band > 0, deadband(u, band), 2*u) - x"), guess=0.0)}),
+        outputs=FrozenMap({"x": Output(parse("x"))}),
+    )
+    np.testing.assert_array_equal(linearize(model).B, [[2.0]])
+    np.testing.assert_array_equal(linearize(model.with_values({"band": 0.1})).B, [[0.0]])
+    with pytest.raises(LinearizationError, match="kink"):  # the edge of the band itself is one
+        linearize(model.with_values({"band": 0.1, "u": 0.1}))
+
+
 def test_unknown_names_are_refused():
     model = load_model("vsc-hvdc-link")
     with pytest.raises(UnknownNameError, match="Vdcref1"):

@@ -150,6 +150,22 @@ def test_a_time_constant_that_is_gone_does_not_come_back(folder) -> None:
         unit.with_values({"avr.TA": 0.1})
 
 
+def test_conditions_that_a_gone_time_constant_decides_open_circles(folder) -> None:
+    """x follows y, which uses x only where T is not 0: at 0 there is no circle of wires."""
+    text = """
+schema = 1
+name = "held"
+parameters = {T = {value = 0.5, min = 0.0}}
+inputs = {u = {value = 1.0}}
+signals = {y = {value = "where(T > 0, 0.5*x, 0) + u"}}
+states = {x = {derivative = "(y - x)/T", rest = "y", vanishes = "T"}}
+outputs = {y = "y"}
+"""
+    held = parse_card(text)
+    assert hi.simulate(held, [0.0, 1.0])["y"] == pytest.approx([2.0, 2.0])
+    assert hi.simulate(held.with_values({"T": 0.0}), [0.0, 1.0])["y"] == pytest.approx([1.0, 1.0])
+
+
 def test_a_circle_of_wires_needs_an_unknown(folder) -> None:
     """Without a lag in it y = k (1 - y) is a circle, with an unknown it has the solution k/(1 + k)."""
     gain = 'schema = 1\nname = "gain"\nparameters = {k = {value = 4.0}}\n'

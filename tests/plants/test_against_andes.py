@@ -20,19 +20,16 @@ from hvdc_ident.plants import parts_of, unit_card
 HERE = Path(__file__).parent
 CASES = tomllib.loads((HERE / "cases.toml").read_text(encoding="utf-8"))
 ANDES = json.loads((HERE / "andes.json").read_text(encoding="utf-8"))["cases"]
-STEPS = {"Vref": 0.02, "Pref": 0.05, "E": -0.05}
+STEPS = {"Vref": 0.02, "Pref": 0.05, "nref": 0.0025, "E": -0.05}
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
-OPTIONS = {"gen": {"Kw": 0.0}}
+OPTIONS = {"genrou": {"Kw": 0.0}}
 
 
 def unit(name: str) -> Model:
     """Return the unit of a case at its power flow: 80 MW, 1.02 pu."""
-    parts = parts_of(CASES[name])
-    for part, values in OPTIONS.items():
-        if part in parts:
-            parts[part] = replace(parts[part], values={**parts[part].values, **values})
+    parts = {n: replace(p, values={**p.values, **OPTIONS.get(p.source, {})}) for n, p in parts_of(CASES[name]).items()}
     model = parse_card(unit_card(parts, f0=60.0, R=0.01, X=0.3))
-    free = [r for r in ("Vref", "Pref", "Efd", "Pm") if r in model.inputs]
+    free = [r for r in ("Vref", "Pref", "nref", "Efd", "Pm") if r in model.inputs]
     point = hi.find_operating_point(model, outputs={"P": 80.0, "Vt": 1.02}, free=free)
     return model.with_values(point.inputs)
 
