@@ -26,6 +26,28 @@ REFERENCES = {"HYGOV": ("nref", "q0"), "IEEEG1": ("Pref", "tm012")}
 OF_GROUP = {"Exciter": ("Vref", "vref0"), "TurbineGov": ("Pref", "pref0")}
 """The same for the other models of a group."""
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
+SHELF = Path(__file__).resolve().parents[1] / "hvdc_ident" / "shelf"
+ORDERS = {
+    "ESST1A": "UEL VOS TR VIMAX VIMIN TB TC TB1 TC1 VAMAX VAMIN KA TA ILR KLR VRMAX VRMIN KF TF KC",
+    "ESAC1A": "TR TB TC VAMAX VAMIN KA TA VRMAX VRMIN TE E1 SE1 E2 SE2 KC KD KE KF TF",
+    "AC8B": "TR KPR KIR KDR TDR VPIDMAX VPIDMIN VRMAX VRMIN VFEMAX VEMIN TA KA TE KC KD KE E1 SE1 E2 SE2",
+}
+"""Order in which andes reads the values of a record, where it is not PSS/E's."""
+ESAC8B = {
+    "KPR": "KP",
+    "KIR": "KI",
+    "KDR": "KD",
+    "TDR": "TD",
+    "VPIDMAX": 999.0,
+    "VPIDMIN": -999.0,
+    "VFEMAX": 999.0,
+    "VEMIN": -999.0,
+    "KC": 0.0,
+    "KD": 0.0,
+}
+"""Values of AC8B that make it ESAC8B, which andes does not have: by name, the value or the name of ESAC8B's."""
+ABSENT = {"SCRX", "PSS2B", "STAB2A"}
+"""Models that andes does not have, or takes another for."""
 RAW = """0, 100.00, 32, 0, 1, 60.00 / two buses
 a unit at an infinite bus
 
@@ -54,10 +76,22 @@ Q
 """
 
 
+def line(model: str, values: list[float]) -> str:
+    """Return the .dyr line of a record, its values in the order in which andes reads them."""
+    if model in ORDERS or model == "ESAC8B":
+        card = tomllib.loads((SHELF / f"{model.lower()}.toml").read_text(encoding="utf-8"))
+        named = dict(zip(card["record"], values, strict=True))
+        if model == "ESAC8B":
+            given = {n: named[v] if isinstance(v, str) else v for n, v in ESAC8B.items()}
+            model, named = "AC8B", named | given
+        values = [named[n] for n in ORDERS[model].split()]
+    return f"1 '{model}' 1 {' '.join(map(repr, values))} /"
+
+
 def system(records: dict[str, list[float]], folder: Path) -> Any:
     """Return andes' system of a unit, initialised."""
     (folder / "unit.raw").write_text(RAW, encoding="utf-8")
-    lines = [f"1 '{model}' 1 {' '.join(map(repr, values))} /" for model, values in records.items()]
+    lines = [line(model, values) for model, values in records.items()]
     (folder / "unit.dyr").write_text("\n".join(lines) + "\n", encoding="utf-8")
     found = andes.load(str(folder / "unit.raw"), addfile=str(folder / "unit.dyr"), no_output=True, default_config=True)
     found.PFlow.run()
@@ -68,10 +102,16 @@ def system(records: dict[str, list[float]], folder: Path) -> Any:
 
 
 def eigenvalues(records: dict[str, list[float]], folder: Path) -> list[list[float]]:
-    """Return the eigenvalues as [real, imaginary], 1/s, in rising order."""
+    """Return the eigenvalues as [real, imaginary], 1/s, in rising order, without those of states that nothing reads."""
     found = system(records, folder)
     found.EIG.run()
-    return [[float(e.real), float(e.imag)] for e in np.sort_complex(found.EIG.mu)]
+    matrix = np.array(found.EIG.As)
+    while True:
+        read = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=0, initial=0.0) > 0
+        if read.all():
+            break
+        matrix = matrix[np.ix_(read, read)]
+    return [[float(e.real), float(e.imag)] for e in np.sort_complex(np.linalg.eigvals(matrix))]
 
 
 def response(records: dict[str, list[float]], step: str, folder: Path) -> dict[str, list[float]] | None:
@@ -115,17 +155,17 @@ def main(names: list[str]) -> None:
     cases = tomllib.loads((HERE / "cases.toml").read_text(encoding="utf-8"))
     path = HERE / "andes.json"
     known = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"andes": "", "cases": {}}
-    for name in names or cases:
+    for name in names or [n for n, records in cases.items() if not ABSENT & set(records)]:
         with tempfile.TemporaryDirectory() as folder:
             found: dict[str, Any] = {"eigenvalues": eigenvalues(cases[name], Path(folder))}
             runs = {step: response(cases[name], step, Path(folder)) for step in STEPS}
             found["responses"] = {step: run for step, run in runs.items() if run is not None}
         known["cases"][name] = found
-        print(name, len(found["eigenvalues"]), list(found["responses"]))
-    known["andes"] = andes.__version__
-    known["cases"] = {n: known["cases"][n] for n in cases if n in known["cases"]}
-    rounded = json.loads(json.dumps(known), parse_float=lambda x: float(f"{float(x):.9g}"))
-    path.write_text(json.dumps(rounded) + "\n", encoding="utf-8")
+        print(name, len(found["eigenvalues"]), list(found["responses"]), flush=True)
+        known["andes"] = andes.__version__
+        known["cases"] = {n: known["cases"][n] for n in cases if n in known["cases"]}
+        rounded = json.loads(json.dumps(known), parse_float=lambda x: float(f"{float(x):.9g}"))
+        path.write_text(json.dumps(rounded) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,53 @@
+"""Every card of the shelf: it loads, says what it is, and its record names its parameters; every case stays at rest."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+
+import hvdc_ident as hi
+from hvdc_ident.model import read_card
+from hvdc_ident.shelf import card_of, components, record_of
+from tests.plants.test_against_andes import CASES, unit
+
+NO_RECORD = ("infinite-bus", "line", "load", "playback", "transformer")
+
+
+@pytest.mark.parametrize("name", components())
+def test_a_card_loads_and_says_what_it_is(name: str) -> None:
+    text = card_of(name).read_text(encoding="utf-8")
+    card = tomllib.loads(text)  # refuses a name that is given twice
+    model = read_card(card_of(name))
+    assert model.name == name == card["name"]
+    assert model.outputs
+    if name not in NO_RECORD:
+        assert model.description.startswith(f"{name.upper()}: ")
+        assert "Source: " in model.description or "Sources: " in model.description
+    for section in ("parameters", "inputs", "signals", "states"):
+        for n, item in getattr(model, section).items():
+            assert item.description, f"{section} {n}"
+    for n, q in (model.inputs | model.states).items():
+        assert q.unit, n
+
+
+@pytest.mark.parametrize("name", [n for n in components() if n not in NO_RECORD])
+def test_a_record_names_parameters(name: str) -> None:
+    """Each once; what the record lacks belongs to the base or is an option of the card."""
+    model, record = read_card(card_of(name)), record_of(name)
+    named = [n for n in record if n != "-"]
+    assert named and len(set(named)) == len(named)
+    assert set(named) <= set(model.parameters)
+    for n in named:
+        low, high = model.parameters[n].min, model.parameters[n].max
+        assert low <= model.parameters[n].value <= high
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_unit_stays_at_rest(name: str) -> None:
+    times = np.linspace(0.0, 5.0, 51)
+    model = unit(name)
+    run = hi.simulate(model, times)
+    for output in model.outputs:
+        assert np.ptp(run[output]) <= 1e-6 * max(1.0, np.abs(run[output]).max()), output
