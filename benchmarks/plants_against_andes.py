@@ -19,12 +19,38 @@ import andes
 import numpy as np
 
 HERE = Path(__file__).resolve().parents[1] / "tests" / "plants"
-STEPS = {"Vref": 0.02, "Pref": 0.05, "nref": 0.0025, "E": -0.05}
-"""Steps at 0.5 s of the references and of the infinite bus, pu."""
-REFERENCES = {"HYGOV": ("nref", "q0"), "IEEEG1": ("Pref", "tm012")}
-"""By model of andes: the reference that it takes, and the name of the constant that holds it; q0 is nref/R."""
-OF_GROUP = {"Exciter": ("Vref", "vref0"), "TurbineGov": ("Pref", "pref0")}
-"""The same for the other models of a group."""
+STEPS = {
+    "Vref": 0.02,
+    "Pref": 0.05,
+    "nref": 0.0025,
+    "Plant_pref": 0.05,
+    "Qext": 0.05,
+    "Qref": 0.05,
+    "PFaref": 0.05,
+    "E": -0.05,
+}
+"""Steps at 0.5 s of the references and of the infinite bus, pu; of the angle of the power factor in rad."""
+REFERENCES = {
+    "HYGOV": {"nref": "q0"},
+    "IEEEG1": {"Pref": "tm012"},
+    "REPCA1": {"Plant_pref": "Pline0", "Vref": "Vref0", "Qref": "Qline0"},
+}
+"""By model of andes: the references that it takes, with the names of the constants that hold them; q0 is nref/R."""
+OF_GROUP = {
+    "Exciter": {"Vref": "vref0"},
+    "TurbineGov": {"Pref": "pref0"},
+    "RenExciter": {"Pref": "Pref0", "Qext": "qref0", "PFaref": "pfaref0"},
+    "RenPlant": {},
+}
+"""The same for the other models of a group; qref0 is -Qext."""
+FACTORS = {"qref0": -1.0, "q0": 20.0}
+"""What a step of a reference is multiplied with for a constant; 1/R = 20 in the cases with q0."""
+SHOWN = {"P": ("Pe", 100.0, 0.0), "Q": ("Qe", 100.0, 0.0), "Vt": ("v", 1.0, 0.0), "dw": ("omega", 1.0, -1.0)}
+"""Signals by name: the variable of the machine or converter, the factor and what is added; MW, Mvar, pu."""
+TIME_STEPS = {"SynGen": 0.001, "RenGen": 0.002}
+"""Time steps, s, by group of the unit. Swings are hardly damped: the trapezoidal rule's error of their frequency shows soon."""
+ENDS = {"SynGen": 5.0, "RenGen": 2.5}
+"""Ends of the runs, s: converters settle sooner."""
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
 SHELF = Path(__file__).resolve().parents[1] / "hvdc_ident" / "shelf"
 ORDERS = {
@@ -94,11 +120,20 @@ def system(records: dict[str, list[float]], folder: Path) -> Any:
     lines = [line(model, values) for model, values in records.items()]
     (folder / "unit.dyr").write_text("\n".join(lines) + "\n", encoding="utf-8")
     found = andes.load(str(folder / "unit.raw"), addfile=str(folder / "unit.dyr"), no_output=True, default_config=True)
+    found.PFlow.config.tol = 1e-10
     found.PFlow.run()
-    found.TDS.config.fixt, found.TDS.config.shrinkt, found.TDS.config.tstep = 1, 0, 0.001
+    found.TDS.config.fixt, found.TDS.config.shrinkt = 1, 0
+    found.TDS.config.tstep = next(
+        h for group, h in TIME_STEPS.items() if any(m.n for m in found.groups[group].models.values())
+    )
     found.TDS.config.criteria = 0
     found.TDS.init()
     return found
+
+
+def group_of(found: Any) -> str:
+    """Return the group of the unit: machines or converters."""
+    return next(group for group in TIME_STEPS if any(m.n for m in found.groups[group].models.values()))
 
 
 def eigenvalues(records: dict[str, list[float]], folder: Path) -> list[list[float]]:
@@ -117,37 +152,31 @@ def eigenvalues(records: dict[str, list[float]], folder: Path) -> list[list[floa
 def response(records: dict[str, list[float]], step: str, folder: Path) -> dict[str, list[float]] | None:
     """Return P (MW), Q (Mvar), Vt (pu) and dw (pu) at TIMES with a step at 0.5 s; None where nothing takes the step."""
     found = system(records, folder)
-    machine = next(m for m in found.groups["SynGen"].models.values() if m.n)
+    group = group_of(found)
+    machine = next(m for m in found.groups[group].models.values() if m.n)
+    models = [(g, m) for g in OF_GROUP for m in found.groups[g].models.values() if m.n]
+    models = [(g, m) for g, m in models if g == "RenPlant"] or models  # it gives the references of the converter
+    constants = [(m, REFERENCES.get(m.class_name, OF_GROUP[g]).get(step)) for g, m in models]
+    taken = [(found.Slack, "v0")] if step == "E" else [(m, constant) for m, constant in constants if constant]
+    if not taken or (step in ("Qext", "PFaref") and bool(taken[0][0].PFFLAG.v[0]) != (step == "PFaref")):
+        return None
     found.TDS.config.tf = 0.5
     found.TDS.run()
-    if step == "E":
-        found.Slack.v0.v[:] += STEPS[step]
-    else:
-        named = [
-            (m, *REFERENCES.get(m.class_name, reference))
-            for group, reference in OF_GROUP.items()
-            for m in found.groups[group].models.values()
-            if m.n
-        ]
-        taken = next(((m, constant) for m, reference, constant in named if reference == step), None)
-        if taken is None:
-            return None
-        model, constant = taken
-        getattr(model, constant).v[:] += STEPS[step] / (model.R.v if step == "nref" else 1.0)
-    found.TDS.config.tf = float(TIMES[-1]) + 0.01
+    model, constant = taken[0]
+    getattr(model, constant).v[:] += STEPS[step] * FACTORS.get(constant, 1.0)
+    found.TDS.config.tf = ENDS[group] + 0.01
     found.TDS.run()
     series = found.dae.ts
     # The trapezoidal rule takes the step over the whole of one time step: in its middle, to second order.
-    times = np.where(TIMES > 0.5, TIMES + 0.5 * found.TDS.config.tstep, TIMES)
-    algebraic, states = (
-        np.column_stack([np.interp(times, series.t, column) for column in values.T]) for values in (series.y, series.x)
-    )
-    return {
-        "P": (100.0 * algebraic[:, machine.Pe.a[0]]).tolist(),
-        "Q": (100.0 * algebraic[:, machine.Qe.a[0]]).tolist(),
-        "Vt": algebraic[:, machine.v.a[0]].tolist(),
-        "dw": (states[:, machine.omega.a[0]] - 1.0).tolist(),
-    }
+    times = np.array([t for t in TIMES if t <= ENDS[group]])
+    times = np.where(times > 0.5, times + 0.5 * found.TDS.config.tstep, times)
+    runs = {}
+    for signal, (name, factor, added) in SHOWN.items():
+        variable = getattr(machine, name, None)
+        if variable is not None:
+            column = (series.x if variable.v_code == "x" else series.y)[:, variable.a[0]]
+            runs[signal] = (factor * np.interp(times, series.t, column) + added).tolist()
+    return runs
 
 
 def main(names: list[str]) -> None:

@@ -1,0 +1,23 @@
+"""Units: which inputs follow what in the recorded network."""
+
+from __future__ import annotations
+
+import pytest
+
+import hvdc_ident as hi
+from hvdc_ident.model import parse_card
+from hvdc_ident.plants import Part, unit_card
+
+
+def test_a_plant_of_converters_follows_the_recorded_frequency() -> None:
+    """The converter has no input for it, the plant controller has: at rest P falls by Ddn times what lies beyond the dead band."""
+    control = {"Fflag": 1.0, "Ddn": 20.0, "fdbd1": -6e-4, "fdbd2": 6e-4, "Pmin": 0.0}
+    parts = {"gen": Part("regca1"), "elec": Part("reeca1", {"QFLAG": 0.0}), "plant": Part("repca1", control)}
+    model = parse_card(unit_card(parts, network="playback", f0=60.0))
+    model = model.with_values({"P0": 80.0, "Q0": 10.0})
+    point = hi.find_operating_point(model)
+    references = ["Plant_pref", "Vref"]
+    held = model.driven(references).with_values({n: point.states[n] for n in references})
+    high = hi.find_operating_point(held, {"f": 60.2}, guess=point.states)
+    assert high.outputs["P"] == pytest.approx(80.0 - 100.0 * 20.0 * (0.2 / 60.0 - 6e-4))
+    assert high.outputs["Q"] == pytest.approx(10.0)
