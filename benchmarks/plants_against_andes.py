@@ -158,7 +158,13 @@ def response(records: dict[str, list[float]], step: str, folder: Path) -> dict[s
     models = [(g, m) for g, m in models if g == "RenPlant"] or models  # it gives the references of the converter
     constants = [(m, REFERENCES.get(m.class_name, OF_GROUP[g]).get(step)) for g, m in models]
     taken = [(found.Slack, "v0")] if step == "E" else [(m, constant) for m, constant in constants if constant]
-    if not taken or (step in ("Qext", "PFaref") and bool(taken[0][0].PFFLAG.v[0]) != (step == "PFaref")):
+    flags = {n: bool(getattr(m, n).v[0]) for _, m in models for n in ("PFFLAG", "Fflag") if hasattr(m, n)}
+    unused = {
+        "Qext": flags.get("PFFLAG", False),
+        "PFaref": not flags.get("PFFLAG", True),
+        "Plant_pref": not flags.get("Fflag", True),
+    }
+    if not taken or unused.get(step, False):
         return None
     found.TDS.config.tf = 0.5
     found.TDS.run()
