@@ -63,13 +63,17 @@ def nonwindup(rate: sp.Expr, x: sp.Expr, low: sp.Expr | None, high: sp.Expr | No
 
 
 def saturation(x: sp.Expr, x1: sp.Expr, s1: sp.Expr, x2: sp.Expr, s2: sp.Expr) -> sp.Expr:
-    """Return the saturation B (x - A)^2/x above A, 0 below, that is s1 at x1 and s2 at x2; 0 everywhere where s2 is 0."""
-    if s2 == 0:
+    """Return the saturation B (x - A)^2/x above A, 0 below, that is s1 at x1 and s2 at x2; 0 everywhere where s2 or x1 is 0.
+
+    Zeros stand in data for no saturation.
+    """
+    given = x1 * s2
+    if given == 0:
         return sp.S.Zero
     ratio = sp.sqrt(x1 * s1 / (x2 * s2))
     foot = (x1 - ratio * x2) / (1 - ratio)
     above = where(x > foot, x2 * s2 / (x2 - foot) ** 2 * (x - foot) ** 2 / x, 0)
-    return above if s2.is_number else where(s2 > 0, above, 0)
+    return above if given.is_number else where(given > 0, above, 0)
 
 
 def saturation_exponential(x: sp.Expr, x1: sp.Expr, s1: sp.Expr, x2: sp.Expr, s2: sp.Expr) -> sp.Expr:

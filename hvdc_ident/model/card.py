@@ -26,7 +26,7 @@ SCHEMA = 1
 MAX_BYTES = 5_000_000
 
 _BARE = re.compile(r"[A-Za-z0-9_-]+", re.ASCII)
-_TOP = ("schema", "name", "description", "record", *SECTIONS, *PARTS)
+_TOP = ("schema", "name", "description", "record", "also", *SECTIONS, *PARTS)
 _ESCAPES = {"\\": "\\\\", '"': '\\"', "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 _SHORT = frozenset(("signals", "outputs"))
 
@@ -98,7 +98,7 @@ def _model(card: dict[str, Any], inside: tuple[Path, ...]) -> Model:
     if "name" not in card:
         raise ModelError("the card has no name", expected='name = "..."')
     sections: dict[str, Any] = {s: _section(s, card[s]) for s in SECTIONS if s in card}
-    _check_record(card.get("record", []), sections.get("parameters", {}))
+    _check_record(card.get("record", []), card.get("also", []), sections.get("parameters", {}))
     if "components" not in card and "connections" not in card:
         return Model(name=card["name"], description=card.get("description", ""), **sections)
     parts = {n: _component(n, c, inside) for n, c in _table(card, "components").items()}
@@ -106,10 +106,12 @@ def _model(card: dict[str, Any], inside: tuple[Path, ...]) -> Model:
     return assembled(sections, parts, connections, name=card["name"], description=card.get("description", ""))
 
 
-def _check_record(record: object, parameters: dict[str, Any]) -> None:
-    """Refuse a record that is no list of parameters' names; "-" stands for a value that no parameter has."""
-    if not isinstance(record, list) or not all(isinstance(n, str) for n in record):
-        raise ModelError("the record is no list of names", expected='record = ["H", "D"]', got=_kind(record))
+def _check_record(record: object, also: object, parameters: dict[str, Any]) -> None:
+    """Refuse what is no list of names; of a record they are parameters', "-" where no parameter has the value."""
+    for key, value in (("record", record), ("also", also)):
+        if not isinstance(value, list) or not all(isinstance(n, str) for n in value):
+            raise ModelError(f"{key} is no list of names", expected=f'{key} = ["...", "..."]', got=_kind(value))
+    assert isinstance(record, list)
     require_known("parameter", [n for n in record if n != "-"], parameters, "record")
 
 

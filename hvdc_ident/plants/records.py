@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from hvdc_ident.errors import ModelError
 from hvdc_ident.plants.unit import Part, part_name, parts_of
 from hvdc_ident.psse import DyrFile, DyrRecord
-from hvdc_ident.shelf import components, is_component, record_of
+from hvdc_ident.shelf import components, record_of, source_of
 from hvdc_ident.text import listed
 
 
@@ -39,7 +39,7 @@ def recorded_unit(records: Sequence[DyrRecord], base: float) -> RecordedUnit:
 
     Raises ModelError where no record is that of a machine or converter on the shelf, or a record has another number of values.
     """
-    known = {r.model: _numbers(r) for r in records if is_component(r.model.lower())}
+    known = {r.model: _numbers(r) for r in records if source_of(r.model) is not None}
     unknown = tuple(r.model for r in records if r.model not in known)
     if not known:
         raise ModelError(
@@ -76,8 +76,8 @@ def with_unit_values(
     """
     left = dict(values)
     for record in records:
-        source = record.model.lower()
-        if not is_component(source):
+        source = source_of(record.model)
+        if source is None:
             continue
         name = part_name(source)
         changed: dict[int, float] = {}

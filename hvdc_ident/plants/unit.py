@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal
 
-from hvdc_ident.errors import ModelError
+from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, read_card
 from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.parameters import Input
-from hvdc_ident.shelf import card_of, record_of
+from hvdc_ident.shelf import card_of, components, record_of, source_of
 
 UNCONNECTED = FrozenMap(
     {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0", "wg": "1"}
@@ -121,7 +121,9 @@ def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, Part]:
     """Return the parts of a unit by name. records: by model (GENROU, SEXS), the values of its .dyr record in their order."""
     parts = {}
     for model, values in records.items():
-        source = model.lower()
+        source = source_of(model)
+        if source is None:
+            raise unknown_name("model on the shelf", model, [c.upper() for c in components() if record_of(c)])
         names = record_of(source)
         if len(values) != len(names):
             raise ModelError(

@@ -28,6 +28,21 @@ def card_of(name: str) -> Path:
 
 
 @cache
+def _sources() -> dict[str, str]:
+    """Return the component of each model of .dyr files, by the model's name."""
+    found = {name.upper(): name for name in components()}
+    for name in components():
+        card = tomllib.loads(card_of(name).read_text(encoding="utf-8"))
+        found |= dict.fromkeys(card.get("also", ()), name)
+    return found
+
+
+def source_of(model: str) -> str | None:
+    """Return the component that stands for a model of .dyr files (GENROU); None where none is on the shelf."""
+    return _sources().get(model.upper())
+
+
+@cache
 def record_of(name: str) -> tuple[str, ...]:
     """Return a component's parameters in the order of the values of its .dyr record; "-" for a value that it does not use."""
     return tuple(tomllib.loads(card_of(name).read_text(encoding="utf-8")).get("record", ()))

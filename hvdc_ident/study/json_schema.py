@@ -158,7 +158,7 @@ def card_schema() -> dict[str, Any]:
 def _top_kind(key: str) -> dict[str, Any]:
     if key == "schema":
         return {"const": SCHEMA, "type": "integer"}
-    if key == "record":
+    if key in ("record", "also"):
         return {"type": "array", "items": {"type": "string"}}
     if key not in CARD:
         return {"type": "string"}

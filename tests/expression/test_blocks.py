@@ -55,6 +55,12 @@ def test_no_saturation_where_its_points_are_0(text: str) -> None:
     assert parse(text.replace("S1", "0").replace("S2", "0")) == 0
 
 
+def test_a_first_point_at_0_is_no_saturation() -> None:
+    """Data have E1 = 0, SE1 = 0, E2 = 1, SE2 = 1 where there is none."""
+    assert value("saturation(x, E1, S1, E2, S2)", x=2.0, E1=0.0, S1=0.0, E2=1.0, S2=1.0) == 0.0
+    assert parse("saturation(x, 0, 0, 1, 1)") == 0
+
+
 def test_dead_bands_of_both_types() -> None:
     assert [value("deadband(u, 0.1)", u=u) for u in (-0.3, -0.05, 0.0, 0.1, 0.4)] == pytest.approx([-0.2, 0, 0, 0, 0.3])
     assert [value("deadband_step(u, 0.1)", u=u) for u in (-0.3, -0.05, 0.0, 0.4)] == pytest.approx([-0.3, 0, 0, 0.4])

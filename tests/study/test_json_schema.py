@@ -69,7 +69,7 @@ def test_every_key_of_the_readers_has_a_text_and_no_other() -> None:
     assert {s: {f.name for f in fields(kind)} for s, (kind, _, _) in json_schema.CARD.items()} == {
         s: set(keys) for s, keys in texts.items() if s != "card"
     }
-    assert set(texts["card"]) == {"schema", "name", "description", "record", *json_schema.CARD}
+    assert set(texts["card"]) == {"schema", "name", "description", "record", "also", *json_schema.CARD}
 
 
 @pytest.mark.parametrize("kind", ["study", "model-card"])
