@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal
@@ -28,6 +28,7 @@ LEVELS = FrozenMap({level: output for level, output, _, _ in REFERENCES})
 """By input with a level the output that has it."""
 LOADED = 0.8
 """Share of its base that a unit delivers where its level is not known."""
+VOLTAGE = Input(1.0, "pu", "voltage of the infinite bus")
 SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu"})
 """Outputs of a unit, where one of its components has them, with their units."""
 
@@ -66,55 +67,78 @@ def unit_card(
     """
     models = {n: shelf_model(p.source) for n, p in parts.items()}
     machine = _one_that_gives(models, "Ir")
-    lines = ["schema = 1", f"name = {toml_string(name)}"]
-    inputs = {"E": Input(1.0, "pu", "voltage of the infinite bus")} if network == "infinite-bus" else {}
-    if network == "playback":
-        inputs |= {n: replace(i, value=f0) if n == "f" else i for n, i in shelf_model("playback").inputs.items()}
-    connections = _network(machine, network)
-    for part, model in models.items():
-        for u, quantity in model.inputs.items():
-            target = f"{part}.{u}"
-            if target in connections:
-                continue
-            sources = [n for n, other in models.items() if n != part and u in other.outputs]
-            if len(sources) > 1:
-                raise ModelError(f"'{target}' may follow several parts", expected="one", got=", ".join(sources))
-            if sources:
-                connections[target] = f"{sources[0]}.{u}"
-            elif network == "playback" and u == "dwn":
-                connections[target] = "bus.dwn"
-            else:
-                connections[target] = UNCONNECTED.get(u, u)
-            if not sources and u not in UNCONNECTED:
+    played = network == "playback"
+    connections, references = _wired(models, _network(machine, network), played)
+    inputs: dict[str, Input] = {**(shelf_model("playback").inputs if played else {"E": VOLTAGE}), **references}
+    found = _references(inputs, parts[machine]) if played else {}
+    known = {"f": f0} | dict(levels)
+    grid = (
+        {"bus": Part("playback", {"f0": f0})}
+        if played
+        else {"grid": Part("infinite-bus"), "line": Part("line", {"R": R, "X": X})}
+    )
+    shared = {n: {"f0": f0} if "f0" in m.parameters else {} for n, m in models.items()}
+    components = {n: replace(p, values=shared[n] | dict(p.values)) for n, p in parts.items()} | grid
+    lines = [
+        "schema = 1",
+        f"name = {toml_string(name)}",
+        "",
+        "[inputs]",
+        *(_input_line(n, replace(i, value=known.get(n, i.value))) for n, i in inputs.items()),
+        *(line for n, p in components.items() for line in _component_lines(n, p)),
+        "",
+        "[connections]",
+        *(f"{toml_key(n)} = {e if e.startswith('{') else toml_string(e)}" for n, e in connections.items()),
+        *(line for n, about in found.items() for line in _reference_lines(n, machine, *about)),
+        "",
+        "[outputs]",
+        *_output_lines(models),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _wired(
+    models: Mapping[str, Model], connections: Mapping[str, str], played: bool
+) -> tuple[dict[str, str], FrozenMap[Input]]:
+    """Return what each input of the parts follows, and the inputs of the unit that are left. connections: those with the network."""
+    found, inputs = dict(connections), dict[str, Input]()
+    targets = [
+        (n, u, quantity) for n, m in models.items() for u, quantity in m.inputs.items() if f"{n}.{u}" not in found
+    ]
+    for part, u, quantity in targets:
+        sources = [n for n, other in models.items() if n != part and u in other.outputs]
+        if len(sources) > 1:
+            raise ModelError(f"'{part}.{u}' may follow several parts", expected="one", got=", ".join(sources))
+        if sources:
+            found[f"{part}.{u}"] = f"{sources[0]}.{u}"
+        elif played and u == "dwn":
+            found[f"{part}.{u}"] = "bus.dwn"
+        else:
+            found[f"{part}.{u}"] = UNCONNECTED.get(u, u)
+            if u not in UNCONNECTED:
                 inputs.setdefault(u, quantity)
-    found = _references(inputs, parts[machine]) if network == "playback" else {}
-    inputs = {n: replace(i, value=levels.get(n, i.value)) for n, i in inputs.items()}
-    lines += ["", "[inputs]", *(_input_line(n, i) for n, i in inputs.items())]
-    shared = {"f0": f0}
-    for part, p in parts.items():
-        own = {n: v for n, v in shared.items() if n in models[part].parameters} | dict(p.values)
-        lines += ["", f"[components.{part}]", f"source = {toml_string(p.source)}"]
-        lines += (
-            [f"parameters = {{{', '.join(f'{toml_key(n)} = {float(v)!r}' for n, v in own.items())}}}"] if own else []
-        )
-    if network == "playback":
-        lines += ["", "[components.bus]", 'source = "playback"', f"parameters = {{f0 = {f0!r}}}"]
-    else:
-        lines += ["", "[components.grid]", 'source = "infinite-bus"']
-        lines += ["", "[components.line]", 'source = "line"', f"parameters = {{R = {R!r}, X = {X!r}}}"]
-    lines += ["", "[connections]"]
-    lines += [f"{toml_key(n)} = {e if e.startswith('{') else toml_string(e)}" for n, e in connections.items()]
-    for reference, (level, output, quantity) in found.items():
-        # It never moves; where it stands follows from the level of the output.
-        rest = f"{reference} + ({level} - {machine}.{output})/{machine}.Sn"
-        lines += ["", f"[states.{toml_key(reference)}]", 'derivative = "0"', f"rest = {toml_string(rest)}"]
-        lines += [f"guess = {quantity.value!r}", f"unit = {toml_string(quantity.unit)}"]
-        lines += [f"description = {toml_string(quantity.description)}"]
-    lines += ["", "[outputs]"]
+    return found, FrozenMap(inputs)
+
+
+def _component_lines(name: str, part: Part) -> Iterator[str]:
+    yield from ("", f"[components.{name}]", f"source = {toml_string(part.source)}")
+    if part.values:
+        yield f"parameters = {{{', '.join(f'{toml_key(n)} = {float(v)!r}' for n, v in part.values.items())}}}"
+
+
+def _reference_lines(name: str, machine: str, level: str, output: str, quantity: Input) -> Iterator[str]:
+    """Yield the state of a reference: it never moves, and where it stands follows from the level of the output."""
+    rest = f"{name} + ({level} - {machine}.{output})/{machine}.Sn"
+    yield from ("", f"[states.{toml_key(name)}]", 'derivative = "0"', f"rest = {toml_string(rest)}")
+    yield from (f"guess = {quantity.value!r}", f"unit = {toml_string(quantity.unit)}")
+    yield f"description = {toml_string(quantity.description)}"
+
+
+def _output_lines(models: Mapping[str, Model]) -> Iterator[str]:
     for n, unit in SHOWN.items():
         source = next((part for part, model in models.items() if n in model.outputs), None)
-        lines += [f'{n} = {{value = "{source}.{n}", unit = "{unit}"}}'] if source else []
-    return "\n".join(lines) + "\n"
+        if source is not None:
+            yield f'{n} = {{value = "{source}.{n}", unit = "{unit}"}}'
 
 
 def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, Part]:
