@@ -19,7 +19,7 @@ UNCONNECTED = FrozenMap(
 )
 """What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), nominal frequency and speed."""
 REFERENCES = (
-    ("P0", "P", "MW", ("Pref", "Plant_pref", "Pm")),
+    ("P0", "P", "MW", ("Plant_pref", "Pref", "nref", "Pm")),
     ("Q0", "Q", "Mvar", ("Vref", "Qref", "Qext", "Efd")),
 )
 """Of a unit that is played back: the input with the recorded level before the event, its output and unit, and the reference that is
