@@ -340,7 +340,7 @@ def test_convert_cuts_by_time_and_counts(tmp_path: Path) -> None:
         (("fit", "--executor", "spark://h:1"), "on this machine or by a dask scheduler"),
         (("run", "--executor", "foo"), "expected local, dask://HOST:PORT or dask+tls://HOST:PORT, got 'foo'"),
         (("diagnose", "--executor", "dask://"), "on this machine or by a dask scheduler"),
-        (("export", "--to", "x.xyz"), "expected one of .csv, .fmu"),
+        (("export", "--to", "x.xyz"), "expected one of .csv, .dyr, .fmu"),
         (("fit", "--force", "gain"), "no candidate 'gain'"),
     ],
 )

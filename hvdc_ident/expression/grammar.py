@@ -32,12 +32,12 @@ MAX_POINTS = 64
 CONSTANTS = ("pi", "time")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")
 _OPERATORS = ("+", "-", "*", "/", *COMPARISONS)
-IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*)*", re.ASCII)
+IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z][A-Za-z0-9_]*)*", re.ASCII)
 # A quantifier that gives nothing back: no text makes the scan slower than linear.
 _TOKEN = re.compile(
     r"(?P<space>[ \t\r\n]+)"
     r"|(?P<number>(?:[0-9]++(?:\.[0-9]*+)?|\.[0-9]++)(?:[eE][+-]?[0-9]++)?)"
-    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*+(?:\.[A-Za-z_][A-Za-z0-9_]*+)*+)"
+    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*+(?:\.[A-Za-z][A-Za-z0-9_]*+)*+)"
     r"|(?P<mark>\*\*|<=|>=|==|!=|[-+*/(),<>\[\]])",
     re.ASCII,
 )
@@ -50,7 +50,7 @@ def is_identifier(name: object) -> bool:
 
 def is_reserved(name: object) -> bool:
     """True for the name of a function or a constant of the grammar, which no variable can have."""
-    return name in FUNCTIONS or name in BLOCKS or name in CONSTANTS
+    return name in FUNCTIONS or name in CONSTANTS
 
 
 class Token(NamedTuple):
@@ -230,7 +230,7 @@ class _Scan:
             near = difflib.get_close_matches(token.text, known, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(known)}"
             self.source.fail(f"no function '{token.text[:40]}' ({hint})", token.position)
-        if not called and token.text in known:
+        if not called and token.text in FUNCTIONS:
             self.source.fail(f"'{token.text}' is a function and cannot stand alone", token.position)
 
     def _unexpected(self, token: Token, expected: str) -> NoReturn:

@@ -72,7 +72,7 @@ def test_version_and_kind_are_chosen_by_options(study: Path, tmp_path: Path) -> 
         (["x.fmu", "--fmi", "1"], "expected 2 or 3"),
         (["x.fmu", "--kind", "both"], "expected me or cs"),
         (["x.mo", "--fmi", "3"], "expected a file *.fmu"),
-        (["x.xyz"], "expected one of .csv, .fmu"),
+        (["x.xyz"], "expected one of .csv, .dyr, .fmu"),
     ],
 )
 def test_what_does_not_go_together_is_refused(study: Path, tmp_path: Path, options: list[str], message: str) -> None:
