@@ -1,13 +1,13 @@
 """Plants of standard components: units at an infinite bus or at a recorded voltage, wired by the names of their signals."""
 
 from hvdc_ident.plants.records import RecordedUnit, machine_records, recorded_unit, with_unit_values
-from hvdc_ident.plants.unit import LEVELS, MACHINE, Part, parts_of, shelf_model, unit_card
+from hvdc_ident.plants.unit import LEVELS, MACHINE, UnitPart, parts_of, shelf_model, unit_card
 
 __all__ = [
     "LEVELS",
     "MACHINE",
-    "Part",
     "RecordedUnit",
+    "UnitPart",
     "machine_records",
     "parts_of",
     "recorded_unit",

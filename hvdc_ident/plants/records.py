@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.plants.unit import Part, part_name, parts_of
+from hvdc_ident.plants.unit import UnitPart, part_name, parts_of
 from hvdc_ident.psse import DyrFile, DyrRecord
 from hvdc_ident.shelf import components, record_of, source_of
 from hvdc_ident.text import listed
@@ -16,7 +16,7 @@ from hvdc_ident.text import listed
 class RecordedUnit:
     """A unit as a .dyr file states it. parts: by name; unknown: names of models that are not on the shelf."""
 
-    parts: Mapping[str, Part]
+    parts: Mapping[str, UnitPart]
     unknown: tuple[str, ...]
 
 
@@ -60,7 +60,7 @@ def _numbers(record: DyrRecord) -> list[float]:
     return [v for v in record.values if isinstance(v, float)]
 
 
-def _on_base(part: Part, base: float) -> Part:
+def _on_base(part: UnitPart, base: float) -> UnitPart:
     from hvdc_ident.plants.unit import shelf_model
 
     has_base = "Sn" in shelf_model(part.source).parameters

@@ -39,7 +39,7 @@ NAMES = FrozenMap({"Ir": MACHINE, "Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd
 
 
 @dataclass(frozen=True)
-class Part:
+class UnitPart:
     """A component of a unit. source: its name on the shelf; values: parameters that differ from its card's."""
 
     source: str
@@ -47,7 +47,7 @@ class Part:
 
 
 def unit_card(
-    parts: Mapping[str, Part],
+    parts: Mapping[str, UnitPart],
     *,
     name: str = "unit",
     network: Literal["infinite-bus", "playback"] = "infinite-bus",
@@ -73,9 +73,9 @@ def unit_card(
     found = _references(inputs, parts[machine]) if played else {}
     known = {"f": f0} | dict(levels)
     grid = (
-        {"bus": Part("playback", {"f0": f0})}
+        {"bus": UnitPart("playback", {"f0": f0})}
         if played
-        else {"grid": Part("infinite-bus"), "line": Part("line", {"R": R, "X": X})}
+        else {"grid": UnitPart("infinite-bus"), "line": UnitPart("line", {"R": R, "X": X})}
     )
     shared = {n: {"f0": f0} if "f0" in m.parameters else {} for n, m in models.items()}
     components = {n: replace(p, values=shared[n] | dict(p.values)) for n, p in parts.items()} | grid
@@ -120,7 +120,7 @@ def _wired(
     return found, FrozenMap(inputs)
 
 
-def _component_lines(name: str, part: Part) -> Iterator[str]:
+def _component_lines(name: str, part: UnitPart) -> Iterator[str]:
     yield from ("", f"[components.{name}]", f"source = {toml_string(part.source)}")
     if part.values:
         yield f"parameters = {{{', '.join(f'{toml_key(n)} = {float(v)!r}' for n, v in part.values.items())}}}"
@@ -141,7 +141,7 @@ def _output_lines(models: Mapping[str, Model]) -> Iterator[str]:
             yield f'{n} = {{value = "{source}.{n}", unit = "{unit}"}}'
 
 
-def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, Part]:
+def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, UnitPart]:
     """Return the parts of a unit by name. records: by model (GENROU, SEXS), the values of its .dyr record in their order."""
     parts = {}
     for model, values in records.items():
@@ -155,7 +155,9 @@ def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, Part]:
                 expected=f"{len(names)}: {', '.join(names)}",
                 got=str(len(values)),
             )
-        parts[part_name(source)] = Part(source, {n: float(v) for n, v in zip(names, values, strict=True) if n != "-"})
+        parts[part_name(source)] = UnitPart(
+            source, {n: float(v) for n, v in zip(names, values, strict=True) if n != "-"}
+        )
     return parts
 
 
@@ -165,7 +167,7 @@ def part_name(source: str) -> str:
     return next((n for o, n in NAMES.items() if o in outputs), source)
 
 
-def _references(inputs: dict[str, Input], machine: Part) -> dict[str, tuple[str, str, Input]]:
+def _references(inputs: dict[str, Input], machine: UnitPart) -> dict[str, tuple[str, str, Input]]:
     """Return by reference its level's name, its output and what it was; the levels take the places of the references among the inputs."""
     found = {}
     for level, output, unit, names in REFERENCES:

@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 import hvdc_ident as hi
 from hvdc_ident.model import Model, parse_card
-from hvdc_ident.plants import Part, parts_of, unit_card
+from hvdc_ident.plants import UnitPart, parts_of, unit_card
 from hvdc_ident.plants.unit import shelf_model
 
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
@@ -192,7 +192,7 @@ def test_loops_of_reactive_power_and_voltage(source, VFLAG, E) -> None:
     table = {f"I{k}{i}": 1.3 for k in "qp" for i in range(1, 5)} if source == "reeca1" else {}
     values = {**LOOPS, **table, "VFLAG": VFLAG, "QFLAG": 1.0, "Kqv": 0.0 if source == "reecb1" else 2.0, "Vref0": 1.02}
     values |= {} if VFLAG else {"QMax": 1.2}  # which limit the voltage reference, too
-    parts = parts_of({"REGCA1": REGCA1}) | {"elec": Part(source, values)}
+    parts = parts_of({"REGCA1": REGCA1}) | {"elec": UnitPart(source, values)}
     model = parse_card(unit_card(parts, f0=60.0, X=0.3)).with_values({"Qext": 0.1 if VFLAG else 1.02})
     point = hi.find_operating_point(model, outputs={"P": 80.0, "Vt": 1.02}, free=["Pref", "Qext"])
     model, reference = model.with_values(point.inputs), point.inputs["Qext"]

@@ -9,9 +9,9 @@ import hvdc_ident as hi
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import InputError
 from hvdc_ident.model import parse_card
-from hvdc_ident.plants import Part, unit_card
+from hvdc_ident.plants import UnitPart, unit_card
 
-PARTS = {"gen": Part("genrou"), "avr": Part("sexs"), "gov": Part("tgov1")}
+PARTS = {"gen": UnitPart("genrou"), "avr": UnitPart("sexs"), "gov": UnitPart("tgov1")}
 TIMES = np.arange(0.0, 6.0, 0.01)
 TRUTH = {"gen.H": 3.8, "avr.K": 130.0}
 

@@ -6,13 +6,17 @@ import pytest
 
 import hvdc_ident as hi
 from hvdc_ident.model import parse_card
-from hvdc_ident.plants import Part, unit_card
+from hvdc_ident.plants import UnitPart, unit_card
 
 
 def test_a_plant_of_converters_follows_the_recorded_frequency() -> None:
     """The converter has no input for it, the plant controller has: at rest P falls by Ddn times what lies beyond the dead band."""
     control = {"Fflag": 1.0, "Ddn": 20.0, "fdbd1": -6e-4, "fdbd2": 6e-4, "Pmin": 0.0}
-    parts = {"gen": Part("regca1"), "elec": Part("reeca1", {"QFLAG": 0.0}), "plant": Part("repca1", control)}
+    parts = {
+        "gen": UnitPart("regca1"),
+        "elec": UnitPart("reeca1", {"QFLAG": 0.0}),
+        "plant": UnitPart("repca1", control),
+    }
     model = parse_card(unit_card(parts, network="playback", f0=60.0))
     model = model.with_values({"P0": 80.0, "Q0": 10.0})
     point = hi.find_operating_point(model)

@@ -12,7 +12,7 @@ import hvdc_ident as hi
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal
 from hvdc_ident.model import parse_card
-from hvdc_ident.plants import Part, unit_card
+from hvdc_ident.plants import UnitPart, unit_card
 from hvdc_ident.psse import read_dyr
 
 DYR = """// a plant
@@ -41,7 +41,11 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("plant")
     (folder / "plant.dyr").write_text(DYR, encoding="utf-8")
     (folder / "grid.raw").write_text(RAW, encoding="utf-8")
-    parts = {"gen": Part("genrou", {"Sn": 250.0, "H": 3.6}), "avr": Part("sexs", {"K": 140.0}), "gov": Part("tgov1")}
+    parts = {
+        "gen": UnitPart("genrou", {"Sn": 250.0, "H": 3.6}),
+        "avr": UnitPart("sexs", {"K": 140.0}),
+        "gov": UnitPart("tgov1"),
+    }
     card = unit_card(parts, R=0.004, X=0.12)
     card = card.replace(
         "[outputs]", '[outputs]\nVr = {value = "line.Vr", unit = "pu"}\nVi = {value = "line.Vi", unit = "pu"}'
