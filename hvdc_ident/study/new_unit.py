@@ -23,8 +23,8 @@ SPAN = 4.0
 
 @dataclass(frozen=True)
 class UnitAsked:
-    """Which unit of which files. machine: its identifier, where the bus has several; raw: the power flow; base: MVA of the machine, and
-    frequency in Hz, where no power flow says them."""
+    """A unit and its files. bus: its number; machine: its identifier, where the bus has several; raw: the power flow; base: MVA of the
+    machine, and frequency in Hz, where no power flow says them."""
 
     dyr: Path
     bus: int
@@ -64,9 +64,14 @@ def new_unit_study(folder: str | Path, recordings: str | Path | Sequence[str | P
     def write(levels: Mapping[str, float]) -> None:
         write_text(card, unit_card(unit.parts, name=name, network="playback", f0=frequency, levels=levels))
 
+    # Levels are known once the columns are mapped, and those are mapped to the signals of the card.
     write({})
     about = DyrOfStudy(asked.dyr, asked.bus, records[0].machine, unit.unknown, _candidates(unit), _places(unit))
-    found = new_study(folder, recordings, card, dyr=about)
+    try:
+        found = new_study(folder, recordings, card, dyr=about)
+    except InputError:
+        card.unlink()  # the next try finds the folder as it was
+        raise
     write(_levels(found))
     return found
 
