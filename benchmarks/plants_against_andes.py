@@ -44,7 +44,7 @@ OF_GROUP = {
 }
 """The same for the other models of a group; qref0 is -Qext."""
 FACTORS = {"qref0": -1.0, "q0": 20.0}
-"""What a step of a reference is multiplied with for a constant; 1/R = 20 in the cases with q0."""
+"""Factors from the step of a reference to that of a constant; 1/R = 20 in the cases with q0."""
 SHOWN = {"P": ("Pe", 100.0, 0.0), "Q": ("Qe", 100.0, 0.0), "Vt": ("v", 1.0, 0.0), "dw": ("omega", 1.0, -1.0)}
 """Signals by name: the variable of the machine or converter, the factor and what is added; MW, Mvar, pu."""
 TIME_STEPS = {"SynGen": 0.001, "RenGen": 0.002}
@@ -197,7 +197,7 @@ def main(names: list[str]) -> None:
             found["responses"] = {step: run for step, run in runs.items() if run is not None}
         known["cases"][name] = found
         print(name, len(found["eigenvalues"]), list(found["responses"]), flush=True)
-        known["andes"] = andes.__version__
+        known |= {"andes": andes.__version__, "steps": STEPS, "times": TIMES.tolist()}
         known["cases"] = {n: known["cases"][n] for n in cases if n in known["cases"]}
         rounded = json.loads(json.dumps(known), parse_float=lambda x: float(f"{float(x):.9g}"))
         path.write_text(json.dumps(rounded) + "\n", encoding="utf-8")

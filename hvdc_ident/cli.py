@@ -76,9 +76,7 @@ def new(
     place of --model, the model is the unit of that bus, played back: recorded V and theta or f give P and Q.
     """
     if unit.dyr is not None or unit.bus is not None:
-        written = _new_unit(folder, recordings or [], model, unit)
-        console.print_json(written.to_dict())
-        console.say(*written.lines)
+        _tell_new(console, _new_unit(folder, recordings or [], model, unit))
         return
     if (recordings is None) != (model is None):
         raise InputError(
@@ -91,9 +89,7 @@ def new(
     if recordings and model:
         from hvdc_ident.study.new_study import new_study
 
-        found = new_study(folder, recordings, model, trust=access.trust, limits=access.limits)
-        console.print_json(found.to_dict())
-        console.say(*found.lines)
+        _tell_new(console, new_study(folder, recordings, model, trust=access.trust, limits=access.limits))
         return
     from hvdc_ident.study.examples import write_starter
 
@@ -115,9 +111,12 @@ def _new_unit(folder: Path, recordings: list[Path], model: str | None, unit: Pss
             got=", ".join(n for n, v in given.items() if v is not None),
             hint="--dyr plant.dyr --raw grid.raw --bus 101 --from event.csv",
         )
-    return new_unit_study(
-        folder, recordings, UnitAsked(unit.dyr, unit.bus, unit.machine, unit.raw, unit.base, unit.frequency)
-    )
+    return new_unit_study(folder, recordings, UnitAsked(**vars(unit)))
+
+
+def _tell_new(console: Console, found: NewStudy) -> None:
+    console.print_json(found.to_dict())
+    console.say(*found.lines)
 
 
 def check(

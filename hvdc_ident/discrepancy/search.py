@@ -272,9 +272,9 @@ def _outside(
     """Return the round with the refits of forms outside the catalogue, and the form that comes nearer than any effect, if one does.
 
     A form with many values finds the place and the gains where an effect, beside biased gains, did not: a filter whose poles and zeros
-    meet is a gain. So every effect is tried there, begun with the gains that the form came to. Where one of them
-    comes near the noise too, the catalogue lacks nothing. Forms are looked for in the first round, where the best refit takes away
-    some of the misfit and leaves more than noise.
+    meet is a gain. So every effect is tried there, begun with the gains that the form came to. Where one of them comes near the
+    noise too, the catalogue lacks nothing. Forms are looked for in the first round, where the best refit takes away some of the misfit
+    and leaves more than noise.
     """
     best = next(iter(by_cost(trials)), None)
     if number > 1 or not search.options.fallback or search.spent or best is None or not _tells(opened, trials):

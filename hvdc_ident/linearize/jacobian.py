@@ -92,7 +92,7 @@ def _with_constants_as_inputs(model: AnyModel, at: OperatingPoint) -> tuple[AnyM
 def _constants(model: Model) -> list[str]:
     """Return the states of the model as it was given that stand where the start puts them; those of effects are their memory."""
     given = model.origin.root.states if model.origin else model.states
-    return [n for n, s in model.states.items() if n in given and s.derivative == 0 and s.rest is not None]
+    return [n for n, s in model.states.items() if n in given and s.is_reference]
 
 
 def _closed(s: CompiledSystem, p: Array, parts: Blocks, names: Sequence[str]) -> tuple[int, ...]:

@@ -38,6 +38,11 @@ class State:
     description: str = ""
     vanishes: sp.Expr | None = None
 
+    @property
+    def is_reference(self) -> bool:
+        """True where it never moves, and its rest tells where it stands: a reference that is found with the start."""
+        return self.derivative == 0 and self.rest is not None
+
 
 @dataclass(frozen=True)
 class Signal:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.plants.unit import UnitPart, part_name, parts_of
+from hvdc_ident.plants.unit import UnitPart, part_name, parts_of, shelf_model
 from hvdc_ident.psse import DyrFile, DyrRecord
 from hvdc_ident.shelf import components, record_of, source_of
 from hvdc_ident.text import listed
@@ -61,8 +61,6 @@ def _numbers(record: DyrRecord) -> list[float]:
 
 
 def _on_base(part: UnitPart, base: float) -> UnitPart:
-    from hvdc_ident.plants.unit import shelf_model
-
     has_base = "Sn" in shelf_model(part.source).parameters
     return replace(part, values={**part.values, "Sn": base}) if has_base else part
 

@@ -21,7 +21,7 @@ from hvdc_ident.psse.free_format import (
     ENCODING,
     SHOWN,
     Item,
-    Token,
+    Word,
     content_of,
     items_of,
     number_text,
@@ -173,9 +173,9 @@ def _parsed(path: str, content: bytes) -> DyrFile:
     return DyrFile(path, content, tuple(records))
 
 
-def _records(text: str, begin: int) -> Iterator[tuple[list[Token], bool]]:
+def _records(text: str, begin: int) -> Iterator[tuple[list[Word], bool]]:
     """Yield the tokens of each record, and whether a `/` ends it."""
-    pieces: list[Token] = []
+    pieces: list[Word] = []
     place, at_start = begin, True
     while place < len(text):
         if at_start:
@@ -203,7 +203,7 @@ def _records(text: str, begin: int) -> Iterator[tuple[list[Token], bool]]:
         yield pieces, False
 
 
-def _check_one(pieces: list[Token], closed: bool, where: str, line_of: Callable[[int], int]) -> None:
+def _check_one(pieces: list[Word], closed: bool, where: str, line_of: Callable[[int], int]) -> None:
     """Raise ModelError where the tokens are those of two records, or their end is the file's."""
     hint = "end the record with /"
     values = [p for p in pieces if p.kind not in ("comma", "line")]
@@ -223,16 +223,16 @@ def _check_one(pieces: list[Token], closed: bool, where: str, line_of: Callable[
         raise ModelError("a record without its end", where=where, expected="a /", got="the end of the file", hint=hint)
 
 
-def _is_event(pieces: list[Token]) -> bool:
+def _is_event(pieces: list[Word]) -> bool:
     words = [_bare(p) for p in pieces if p.kind in ("quoted", "word")][:2]
     return len(words) == 2 and words[1].upper() in _EVENTS and words[0].isalpha()
 
 
-def _bare(piece: Token) -> str:
+def _bare(piece: Word) -> str:
     return piece.text.strip("'\"").strip()
 
 
-def _record(number: int, line: int, pieces: list[Token], path: str) -> DyrRecord:
+def _record(number: int, line: int, pieces: list[Word], path: str) -> DyrRecord:
     where = f"{path}:{line}"
     items = items_of(pieces, where)
     bus = _integer(items[0] if items else None, "a bus number", where)
@@ -269,7 +269,7 @@ def _is_name(item: Item) -> bool:
     return isinstance(item.value, str) and _NAME.fullmatch(item.value.strip()) is not None
 
 
-def _id(item: Item, pieces: list[Token]) -> str:
+def _id(item: Item, pieces: list[Word]) -> str:
     """Return a machine's id as it is written: 1 stays 1, 01 stays 01."""
     if isinstance(item.value, str):
         return item.value.strip()

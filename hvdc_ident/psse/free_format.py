@@ -36,7 +36,7 @@ _NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[eEdD]([+-]?\d+)|([+-]\d+))?
 _REPEATED = re.compile(r"([1-9]\d{0,3})\*(.*)")
 
 
-class Token(NamedTuple):
+class Word(NamedTuple):
     """A piece of the text, with its place."""
 
     kind: Kind
@@ -82,15 +82,15 @@ def start_of(text: str) -> int:
     return len(mark) if text.startswith(mark) else 0
 
 
-def tokens(text: str, start: int, end: int | None = None) -> Iterator[Token]:
+def tokens(text: str, start: int, end: int | None = None) -> Iterator[Word]:
     """Yield the tokens of the text from a place on; blanks are none."""
     for found in _TOKEN.finditer(text, start, len(text) if end is None else end):
         kind = found.lastgroup
         if kind is not None:
-            yield Token(kind, found[0], *found.span())  # type: ignore[arg-type]  # the names of the groups are the kinds
+            yield Word(kind, found[0], *found.span())  # type: ignore[arg-type]  # the names of the groups are the kinds
 
 
-def items_of(pieces: list[Token], where: str) -> list[Item]:
+def items_of(pieces: list[Word], where: str) -> list[Item]:
     """Return the values of a record's tokens up to its `/`; ModelError for a quote without its end, or a word without quotes.
 
     where: the file and line that an error names.

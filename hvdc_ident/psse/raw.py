@@ -124,7 +124,7 @@ class Transformer(NamedTuple):
 
 @dataclass(frozen=True)
 class RawFile:
-    """What a .raw file says of the network."""
+    """The network of a .raw file."""
 
     path: str
     version: int
@@ -173,7 +173,7 @@ class _Section(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Record:
+class _Line:
     """The fields of one line, with what an error says of it."""
 
     what: str
@@ -243,7 +243,7 @@ def read_raw(path: str | Path) -> RawFile:
     for section in _sections(numbered[3:], version):
         sections.setdefault(section.name, []).extend(section.lines)
 
-    def records(name: str, what: str) -> Iterator[_Record]:
+    def records(name: str, what: str) -> Iterator[_Line]:
         return (_record(where, what, *line) for line in sections.get(name, ()))
 
     buses = tuple(_bus(r) for r in records("BUS", "a bus"))
@@ -305,17 +305,17 @@ def _canonical(name: str) -> str:
     return {"NON-TRANSFORMER BRANCH": "BRANCH", "AC LINE": "BRANCH", "SYSTEM WIDE": "SYSTEM-WIDE"}.get(words, words)
 
 
-def _record(path: str, what: str, number: int, line: str) -> _Record:
+def _record(path: str, what: str, number: int, line: str) -> _Line:
     where = f"{path}:{number}"
     pieces = []
     for piece in tokens(line, 0):
         if piece.kind == "slash":
             break
         pieces.append(piece)
-    return _Record(what, where, tuple(item.value for item in items_of(pieces, where)))
+    return _Line(what, where, tuple(item.value for item in items_of(pieces, where)))
 
 
-def _bus(r: _Record) -> Bus:
+def _bus(r: _Line) -> Bus:
     return Bus(
         r.integer(0, "i", None),
         r.text(_BUS["name"], ""),
@@ -326,7 +326,7 @@ def _bus(r: _Record) -> Bus:
     )
 
 
-Number = Callable[[_Record, int], int]
+Number = Callable[[_Line, int], int]
 
 
 def _numbers(buses: Sequence[Bus]) -> Number:
@@ -337,7 +337,7 @@ def _numbers(buses: Sequence[Bus]) -> Number:
         for name in (b.name, f"{b.name:<12}{b.base_kv:g}"):
             named.setdefault(_squeezed(name), []).append(b.number)
 
-    def number(r: _Record, place: int) -> int:
+    def number(r: _Line, place: int) -> int:
         value = r.get(place)
         if isinstance(value, str):
             squeezed = _squeezed(value)
@@ -371,12 +371,12 @@ def _without_zeros(name: str) -> str:
     return f"{head} {float(tail):g}" if re.fullmatch(r"\d+\.\d*", tail) else name
 
 
-def _load(r: _Record, number: Number) -> Load:
+def _load(r: _Line, number: Number) -> Load:
     powers = [r.number(_LOAD[name], name, 0.0) for name in ("p", "q", "ip", "iq", "yp", "yq")]
     return Load(number(r, 0), r.text(_LOAD["id"], "1"), r.integer(_LOAD["status"], "status", 1), *powers)
 
 
-def _generator(r: _Record, number: Number, version: int, sbase: float) -> Generator:
+def _generator(r: _Line, number: Number, version: int, sbase: float) -> Generator:
     # The regulated bus (IREG) takes field 8, since version 35 with its node (NREG) in field 9.
     start = 9 if version >= 35 else 8
     places: Mapping[str, int] = _GENERATOR | {name: start + k for k, name in enumerate(_AFTER_REGULATED)}
@@ -404,7 +404,7 @@ def _generator(r: _Record, number: Number, version: int, sbase: float) -> Genera
     )
 
 
-def _branch(r: _Record, number: Number, version: int) -> Branch:
+def _branch(r: _Line, number: Number, version: int) -> Branch:
     return Branch(
         number(r, 0),
         number(r, 1),
@@ -445,7 +445,7 @@ def _transformers(
     return two, three
 
 
-def _two_windings(first: _Record, rest: Sequence[_Record], number: Number, sbase: float) -> Transformer:
+def _two_windings(first: _Line, rest: Sequence[_Line], number: Number, sbase: float) -> Transformer:
     impedance, one, other = rest
     cw = first.integer(_TRANSFORMER["cw"], "cw", 1)
     nominal = None if cw == 2 else 1.0  # in kV there is no default but the bus's base voltage, which the file then says

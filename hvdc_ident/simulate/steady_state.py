@@ -31,7 +31,7 @@ CLOSE = 1e-3  # a guess that is not 0 tells a state's size up to 1 / CLOSE times
 HALVES = 0.5
 """The most that an undamped Newton correction may keep of the one before: Kantorovich's condition (`rest` says how)."""
 AWAY = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
-"""How far from its guess a reference is looked for, of 1 and its size: a control's range is some per cent of its reference wide."""
+"""Distances from its guess at which a reference is looked for, of 1 and its size: a control's range is some per cent of that."""
 ROOM = 256
 DOUBLINGS = 11  # of a hundredth of a state's size: to ten times that, beyond which a state is hardly a neighbour
 
@@ -385,7 +385,7 @@ class Equilibria:
         tail = [m.algebraic[n].start for n in self.structure.unknowns]
         if all(g is not None for g in given):
             own = np.array([*given, *tail], dtype=float)
-            references = [k for k, s in enumerate(m.states.values()) if s.derivative == 0 and s.rest is not None]
+            references = [k for k, s in enumerate(m.states.values()) if s.is_reference]
             moves = sorted(
                 product((0.0, *AWAY, *(-a for a in AWAY)), repeat=min(len(references), 2)), key=np.linalg.norm
             )

@@ -264,9 +264,8 @@ def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapp
 
 def level_before(time: Array, values: Array, event: float | None) -> float:
     """Return the mean of the rows before the event, the first recorded row where there is none, in the values' unit."""
-    known = np.isfinite(values)
-    rows = known & before_event(time, values, event)
-    return float(values[rows].mean() if rows.any() else values[known][0])
+    rows = before_event(time, values, event)
+    return float(values[rows].mean() if rows.any() else values[np.isfinite(values)][0])
 
 
 def _time(table: schema.ExperimentTable, data: Trajectory, place: str) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -21,51 +22,33 @@ from pydantic import (
 def _column_by_name(value: Any) -> Any:
     """A list of names as a table from each name to the column of the same name."""
     if not isinstance(value, list):
-        return _numbers_with_dots(value)
+        return _values_with_dots(value)
     doubled = sorted({str(v) for v in value if value.count(v) > 1})
     if doubled:
         raise ValueError(f"'{doubled[0]}' is listed twice")
     return {v if isinstance(v, str) else _not_text(v): v for v in value}
 
 
-def _with_dots(value: Any) -> Any:
-    """The table with a key a name, where TOML nests the names of a component, gen.H, in a table gen.
-
-    A table nests names where it holds tables alone or no tables are what is expected; `prior` is a key of a parameter's table.
-    """
+def _with_dots(value: Any, nests: Callable[[dict[Any, Any]], bool]) -> Any:
+    """The table with a key a name, where TOML nests the names of a component: gen.H in a table gen. nests: whether a table does."""
     if not isinstance(value, dict):
         return value
     flat: dict[Any, Any] = {}
     for name, item in value.items():
-        inner = _with_dots(item) if isinstance(item, dict) else item
-        if _nests_names(inner):
-            flat |= {f"{name}.{n}": v for n, v in inner.items()}
-        else:
-            flat[name] = item
+        inner = _with_dots(item, nests)
+        nested = isinstance(inner, dict) and bool(inner) and nests(inner)
+        flat |= {f"{name}.{n}": v for n, v in inner.items()} if nested else {name: item}
     return flat
 
 
-def _nests_names(item: Any) -> bool:
-    return (
-        isinstance(item, dict)
-        and bool(item)
-        and "prior" not in item
-        and all(isinstance(v, dict) for v in item.values())
-    )
+def _tables_with_dots(value: Any) -> Any:
+    """The same of a table of tables: one nests names where it holds tables alone; `prior` is a key of a parameter's table."""
+    return _with_dots(value, lambda t: "prior" not in t and all(isinstance(v, dict) for v in t.values()))
 
 
-def _numbers_with_dots(value: Any) -> Any:
-    """The table of numbers or texts with a key a name, where TOML nests the names of a component."""
-    if not isinstance(value, dict):
-        return value
-    flat: dict[Any, Any] = {}
-    for name, item in value.items():
-        flat |= (
-            {f"{name}.{n}": v for n, v in _numbers_with_dots(item).items()}
-            if isinstance(item, dict) and item
-            else {name: item}
-        )
-    return flat
+def _values_with_dots(value: Any) -> Any:
+    """The same of a table of numbers or texts, in which every table nests names."""
+    return _with_dots(value, lambda t: True)
 
 
 def _one_or_three(value: Any) -> Any:
@@ -152,7 +135,7 @@ Columns = Annotated[
     BeforeValidator(_column_by_name),
     WithJsonSchema({"anyOf": [_TEXTS, {"type": "object", "additionalProperties": _TEXT}]}),
 ]
-Numbers = Annotated[dict[Name, FiniteFloat], BeforeValidator(_numbers_with_dots)]
+Numbers = Annotated[dict[Name, FiniteFloat], BeforeValidator(_values_with_dots)]
 Interpolation = Literal["hold", "linear"]
 
 
@@ -323,7 +306,7 @@ class ExperimentTable(TomlTable):
     window: Annotated[list[FiniteFloat], Field(min_length=2, max_length=2), AfterValidator(_rising)] | None = None
     values: Numbers = {}
     trim: Columns = {}
-    columns: Annotated[dict[Name, ColumnTable], BeforeValidator(_with_dots)] = {}
+    columns: Annotated[dict[Name, ColumnTable], BeforeValidator(_tables_with_dots)] = {}
     nuisance: list[Name] = []
     drive: Columns = {}
     instrument: dict[Name, InstrumentTable] = {}
@@ -607,7 +590,7 @@ class StudyFile(TomlTable):
     version: Literal[1] = Field(alias="schema")
     name: Name | None = None
     model: ModelTable
-    parameters: Annotated[dict[Name, ParameterTable], BeforeValidator(_with_dots)] = {}
+    parameters: Annotated[dict[Name, ParameterTable], BeforeValidator(_tables_with_dots)] = {}
     experiment: list[ExperimentTable] = []
     response: list[ResponseTable] = []
     linearize: LinearizeTable | None = None

@@ -20,17 +20,8 @@ from hvdc_ident.plants import parts_of, unit_card
 
 HERE = Path(__file__).parent
 CASES = tomllib.loads((HERE / "cases.toml").read_text(encoding="utf-8"))
-ANDES = json.loads((HERE / "andes.json").read_text(encoding="utf-8"))["cases"]
-STEPS = {
-    "Vref": 0.02,
-    "Pref": 0.05,
-    "nref": 0.0025,
-    "Plant_pref": 0.05,
-    "Qext": 0.05,
-    "Qref": 0.05,
-    "PFaref": 0.05,
-    "E": -0.05,
-}
+RECORDED = json.loads((HERE / "andes.json").read_text(encoding="utf-8"))
+ANDES, STEPS, TIMES = RECORDED["cases"], RECORDED["steps"], np.array(RECORDED["times"])
 UNUSED = {"reeca1-q": 3, "reeca1-pf": 2, "reeca1-v": 3, "reeca1-dip": 3, "reecb1-q": 3}
 """States of branches that a flag switches off, by case: andes keeps them, unseen by all others."""
 UNSEEN = ("repca1-q",)
@@ -38,7 +29,6 @@ UNSEEN = ("repca1-q",)
 ENDS_ALONE = (("reeca1-dip", "Pref"),)
 """Responses of which the end alone is compared: on the way to the limit of the active current, which is the same, P of andes is up to
 2e-3 of its range apart, with a decay that is none of the equations'."""
-TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
 OPTIONS = {"genrou": {"Kw": 0.0}, "reeca1": {"Tpfilt": 0.02}, "reecb1": {"Tpfilt": 0.02}}
 CONSTANT_IN_ANDES = {"ESST3A": "avr.VE", "ESST4B": "avr.VE"}
 """What andes' Jacobian holds constant: the voltage of a source that follows from terminal voltage and current."""
