@@ -120,8 +120,6 @@ def moved(candidate: CandidateEffect, probe: int, factor: float, most: float | N
 
 METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
 """A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""
-GLANCE = 3
-"""Evaluations of each of several starts, of which the best goes on: its start, and the first two steps."""
 FAILURES = (HvdcIdentError, ValueError, ArithmeticError)
 """Errors of the work on one candidate that cannot be done: the candidate has failed then, with this as its reason, and the
 search goes on. numpy's LinAlgError is a ValueError."""
@@ -131,10 +129,9 @@ SCANNED = 15
 
 @dataclass(frozen=True, eq=False)
 class RefitJob:
-    """A refit to be done: the model with its effects and the problem on it, and where to begin (one row a start).
+    """A refit to be done: the model with its effects and the problem on it, and where it may begin (one row a start).
 
-    evaluations: of each start at most. spare: starts that are tried, one after the other, where none of the others runs.
-    judged: whether its end is judged on data that it has not seen.
+    evaluations: at most. judged: whether its end is judged on data that it has not seen.
     """
 
     model: AnyModel
@@ -143,7 +140,6 @@ class RefitJob:
     begins: tuple[Array, ...]
     noise: FrozenMap[OutputNoise]
     evaluations: int = METHOD.max_evaluations
-    spare: tuple[Array, ...] = ()
     judged: bool = True
 
 
@@ -278,19 +274,23 @@ def run(job: RefitJob) -> Refit:
 
 
 def _best_walk(job: RefitJob, most: int) -> OptimiserResult:
-    """The end of a walk of so many evaluations from the start whose first steps come lowest; a failed one where none runs."""
+    """The end of a walk of so many evaluations from the start with the least cost, of those from which one can be walked."""
     starts = _apart(job.begins)
-    glance = most if len(starts) == 1 else min(GLANCE, most)
-    walks = [_walk(job.problem, begin, glance) for begin in starts]
-    best = min(walks, key=_cost)
-    for begin in job.spare:
-        if best.cost is not None:
-            break
-        best = _walk(job.problem, begin, glance)
-    if best.status != "max-evaluations" or glance == most:
-        return best
-    further = _walk(job.problem, best.theta, most - glance)
-    return further if _cost(further) <= _cost(best) else best
+    if len(starts) > 1:
+        starts = sorted(starts, key=lambda begin: _cost_at(job, begin))
+    walks = (_walk(job.problem, begin, most) for begin in starts)
+    first = next(walks)
+    return first if first.cost is not None else next((w for w in walks if w.cost is not None), first)
+
+
+def _cost_at(job: RefitJob, begin: Array) -> float:
+    """Sum of squared residuals at a start; infinite where the model does not run there."""
+    try:
+        # The values alone of a model that is not moved would need machine code of their own.
+        blocks = job.problem.blocks(begin, derivatives=not job.placed[-1].movable)
+    except FAILURES:
+        return math.inf
+    return sum(b.chi2 for b in blocks)
 
 
 def _walk(problem: Problem, begin: Array, evaluations: int) -> OptimiserResult:
@@ -299,10 +299,6 @@ def _walk(problem: Problem, begin: Array, evaluations: int) -> OptimiserResult:
         return replace(METHOD, max_evaluations=evaluations).run(problem, begin)
     except FAILURES as error:
         return OptimiserResult(begin, None, "failed", str(error), 0)
-
-
-def _cost(walk: OptimiserResult) -> float:
-    return np.inf if walk.cost is None else walk.cost
 
 
 def _apart(begins: Sequence[Array]) -> list[Array]:
@@ -479,8 +475,10 @@ def job(
     factor: float,
     theta: Array,
     movable: Movable | None = None,
+    ran: Array | None = None,
 ) -> RefitJob:
-    """Return the refit of a model with one more effect, at a probe times a factor, begun beside the unknowns `theta`.
+    """Return the refit of a model with one more effect, at a probe times a factor, begun beside the unknowns `theta`, or, where that
+    is better, at the probe itself beside the unknowns `ran`: a step that a score asks for may lead too far.
 
     movable: the model with an effect of this form that can be moved, where there is one; else the effect is put in.
     Raises ModelError where the effect cannot sit there.
@@ -515,7 +513,8 @@ def job(
     placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values), movable=movable is not None)
     k = len(before.problem.free)
     asked = moved(candidate, probe, factor, EXACT)
-    begins = tuple(np.concatenate([theta[:k], [size[n] for n in bounds], theta[k:]]) for size in (values, asked))
+    beside = [(theta, values), (theta, asked), *([] if ran is None else [(ran, moved(candidate, probe, 1.0))])]
+    begins = tuple(np.concatenate([at[:k], [size[n] for n in bounds], at[k:]]) for at, size in beside)
     return RefitJob(model, (*before.placed, placed), problem, begins, before.noise)
 
 

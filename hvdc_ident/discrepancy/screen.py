@@ -52,7 +52,7 @@ class Shot:
 
     candidate, probe: its places in the lists. fall: by how much chi2 falls, beside the model without effects at its
     optimum. theta: the unknowns of that model after the step. factor: the size asked for, in units of the probe's distance from
-    neutral.
+    neutral. ran: the unknowns that the candidate was run beside, where it was.
     """
 
     candidate: int
@@ -60,6 +60,7 @@ class Shot:
     fall: float
     theta: Array
     factor: float = 1.0
+    ran: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,7 +310,7 @@ def _shot(parcel: _Parcel) -> _Found:
             found.failures[column[0]] = str(error) or type(error).__name__
             continue
         step, fell, factor = bench.without.stepped(r - was, runner.reach(column), held=bench.held)
-        found.shots.append(Shot(*column, chi2 - fell, bench.point + step, factor))
+        found.shots.append(Shot(*column, chi2 - fell, bench.point + step, factor, bench.point))
         left = nominal.projected((was - r)[:, None])[:, 0]
         found.size[column], found.left[column] = float(np.sum((was - r) ** 2)), float(left @ left)
         if several:

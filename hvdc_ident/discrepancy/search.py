@@ -212,7 +212,7 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
 
 
 def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tuple[Round, list[Shot]]:
-    """Return the round and the shots of what is at the leader's place or is its effect, from the gains that the leader came to.
+    """Return the round and the shots of what is at the leader's places or is its effect, from the gains that the leader came to.
 
     Its effect elsewhere, and at several places of which one is the leader's, is tried in the leader's size too, and another kind
     of delay there with a delay as long.
@@ -224,7 +224,7 @@ def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tup
     like = [k for k in same if len(found[k].at) == len(own.at)]
     around = [k for k in same if set(found[k].at) > set(own.at)]
     parts = [k for k in same if len(found[k].at) == 1 and any(found[k].at[0] in found[f].at for f in around)]
-    here = [k for k, c in enumerate(found) if c.at == own.at and not c.still]
+    here = [k for k, c in enumerate(found) if set(c.at) <= set(own.at) and not c.still]
     which = list(dict.fromkeys((*here, *like[: 2 * OF_EFFECT], *parts, *around)))
     late = effects()[own.effect].delay_with(sizes)
     for k in which:

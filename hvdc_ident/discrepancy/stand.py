@@ -92,7 +92,7 @@ def _on(
 ) -> list[Refit]:
     """The refits, some of them run on from where they are; one that fails stays there, unless it is to be judged."""
     again = [
-        replace(jobs[k], begins=(refits[k].theta,), spare=(), evaluations=evaluations[k], judged=judged)
+        replace(jobs[k], begins=(refits[k].theta,), evaluations=evaluations[k], judged=judged)
         for k in which
         if judged or not refits[k].ended
     ]
@@ -244,7 +244,7 @@ class Stand:
             pick = Pick(s.candidate, s.probe, s.factor, s.fall)
             c = found[s.candidate]
             try:
-                jobs.append(job(self.before, c, s.probe, s.factor, s.theta, self.movable(c, s.probe)))
+                jobs.append(job(self.before, c, s.probe, s.factor, s.theta, self.movable(c, s.probe), s.ran))
                 of.append(pick)
             except FAILURES as error:
                 why = str(error) or type(error).__name__

@@ -54,16 +54,17 @@ def stand_ins(search: SearchContext, last: Refit, opened: Round, moved: Sequence
 
 
 def _job(last: Refit, candidate: CandidateEffect) -> RefitJob:
-    """Return the refit with a candidate, begun at its first size, and at the others where that does not run."""
+    """Return the refit with a candidate, which may begin at each of its sizes."""
     begun = job(last, candidate, 0, 1.0, last.theta)
     placed, k = begun.placed[-1], len(last.problem.free)
     alike = [p.values for p in candidate.probes[1:] if set(p.free) == set(placed.bounds)]
     sizes = [[v[n] for n in placed.bounds] for v in alike if all(b[0] < v[n] < b[1] for n, b in placed.bounds.items())]
-    return replace(begun, spare=tuple(np.concatenate([last.theta[:k], s, last.theta[k:]]) for s in sizes))
+    others = (np.concatenate([last.theta[:k], s, last.theta[k:]]) for s in sizes)
+    return replace(begun, begins=(*begun.begins[:1], *others))
 
 
 def _with_given(begun: RefitJob, names: Sequence[str]) -> RefitJob:
-    """Return a refit with some free parameters of the model held at their given values; it begins at every size probed."""
+    """Return a refit with some free parameters of the model held at their given values."""
     problem = begun.problem
     own = {f.name: f.given for f in problem.free if f.name in names}
     at = [problem.names.index(n) for n in own]
@@ -72,5 +73,4 @@ def _with_given(begun: RefitJob, names: Sequence[str]) -> RefitJob:
         free=tuple(f for f in problem.free if f.name not in own),
         held=FrozenMap({**problem.held, **own}),
     )
-    begins = tuple(np.delete(b, at) for b in (*begun.begins[:1], *begun.spare))
-    return replace(begun, problem=held, begins=begins, spare=())
+    return replace(begun, problem=held, begins=tuple(np.delete(b, at) for b in begun.begins))
