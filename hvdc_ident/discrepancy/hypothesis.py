@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -27,8 +28,11 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, insertion_point
 from hvdc_ident.simulate import ModelSimulator, Tolerance, equilibria, simulate
 
-PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, max_steps=20_000)
-"""Of a refit's runs: a size at which an effect takes more steps (a window of a microsecond, a chatter) is no candidate."""
+PATIENCE = Tolerance(rtol=1e-6, atol=1e-9)
+"""Of a refit's runs."""
+OWN, BETWEEN = 10, 3
+"""Steps of a candidate's run: times those of the model without it, and more for each row. What happens several times between two rows
+(a chatter, a window of a microsecond) is not told by the record: a candidate that takes more steps is none."""
 FAR = 5.0
 """Times a probe's size at most, or this share of it at least, that a refit begins at: a score far from its size says little. Where the
 score asks for another size, that is a second start: a dead band far from 0 is an offset, and its score is exact."""
@@ -190,6 +194,14 @@ class Refit:
         """The places in theta of the nominal model's own free parameters."""
         added = {n for p in self.placed for n in p.names.values()}
         return [k for k, f in enumerate(self.problem.free) if f.name not in added]
+
+    @cached_property
+    def patience(self) -> Tolerance:
+        """Tolerance of the runs of a model with more than this one has, with the steps that they may take."""
+        experiments = self.problem.fitted_experiments
+        runs = [simulate(self.model, e.with_(measured=None), self.values, tolerance=PATIENCE) for e in experiments]
+        own = max((r.statistics.accepted + r.statistics.rejected for r in runs), default=0)
+        return replace(PATIENCE, max_steps=OWN * own + BETWEEN * max((e.time.size for e in experiments), default=0))
 
     @property
     def theta_at_given(self) -> Array:
@@ -492,11 +504,11 @@ def job(
     anywhere = anywhere or begins_anywhere(larger, plain, [use])
     held: dict[str, float] = {}
     if movable is None:
-        model, simulator = larger, ModelSimulator(larger, PATIENCE)
+        model, simulator = larger, ModelSimulator(larger, before.patience)
         present = [n for n in entry.present(values) if n not in candidate.named]
         names = dict(zip(present, [n for n in model.parameters if n not in plain.parameters], strict=True))
     else:
-        model, simulator = movable.model, movable.simulator(PATIENCE)
+        model, simulator = movable.model, movable.simulator(before.patience)
         known = before.values
         named = {n: known.get(p, model.parameters[p].value) for n, p in candidate.named.items()}
         names = {n: name for n, name in movable.names.items() if n not in candidate.named}
@@ -580,7 +592,7 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
     problem = replace(
         here.problem,
-        simulator=ModelSimulator(model, PATIENCE),
+        simulator=ModelSimulator(model, first.patience),
         free=tuple(free),
         held=first.problem.held,
         free_initial_states=begins_anywhere(model, first.model, [p.use for p in placed]),

@@ -19,7 +19,7 @@ from scipy.optimize import lsq_linear
 
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import FAILURES, PATIENCE
+from hvdc_ident.discrepancy.hypothesis import FAILURES
 from hvdc_ident.discrepancy.movable import Form, Movable, is_proportional, movable, on_loop
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.effects import apply_effects, distance_from_neutral, effects
@@ -28,12 +28,10 @@ from hvdc_ident.fit import Problem
 from hvdc_ident.fit.problem import stacked
 from hvdc_ident.fit.residual import unknown_initial_states, with_steady_start
 from hvdc_ident.model import AnyModel, Model, insertion_point
-from hvdc_ident.simulate import ModelSimulator, Tolerance, simulate
+from hvdc_ident.simulate import ModelSimulator, Tolerance
 
-HASTE = Tolerance(rtol=1e-5, atol=1e-8, max_steps=PATIENCE.max_steps, search=False)
+HASTE = Tolerance(rtol=1e-5, atol=1e-8, search=False)
 """Of a first look. Its runs are exact to a hundredth of the noise; one that has no steady state at once begins elsewhere."""
-STEPS = 100
-"""Times the steps of the model without an effect: a run that takes more, chattering in a loop, is passed over."""
 ANY, CHORD = (-np.inf, np.inf), (0.0, 1.0)
 """Factors on the size of an effect in proportion to it; of another, between nothing and the size that was run."""
 SEEN = 1.0
@@ -146,13 +144,14 @@ class Linearised:
 class Bench:
     """What candidates are compared on: the model without them, its optimum, and noise.
 
-    places, sources: where movable effects may sit, and what they may bring in: the same for all, so that an effect is compiled
-    once. point: unknowns that candidates are looked at from. noise: (N, B) records, without what the parameters make good. still:
-    places whose signal never moves. held: whether sizes are as they are.
+    patience: tolerance of runs of candidates. places, sources: where movable effects may sit, and what they may bring in: the same for
+    all, so that an effect is compiled once. point: unknowns that candidates are looked at from. noise: (N, B) records, without what the
+    parameters make good. still: places whose signal never moves. held: whether sizes are as they are.
     """
 
     model: AnyModel
     nominal: Nominal
+    patience: Tolerance
     places: tuple[str, ...]
     sources: tuple[str, ...]
     point: Array
@@ -173,16 +172,10 @@ class Bench:
         """The experiments, those fitted begun at the steady state of the model without effects."""
         return tuple(_at_rest(self.nominal.problem, e, self.point) for e in self.nominal.problem.experiments)
 
-    @cached_property
+    @property
     def haste(self) -> Tolerance:
-        """Return the tolerance of runs of a first look, which take no more than some times the steps of those without an effect."""
-        own = self.nominal.problem
-        runs = [
-            simulate(self.model, e.with_(measured=None), own.values(self.point), tolerance=HASTE)
-            for e in own.fitted_experiments
-        ]
-        most = max(r.statistics.accepted + r.statistics.rejected for r in runs)
-        return replace(HASTE, max_steps=min(STEPS * most, HASTE.max_steps))
+        """Tolerance of the runs of a first look."""
+        return replace(HASTE, max_steps=self.patience.max_steps)
 
     def movable(self, form: Form) -> Movable:
         """Return the model with an effect of this form, at one place, to be moved. It has to be one with equations."""
@@ -396,7 +389,7 @@ class _Runner:
         own, theta, probe = bench.nominal.problem, bench.point, candidate.probes[column[1]]
         if not self.parcel.movable or not isinstance(bench.model, Model):
             larger = apply_effects(bench.model, [candidate.use(probe)])
-            return _residual(replace(own, simulator=ModelSimulator(larger, PATIENCE)), theta, {})
+            return _residual(replace(own, simulator=ModelSimulator(larger, bench.patience)), theta, {})
         loop = on_loop(bench.model, candidate.at[0])
         moved = self.parcel.movable[loop]
         known = own.values(theta) if candidate.named else {}

@@ -72,9 +72,6 @@ TOGETHER = 6
 """Effects at several places in a field: each takes a compilation of its own."""
 TURNS = 3
 """Times that a round goes on from the gains of its best refits."""
-FAINT = 0.1
-"""Share of the best fall of chi2 that an effect whose size lies between those that were run has to come to, to be refitted at first:
-of the hidden effects that this was looked at for, the true one came to 0.96 of it. Where none explains the records, all are."""
 LEVEL = 0.9
 """Share of the best fall of chi2 from which a refit leads on."""
 NEARLY = 0.1
@@ -127,11 +124,7 @@ def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -
     """Return the round with its refits."""
     found, text = opened.candidates, f"round {number}"
     most = opened.screen.shots[0].fall
-    hopeful = [
-        s
-        for s in opened.screen.shots
-        if s.fall >= (Race().reach if in_proportion(found[s.candidate], s.probe) else FAINT) * most
-    ]
+    hopeful = [s for s in opened.screen.shots if s.fall >= Race().reach * most]  # where none explains the records, all are
     opened, trials = _led_on(stand, opened, stand.refitted(found, _field(search, found, hopeful), text), number)
     given = as_given(opened.before)
     far = not search.spent and all_far(opened.before, trials, near=TOLERANCE)

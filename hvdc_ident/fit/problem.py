@@ -197,9 +197,9 @@ class Problem:
         in_time: bool = False,
         also: Mapping[str, float] | None = None,
     ) -> tuple[ResidualBlock, ...]:
-        """Return the residuals of each output in each experiment; jacobians have a column for every unknown.
+        """Return the residuals of each output in each experiment; jacobians have a column for every unknown, without derivatives none.
 
-        Neither the loss nor the priors are in them. Without derivatives the columns are 0. in_time: samples in time
+        Neither the loss nor the priors are in them. in_time: samples in time
         even where the fit is of spectra. also: values of further parameters of the simulator, for these runs. Raises
         SimulationError where a run fails: theta is then inadmissible.
         """
@@ -210,8 +210,8 @@ class Problem:
             columns = self._columns[e.name]
             answered = self._experiment(e, theta, derivatives, treatment, also)
             # Where every unknown is one of this experiment's they are in their order.
-            whole = derivatives and len(columns) == width
-            blocks += answered if whole else [b.among(columns if derivatives else (), width) for b in answered]
+            whole = not derivatives or len(columns) == width
+            blocks += answered if whole else [b.among(columns, width) for b in answered]
         return tuple(blocks)
 
     @cached_property

@@ -74,10 +74,9 @@ class ResidualBlock:
         return float(np.sqrt(np.mean(self.misfit**2)))
 
     def among(self, columns: Sequence[int], width: int) -> ResidualBlock:
-        """Return the block with a jacobian of `width` columns, its own at these indices, if any, and 0 elsewhere."""
+        """Return the block with a jacobian of `width` columns, its own at these indices and 0 elsewhere."""
         jacobian = np.zeros((self.residual.size, width))
-        if columns:
-            jacobian[:, columns] = self.jacobian
+        jacobian[:, columns] = self.jacobian
         return replace(self, jacobian=jacobian)
 
     @property
@@ -242,9 +241,7 @@ def residual_blocks(
             residual, slope = quantised.residual(misfit)
             jacobian, spare = slopes * slope[:, None], quantised.spare
         else:
-            scaled = np.empty((misfit.size, 1 + slopes.shape[1]))
-            scaled[:, 0] = per_deviation(misfit, weight, record.profile)
-            scaled[:, 1:] = per_deviation(slopes, weight, record.profile)
+            scaled = per_deviation(np.column_stack([misfit, slopes]), weight, record.profile)
             if not np.abs(scaled).max(initial=0.0) < LARGEST:
                 raise SimulationError(
                     f"output '{output}' or its sensitivity grows beyond all bounds",
@@ -252,7 +249,7 @@ def residual_blocks(
                     expected=f"below {LARGEST:g} standard deviations",
                 )
             treated = treatment.applied(scaled, record.time, output, f"experiment '{experiment.name}'")
-            residual, jacobian, slope, spare = treated[:, 0].copy(), treated[:, 1:], None, 0.0
+            residual, jacobian, slope, spare = np.ascontiguousarray(treated[:, 0]), treated[:, 1:], None, 0.0
         block = ResidualBlock(
             experiment.name, output, record.rows, misfit, weight, residual, jacobian, slope=slope, spare=spare,
             profile=record.profile,
