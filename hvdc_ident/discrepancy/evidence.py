@@ -273,8 +273,9 @@ NEAR = 0.05
 """Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
 LOUD = 1.4
 """Times the noise's power up to which what is left may be noise that is louder than it was taken for."""
-SHAPED = 0.05
-"""Chance under noise of sums over time below which what is left has a shape."""
+SHAPED = 0.01
+"""Chance under noise of sums over time below which what is left has a shape: as small as for an effect to be named. What is there is
+looked for by a whole round more, and by forms outside the catalogue."""
 FAINT = 0.1
 """Correlation of neighbours up to which nothing is made of it: records that stand still are rounded alike."""
 LOOKED_AT = 3
@@ -374,4 +375,4 @@ def is_noise(refit: Refit, seed: int) -> bool:
 
 def shapeless(nominal: Nominal, seed: int) -> bool:
     """Return True where sums of the residual over time are like those of noise."""
-    return all(b.p > SHAPED for b in residual_tests(nominal, {}, bootstraps=100, seed=seed))
+    return all(b.p > SHAPED for b in residual_tests(nominal, {}, bootstraps=200, seed=seed))

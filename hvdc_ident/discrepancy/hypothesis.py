@@ -26,7 +26,7 @@ from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, insertion_point
-from hvdc_ident.simulate import ModelSimulator, Tolerance, equilibria, simulate
+from hvdc_ident.simulate import Method, ModelSimulator, Statistics, Tolerance, equilibria, simulate
 
 PATIENCE = Tolerance(rtol=1e-6, atol=1e-9)
 """Of a refit's runs."""
@@ -196,12 +196,22 @@ class Refit:
         return [k for k, f in enumerate(self.problem.free) if f.name not in added]
 
     @cached_property
+    def _runs(self) -> list[Statistics]:
+        """What a run of each fitted experiment costs."""
+        experiments = self.problem.fitted_experiments
+        return [simulate(self.model, e.with_(measured=None), self.values, tolerance=PATIENCE).statistics for e in experiments]
+
+    @cached_property
     def patience(self) -> Tolerance:
         """Tolerance of the runs of a model with more than this one has, with the steps that they may take."""
-        experiments = self.problem.fitted_experiments
-        runs = [simulate(self.model, e.with_(measured=None), self.values, tolerance=PATIENCE) for e in experiments]
-        own = max((r.statistics.accepted + r.statistics.rejected for r in runs), default=0)
-        return replace(PATIENCE, max_steps=OWN * own + BETWEEN * max((e.time.size for e in experiments), default=0))
+        own = max((s.accepted + s.rejected for s in self._runs), default=0)
+        rows = max((e.time.size for e in self.problem.fitted_experiments), default=0)
+        return replace(PATIENCE, max_steps=OWN * own + BETWEEN * rows)
+
+    @property
+    def method(self) -> Method:
+        """Method of the runs of a model with a movable effect: it must not depend on what was run before."""
+        return "nonstiff" if all(s.method == "explicit" for s in self._runs) else "rosenbrock"
 
     @property
     def theta_at_given(self) -> Array:
@@ -508,7 +518,7 @@ def job(
         present = [n for n in entry.present(values) if n not in candidate.named]
         names = dict(zip(present, [n for n in model.parameters if n not in plain.parameters], strict=True))
     else:
-        model, simulator = movable.model, movable.simulator(before.patience)
+        model, simulator = movable.model, movable.simulator(before.patience, before.method)
         known = before.values
         named = {n: known.get(p, model.parameters[p].value) for n, p in candidate.named.items()}
         names = {n: name for n, name in movable.names.items() if n not in candidate.named}

@@ -29,7 +29,7 @@ from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Algebraic, Model, Output, Signal, fresh, insertion_point, rewritten, with_derivative_signal
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.simulate import ModelSimulator, Tolerance
+from hvdc_ident.simulate import Method, ModelSimulator, Tolerance
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,10 @@ class Movable:
             weights[copy[source]] = 1.0
         return weights
 
-    def simulator(self, tolerance: Tolerance) -> ModelSimulator:
-        """Return the simulator of its runs. One method serves them all: the engine would choose it by the first that a process runs,
-        and the last digits of the others would hang on that."""
-        return ModelSimulator(self.model, tolerance, "rosenbrock")
+    def simulator(self, tolerance: Tolerance, method: Method) -> ModelSimulator:
+        """Return the simulator of its runs. method: of them all; the engine would choose it by the first that a process runs, and the
+        last digits of the others would hang on that."""
+        return ModelSimulator(self.model, tolerance, method)
 
     def sized(self, values: Mapping[str, float]) -> dict[str, float]:
         """Return the effect's sizes by the names that they have in the model."""

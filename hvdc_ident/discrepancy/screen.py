@@ -28,7 +28,7 @@ from hvdc_ident.fit import Problem
 from hvdc_ident.fit.problem import stacked
 from hvdc_ident.fit.residual import unknown_initial_states, with_steady_start
 from hvdc_ident.model import AnyModel, Model, insertion_point
-from hvdc_ident.simulate import ModelSimulator, Tolerance
+from hvdc_ident.simulate import Method, ModelSimulator, Tolerance
 
 HASTE = Tolerance(rtol=1e-5, atol=1e-8, search=False)
 """Of a first look. Its runs are exact to a hundredth of the noise; one that has no steady state at once begins elsewhere."""
@@ -144,7 +144,7 @@ class Linearised:
 class Bench:
     """What candidates are compared on: the model without them, its optimum, and noise.
 
-    patience: tolerance of runs of candidates. places, sources: where movable effects may sit, and what they may bring in: the same for
+    patience, method: of runs of candidates. places, sources: where movable effects may sit, and what they may bring in: the same for
     all, so that an effect is compiled once. point: unknowns that candidates are looked at from. noise: (N, B) records, without what the
     parameters make good. still: places whose signal never moves. held: whether sizes are as they are.
     """
@@ -152,6 +152,7 @@ class Bench:
     model: AnyModel
     nominal: Nominal
     patience: Tolerance
+    method: Method
     places: tuple[str, ...]
     sources: tuple[str, ...]
     point: Array
@@ -375,8 +376,9 @@ class _Runner:
 
     @cached_property
     def _problems(self) -> Mapping[bool, Problem]:
-        own = self.parcel.bench.nominal.problem
-        return {x: replace(own, simulator=m.simulator(self.parcel.bench.haste)) for x, m in self.parcel.movable.items()}
+        bench = self.parcel.bench
+        own, how = bench.nominal.problem, (bench.haste, bench.method)
+        return {x: replace(own, simulator=m.simulator(*how)) for x, m in self.parcel.movable.items()}
 
     @cached_property
     def _from_rest(self) -> Mapping[bool, Problem]:

@@ -184,7 +184,7 @@ class Stand:
         slots = before.model.insertion_points
         ends = tuple(p for p in slots if p in places), tuple(s for s in slots if s in sources)
         still = frozenset(c.at[0] for c in found if c.still and len(c.at) == 1)
-        return cls(search, before, Bench(before.model, fewer, before.patience, *ends, before.theta, noise, still))
+        return cls(search, before, Bench(before.model, fewer, before.patience, before.method, *ends, before.theta, noise, still))
 
     def screen(
         self,

@@ -20,7 +20,9 @@ from hvdc_ident.simulate.run_state import COUNTED, RUN, place
 from hvdc_ident.simulate.simulation import HINTS, STATUSES, Statistics
 from hvdc_ident.simulate.steady_state import Equilibria
 
-Method = Literal["auto", "explicit", "rosenbrock"]
+Method = Literal["auto", "nonstiff", "explicit", "rosenbrock"]
+"""auto: chosen by the first run of a structure in a process. nonstiff: the explicit pair where it can be, and the Rosenbrock method for
+a run that proves stiff, whatever was run before."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +153,10 @@ class Engine:
             status = self._integrate(
                 state, work, span, allowed, y, w, p, constants, *tables, t_out, out, sizes, *self._hess
             )
-            if STATUSES[status] == "stiff" and method == "auto":
-                self._explicit = explicit = False
+            if STATUSES[status] == "stiff" and method in ("auto", "nonstiff"):
+                explicit = False
+                if method == "auto":
+                    self._explicit = False
                 continue
             break
         counts = state[self._counted].tolist()
@@ -209,6 +213,8 @@ class Engine:
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
         """True where the explicit pair is the better choice: no unknowns, and no eigenvalue so fast that it would rule the step."""
         s = self.structure.sizes
+        if method == "nonstiff":
+            return not s.nz
         if method != "auto":
             if method == "explicit" and s.nz:
                 raise ModelError(
