@@ -446,6 +446,13 @@ def _step(r):  # type: ignore[no-untyped-def]
         # A slope that is infinite for an instant cannot be followed to tolerance: pass it, and count it.
         r.forced_steps += 1
         r.error = 0.05
+    # Steps at the edge of stability are accepted and rejected by turns: a third of them beyond it is enough.
+    if not r.rosenbrock and r.stiffness > 3.25 * 3.25:
+        r.stiff += 2
+        if r.stiff > 50:
+            return STIFF
+    elif r.stiff > 0:
+        r.stiff -= 1
     if not r.error <= 1.0:
         r.rejected += 1
         r.h = r.hs * (max(0.2, 0.9 * r.error**-0.2) if r.error < np.inf else 0.2)
@@ -454,12 +461,6 @@ def _step(r):  # type: ignore[no-untyped-def]
     factor = 0.9 * r.error**-0.2 if r.error > 1e-10 else 8.0
     factor = min(max(factor, 0.2), 1.0 if r.again else 8.0)
     r.again = 0
-    if not r.rosenbrock and r.stiffness > 3.25 * 3.25:
-        r.stiff += 1
-        if r.stiff > 25:
-            return STIFF
-    elif r.stiff > 0:
-        r.stiff -= 1
     return _accept(r, factor)
 
 
