@@ -300,7 +300,11 @@ class ModelEquations:
         return eliminate(constant, n, len(self.states)) if n else None
 
     def compile(self) -> Code:
-        """The machine code that every run needs; keep it as long as its addresses are used."""
+        """The machine code that every run needs; keep it as long as its addresses are used.
+
+        No derivative by another parameter than those of the sensitivities is had from the graph afterwards.
+        """
+        self.graph.hold(self.nodes[n] for n in self.model.parameters if n not in self.sensitivities)
         return Code(self.graph, [f for f in self.functions if f.name not in LATE], max(self.sizes.width, 1))
 
     def compile_rest(self) -> Code:

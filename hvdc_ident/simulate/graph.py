@@ -28,6 +28,7 @@ class Graph:
         self.switches: list[int] = []
         self._switch_of: dict[int, int] = {}
         self._gradients: dict[int, dict[int, int]] = {}
+        self._held: frozenset[int] = frozenset()
         self.zero = self.constant(0.0)
         self.one = self.constant(1.0)
 
@@ -302,6 +303,11 @@ class Graph:
 
     # --- derivatives ---
 
+    def hold(self, leaves: Iterable[int]) -> None:
+        """Take leaves for constants in derivatives from now on: of hundreds of parameters most runs ask for a few."""
+        self._held = frozenset(leaves)
+        self._gradients.clear()
+
     def gradient(self, node: int) -> dict[int, int]:
         """The partial derivatives of a node with respect to every leaf it depends on: {leaf: node}; conditions are held."""
         if node not in self._gradients:
@@ -338,7 +344,7 @@ class Graph:
         if op in ("const", "bool", "switch", "and", "or", "not"):
             return {}
         if op == "leaf":
-            return {n: self.one}
+            return {} if n in self._held else {n: self.one}
         if op == "neg":
             return {v: self.neg(d) for v, d in g[a[0]].items()}
         if op in ("add", "sub"):
