@@ -68,8 +68,7 @@ class Engine:
         self._late: Code | None = None
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
         self._equilibria = Equilibria(self.structure, self._address)
-        second = self.structure.second
-        self._hess = [np.array([entry[k] for entry in second], dtype=np.int64) for k in (0, 1)]
+        self._hess = [np.zeros(0, dtype=np.int64)] * 2
         self._explicit: bool | None = None
         self._lock = Lock()
         self._states: dict[bool, tuple[Any, int]] = {}
@@ -178,6 +177,8 @@ class Engine:
         with self._lock:  # two threads that compile would free the code that one of them runs
             if rosenbrock and self._late is None:
                 self._late = self.structure.compile_late()
+                second = self.structure.second
+                self._hess = [np.array([entry[k] for entry in second], dtype=np.int64) for k in (0, 1)]
                 for name, address in self._late.address.items():
                     self._address[NAMES.index(name)] = address
                 self._states.clear()
@@ -195,7 +196,7 @@ class Engine:
             "size": n * (1 + s.width),
             "stride": padded(n * (1 + s.width)),
             "nw": 1 + s.nu + s.nd + s.nq,
-            "hessians": s.n_hess if rosenbrock else 0,
+            "hessians": self._hess[0].size if rosenbrock else 0,
             "factors": self.structure.elimination.count if rosenbrock and self.structure.elimination else 0,
             "timed": self.structure.moves_by_itself,
             "rosenbrock": rosenbrock,

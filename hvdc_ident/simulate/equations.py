@@ -26,7 +26,6 @@ from hvdc_ident.simulate.object_code import Code
 ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
 SHORTEST = 2.0**-16  # of a path of values: a step that has to be shorter means that the path ends
 TINY = 1e-3  # the least that an unknown counts for, where it tells by what an equation's residual is measured
-LATE = ("hess",)  # beside the elimination: what only the Rosenbrock method needs
 
 
 def padded(count: int) -> int:
@@ -77,7 +76,6 @@ class Sizes:
     no: int
     np: int
     width: int
-    n_hess: int
 
 
 class ModelEquations:
@@ -152,7 +150,6 @@ class ModelEquations:
             len(self.outputs),
             n,
             width,
-            len(self.second),
         )
 
     # --- derivatives ---
@@ -210,7 +207,7 @@ class ModelEquations:
 
     @cached_property
     def functions(self) -> list[Function]:
-        """All functions of `NAMES`, those without content left out."""
+        """The functions of `NAMES` that every run needs, those without content left out."""
         s, g = self.sizes, self.graph
         n, width = s.nx + s.nz, s.width
 
@@ -248,12 +245,13 @@ class ModelEquations:
                 both("outs", self.observed, hot=True),
                 both("srcs", self.sources),
             ]
-            result.append(
-                Function("hess", (), [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)], hot=True)
-            )
-        if len(g.switches) != s.ns:
+        return self._without_new_conditions(result)
+
+    def _without_new_conditions(self, functions: list[Function]) -> list[Function]:
+        """Return the functions, whose derivatives hold the model's own conditions only."""
+        if len(self.graph.switches) != self.sizes.ns:
             raise AssertionError("a derivative made a new condition")
-        return result
+        return functions
 
     def _modes(self) -> Function:
         """One value a switch: 1 where it is negative, else 0."""
@@ -305,7 +303,7 @@ class ModelEquations:
         No derivative by another parameter than those of the sensitivities is had from the graph afterwards.
         """
         self.graph.hold(self.nodes[n] for n in self.model.parameters if n not in self.sensitivities)
-        return Code(self.graph, [f for f in self.functions if f.name not in LATE], max(self.sizes.width, 1))
+        return Code(self.graph, self.functions, max(self.sizes.width, 1))
 
     def compile_rest(self) -> Code:
         """The machine code of the steady state alone."""
@@ -321,7 +319,9 @@ class ModelEquations:
             written["lu"] = lambda symbol: function_text(e.graph, e.function, symbol, 1)
             second = [(i, j) for i, j, _ in self.second]
             written["solve"] = lambda symbol: solve_text(e, symbol, width, second)
-        return Code(self.graph, [f for f in self.functions if f.name in LATE], max(width, 1), written)
+        rows = [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)]
+        functions = self._without_new_conditions([Function("hess", (), rows, hot=True)] if width else [])
+        return Code(self.graph, functions, max(width, 1), written)
 
 
 T = TypeVar("T")
