@@ -28,8 +28,8 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, insertion_point
 from hvdc_ident.simulate import Method, ModelSimulator, Statistics, Tolerance, equilibria, simulate
 
-PATIENCE = Tolerance(rtol=1e-6, atol=1e-9)
-"""Of a refit's runs."""
+PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, brief=True)
+"""Of a refit's runs. A candidate's model has some hundred of them: to compile it well would take longer than they do."""
 OWN, BETWEEN = 10, 3
 """Steps of a candidate's run: times those of the model without it, and more for each row. What happens several times between two rows
 (a chatter, a window of a microsecond) is not told by the record: a candidate that takes more steps is none."""

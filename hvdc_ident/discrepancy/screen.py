@@ -30,7 +30,7 @@ from hvdc_ident.fit.residual import unknown_initial_states, with_steady_start
 from hvdc_ident.model import AnyModel, Model, insertion_point
 from hvdc_ident.simulate import Method, ModelSimulator, Tolerance
 
-HASTE = Tolerance(rtol=1e-5, atol=1e-8, search=False)
+HASTE = Tolerance(rtol=1e-5, atol=1e-8, search=False, brief=True)
 """Of a first look. Its runs are exact to a hundredth of the noise; one that has no steady state at once begins elsewhere."""
 ANY, CHORD = (-np.inf, np.inf), (0.0, 1.0)
 """Factors on the size of an effect in proportion to it; of another, between nothing and the size that was run."""

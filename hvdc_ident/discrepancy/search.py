@@ -27,6 +27,7 @@ from hvdc_ident.discrepancy.evidence import (
     best_each,
     by_cost,
     clear,
+    cost_of,
     evidence_between,
     excess,
     gained,
@@ -173,22 +174,21 @@ def _led_on(
     stand: Stand, opened: Round, trials: Sequence[CandidateFit], number: int
 ) -> tuple[Round, list[CandidateFit]]:
     """Return the trials with what is found from the gains of the best, again while something comes nearer."""
-    trials = best_each(trials)
-    asked: set[tuple[int, tuple[float, ...]]] = set()
+    trials, led = best_each(trials), dict(opened.led)
     for _ in range(TURNS):
-        leaders = [t for t in _leaders(opened, trials) if (t.pick.candidate, tuple(t.refit.theta)) not in asked]
+        leaders = [t for t in _leaders(opened, trials) if cost_of(t) < led.get(t.pick.candidate, math.inf) - TIED]
         if not leaders or stand.search.spent:
             break
-        asked |= {(t.pick.candidate, tuple(t.refit.theta)) for t in leaders}
-        before = by_cost(trials)[0]
+        led |= {t.pick.candidate: cost_of(t) for t in leaders}
+        least = cost_of(by_cost(trials)[0])
         more: list[CandidateFit] = []
         for t in leaders:
             opened, shots = _beside(stand, opened, t, number)
-            more += stand.refitted(opened.candidates, shots, f"round {number}: neighbours", trials)
+            more += stand.refitted(opened.candidates, shots, f"round {number}: neighbours", [*trials, *more])
         trials = best_each([*trials, *more])
-        if by_cost(trials)[0] is before:
+        if cost_of(by_cost(trials)[0]) > least - TIED:
             break
-    return opened, trials
+    return replace(opened, led=led), trials
 
 
 def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit]:

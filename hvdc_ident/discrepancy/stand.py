@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, excess
 from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, RefitResult, failed_at, find, job
+from hvdc_ident.discrepancy.implied import TIED
 from hvdc_ident.discrepancy.movable import Form, Movable
 from hvdc_ident.discrepancy.nominal import thinned
 from hvdc_ident.discrepancy.options import SearchContext
@@ -145,7 +146,8 @@ class Round:
 
     signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: every refit,
     the best first. ruler: what BIC counts by. forms: the refits of forms outside the catalogue; None where none was looked for.
-    form: the one that leaves next to nothing but noise, where no effect that was refitted does.
+    form: the one that leaves next to nothing but noise, where no effect that was refitted does. led: by candidate the cost of the refit
+    from whose gains others were looked for.
     """
 
     before: Refit
@@ -160,6 +162,7 @@ class Round:
     ruler: Ruler | None = None
     forms: tuple[CandidateFit, ...] | None = None
     form: FoundForm | None = None
+    led: Mapping[int, float] = field(default_factory=dict)
 
     def answers(self) -> Mapping[str, Pushed]:
         """Return the model's runs with their answers to pushes, by experiment; none of a model that is closed inside."""
@@ -221,7 +224,8 @@ class Stand:
         self, found: Sequence[CandidateEffect], shots: Sequence[Shot], text: str, earlier: Sequence[CandidateFit] = ()
     ) -> list[CandidateFit]:
         """Return the shots refitted, in a race with each other and with those refitted earlier; and their larger forms where none
-        leaves noise: beside equations of one size that do, more sizes gain nothing but their price."""
+        leaves noise: beside equations of one size that do, more sizes gain nothing but their price. A shot that promises no less than
+        its candidate's earlier refit came to is none."""
         trials = self._raced(found, shots, text, earlier)
         if any(not t.refit.failure and not excess(t.refit) for t in (*earlier, *trials)):
             return trials
@@ -240,6 +244,11 @@ class Stand:
         jobs: list[RefitJob] = []
         of: list[Pick] = []
         trials: list[CandidateFit] = []
+        came_to: dict[int, float] = {}
+        for t in earlier:
+            if t.refit.failure in ("", BEHIND):
+                came_to[t.pick.candidate] = min(t.refit.chi2, came_to.get(t.pick.candidate, math.inf))
+        shots = [s for s in shots if self.before.chi2 - s.fall < came_to.get(s.candidate, math.inf) - TIED]
         for s in sorted(shots, key=lambda s: (found[s.candidate].effect, s.candidate)):  # those of one model together
             pick = Pick(s.candidate, s.probe, s.factor, s.fall)
             c = found[s.candidate]

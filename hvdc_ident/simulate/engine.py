@@ -29,13 +29,15 @@ a run that proves stiff, whatever was run before."""
 class Tolerance:
     """Error control: relative and absolute tolerance (states' own units) per step, and the step budget of one run.
 
-    search: whether a steady start that Newton's method does not find at once is looked for by slower means.
+    search: whether a steady start that Newton's method does not find at once is looked for by slower means. brief: whether the model
+    has few runs to come: its machine code is then made in a fraction of the time, and takes longer to run.
     """
 
     rtol: float = 1e-8
     atol: float = 1e-10
     max_steps: int = 200_000
     search: bool = True
+    brief: bool = False
 
 
 def check_times(model: Model, times: Array) -> None:
@@ -61,9 +63,15 @@ def check_times(model: Model, times: Array) -> None:
 class Engine:
     """Machine code of one model structure for one list of sensitivity parameters and outputs; reusable for any values."""
 
-    def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
+    def __init__(
+        self,
+        model: Model,
+        sensitivities: Sequence[str] = (),
+        outputs: Sequence[str] | None = None,
+        brief: bool = False,
+    ) -> None:
         self._integrate, self._room = entry("integrate"), entry("room")
-        self.structure = ModelEquations(model, sensitivities, outputs)
+        self.structure = ModelEquations(model, sensitivities, outputs, brief)
         self._code = self.structure.compile()
         self._late: Code | None = None
         self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
@@ -289,6 +297,11 @@ ROOM = 128
 _engine = by_structure(Engine, room=ROOM)
 
 
-def engine_of(model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> Engine:
-    """The engine of a model's structure, compiled at the first call and kept for later ones (the last `ROOM`)."""
-    return _engine(model, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs))
+def engine_of(
+    model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None, *, brief: bool = False
+) -> Engine:
+    """The engine of a model's structure, compiled at the first call and kept for later ones (the last `ROOM`).
+
+    brief: as in `Tolerance`.
+    """
+    return _engine(model, tuple(sensitivities), tuple(model.outputs if outputs is None else outputs), brief)

@@ -81,8 +81,15 @@ class Sizes:
 class ModelEquations:
     """A model's equations as a graph, and the machine code made from it for the given sensitivity parameters and outputs."""
 
-    def __init__(self, model: Model, sensitivities: Sequence[str] = (), outputs: Sequence[str] | None = None) -> None:
-        self.model = model
+    def __init__(
+        self,
+        model: Model,
+        sensitivities: Sequence[str] = (),
+        outputs: Sequence[str] | None = None,
+        brief: bool = False,
+    ) -> None:
+        """brief: whether the machine code is made quickly instead of well."""
+        self.model, self.brief = model, brief
         self.sensitivities = tuple(sensitivities)
         self.outputs = tuple(model.outputs if outputs is None else outputs)
         require_known("parameter", self.sensitivities, model.parameters, f"model '{model.name}'")
@@ -303,7 +310,7 @@ class ModelEquations:
         No derivative by another parameter than those of the sensitivities is had from the graph afterwards.
         """
         self.graph.hold(self.nodes[n] for n in self.model.parameters if n not in self.sensitivities)
-        return Code(self.graph, self.functions, max(self.sizes.width, 1))
+        return Code(self.graph, self.functions, max(self.sizes.width, 1), brief=self.brief)
 
     def compile_rest(self) -> Code:
         """The machine code of the steady state alone."""
@@ -321,7 +328,7 @@ class ModelEquations:
             written["solve"] = lambda symbol: solve_text(e, symbol, width, second)
         rows = [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)]
         functions = self._without_new_conditions([Function("hess", (), rows, hot=True)] if width else [])
-        return Code(self.graph, functions, max(width, 1), written)
+        return Code(self.graph, functions, max(width, 1), written, brief=self.brief)
 
 
 T = TypeVar("T")

@@ -179,8 +179,11 @@ class Code:
         functions: Sequence[Function],
         width: int,
         written: Mapping[str, Callable[[str], str]] | None = None,
+        *,
+        brief: bool = False,
     ) -> None:
-        """written: further hot functions as text, by name; each is called with the symbol it has to define."""
+        """written: further hot functions as text, by name; each is called with the symbol it has to define. brief: whether all are
+        compiled quickly."""
         self._engines: list[llvm.ExecutionEngine] = []
         self.address: dict[str, int] = {}
         for hot in (True, False):
@@ -188,7 +191,7 @@ class Code:
             if hot:
                 texts |= {n: text(_symbol(n)) for n, text in (written or {}).items()}
             if texts:
-                engine = _loaded_module("\n".join([*declarations(), *texts.values()]), hot)
+                engine = _loaded_module("\n".join([*declarations(), *texts.values()]), hot and not brief)
                 self._engines.append(engine)
                 self.address |= {n: engine.get_function_address(_symbol(n)) for n in texts}
         # Freed with this object, but not at the end of the process, when LLVM may be gone before it.
@@ -204,10 +207,10 @@ def _symbol(name: str) -> str:
     return f"hvdcident_{name}"
 
 
-def _loaded_module(text: str, hot: bool) -> llvm.ExecutionEngine:
-    """The engine of a module; a cold one is compiled quickly instead of well, which halves the time of a new structure."""
+def _loaded_module(text: str, well: bool) -> llvm.ExecutionEngine:
+    """The engine of a module, compiled well or quickly; quickly where it is cold halves the time of a new structure."""
     # The graph is free of common parts and its rows are vectors already: little is left for the optimiser.
-    return loaded(kept(f"{hot}\0{text}", lambda: compiled(text, effort=2 if hot else 0, combine=hot)))
+    return loaded(kept(f"{well}\0{text}", lambda: compiled(text, effort=2 if well else 0, combine=well)))
 
 
 _GENERATED = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7)

@@ -61,10 +61,10 @@ def run(
     p: (parameters,) values in the model's order. inputs: one InputSignal an input. Raises TimingError for a negative delay, and as
     `Engine.run` does.
     """
-    engine = engine_of(model, sensitivities, outputs)
+    engine = engine_of(model, sensitivities, outputs, brief=tolerance.brief)
 
     def answer(of: Model, parameters: Sequence[str], values: Array) -> DelayedRun:
-        code = engine if of is model else engine_of(of, parameters, outputs)
+        code = engine if of is model else engine_of(of, parameters, outputs, brief=tolerance.brief)
         scale = np.array([of.parameters[n].size for n in parameters]) if parameters else None
         out, statistics = code.run(values, inputs, time, tolerance, method, scale, model=of)
         return _answer(code, out, statistics)
@@ -74,7 +74,7 @@ def run(
     shortest = 0.0
     if (times < span / COARSEST).any():
         plain = _without(model, tuple(model.delays))
-        fastest = engine_of(plain, sensitivities, outputs).fastest(p, inputs, time, tolerance, plain)
+        fastest = engine_of(plain, sensitivities, outputs, brief=tolerance.brief).fastest(p, inputs, time, tolerance, plain)
         shortest = span / _steps(span * fastest, inputs, tolerance)
     lengths = zip(model.delays, times.tolist(), by_parameters, strict=True)
     short = {name: (length, rows) for name, length, rows in lengths if length == 0.0 or length < shortest}
