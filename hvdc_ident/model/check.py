@@ -83,7 +83,7 @@ def _section(items: object, section: str, place: str) -> FrozenMap[Any]:
 
 def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
     if isinstance(value, kind):
-        given = {n: getattr(value, n) for n in _fields(kind)}
+        given = {n: getattr(value, n) for n in keys_of(kind)}
     elif isinstance(value, Mapping):
         given = dict(value)
     else:
@@ -100,7 +100,7 @@ def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
 
 def required_keys(given: Mapping[str, object], kind: type[Any], place: str) -> None:
     """Refuse keys that are no fields of the class, and the lack of a field without a default."""
-    known = _fields(kind)
+    known = keys_of(kind)
     for key in given:
         if key not in known:
             raise unknown_name("key", str(key), known, where=place)
@@ -114,7 +114,7 @@ def _read(kind: type[Any]) -> FrozenMap[bool]:
     return FrozenMap({f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(kind)})
 
 
-_fields = cast("Callable[[type[Any]], FrozenMap[bool]]", cache(_read))
+keys_of = cast("Callable[[type[Any]], FrozenMap[bool]]", cache(_read))
 """`_read`, once a class: it is asked for every value of every model that is made."""
 
 

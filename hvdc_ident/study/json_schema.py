@@ -21,7 +21,7 @@ from pydantic import BaseModel
 
 from hvdc_ident.files import write_text
 from hvdc_ident.model.card import SCHEMA
-from hvdc_ident.model.check import EXPRESSIONS, SECTIONS
+from hvdc_ident.model.check import EXPRESSIONS, SECTIONS, keys_of
 from hvdc_ident.model.components import PARTS
 from hvdc_ident.study.schema import StudyFile
 
@@ -132,7 +132,7 @@ def card_keys() -> dict[str, list[Key]]:
     top = [_key(key, text, key in ("schema", "name"), MISSING, _top_kind(key)) for key, text in texts["card"].items()]
     return {"card": top} | {
         section: [
-            _key(f.name, texts[section][f.name], f.default is MISSING, f.default, _card_value(section, f))
+            _key(f.name, texts[section][f.name], keys_of(kind)[f.name], f.default, _card_value(section, f))
             for f in fields(kind)
         ]
         for section, (kind, _, _) in CARD.items()

@@ -118,6 +118,13 @@ def test_cards_are_accepted_and_misspelt_keys_refused(name: str) -> None:
                 assert not _accepts("model-card", wrong), (section, item, key)
 
 
+def test_a_component_needs_no_more_than_its_source() -> None:
+    card = tomllib.loads('schema = 1\nname = "plant"\n[components.bus]\nsource = "infinite-bus"\n')
+    assert _accepts("model-card", card)
+    del card["components"]["bus"]["source"]
+    assert not _accepts("model-card", card)
+
+
 @pytest.mark.parametrize(
     "line",
     [
