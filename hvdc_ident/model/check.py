@@ -240,7 +240,7 @@ def _check_names(model: Model) -> None:
     owner: dict[str, str] = {}
     for section in (*VARIABLES, "outputs"):
         for name in getattr(model, section):
-            _check_name(name, _place(model, section, name))
+            check_name(name, _place(model, section, name))
             if section == "outputs":
                 continue
             if name in owner:
@@ -249,7 +249,8 @@ def _check_names(model: Model) -> None:
             owner[name] = section
 
 
-def _check_name(name: object, place: str) -> None:
+def check_name(name: object, place: str) -> None:
+    """Refuse what cannot name a variable: ModelError with the place."""
     if not is_identifier(name):
         raise ModelError(
             f"{name!r} cannot name a variable", where=place, expected="letters, digits and _, no digit first"
@@ -363,7 +364,7 @@ def _check_parameterisation(model: Model, name: str, parameterisation: Parameter
             raise unknown_name("parameter", str(replaced), model.parameters, where=f"{place}, replaces")
     kept = set(model.names) - set(parameterisation.replaces)
     for new in parameterisation.parameters:
-        _check_name(new, f"{place}, parameter '{new}'")
+        check_name(new, f"{place}, parameter '{new}'")
         if new in kept:
             raise ModelError(f"the name '{new}' is taken in the model", where=place, expected="another name")
     known = [*parameterisation.parameters, *(p for p in model.parameters if p in kept)]

@@ -185,6 +185,9 @@ def _card_value(section: str, field: Field[Any]) -> dict[str, Any]:
         return {"type": "string"}
     if (section, field.name) == ("components", "parameters"):
         return {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
+    if field.name == "names":
+        text = {"type": "string"}
+        return {"anyOf": [text, {"type": "object", "additionalProperties": text}]}
     if field.name in ("parameters", "replaces"):
         item = {"$ref": "#/$defs/parameters"} if field.name == "parameters" else {"type": ["string", "number"]}
         return {"type": "object", "additionalProperties": item}
