@@ -145,10 +145,22 @@ def _component(name: str, item: object, inside: tuple[Path, ...]) -> Component:
         path = inside[-1].parent / path
     if path.resolve() in [p.resolve() for p in inside]:
         raise ModelError("the card is a component of itself", where=place, got=str(path))
+    names = _names(item.get("names", {}), place)
     try:
-        return Component(read_card(path, inside), FrozenMap(given))
+        return Component(read_card(path, inside), FrozenMap(given), names)
     except InputError as e:
         raise e.at(place) from None
+
+
+def _names(names: object, place: str) -> FrozenMap[str]:
+    """Return the patterns by which a component's variables are called; a text is one for all of them."""
+    table = {"*": names} if isinstance(names, str) else names
+    if not isinstance(table, dict):
+        raise ModelError("its names are no pattern", where=place, expected='"*1" or {"*" = "*1"}', got=_kind(names))
+    for n, value in table.items():
+        if not isinstance(value, str):
+            raise ModelError(f"the name of '{n}' is no text", where=place, expected='"*1"', got=_kind(value))
+    return FrozenMap(table)
 
 
 def _connection(name: str, item: object) -> Connection:

@@ -83,7 +83,7 @@ def _section(items: object, section: str, place: str) -> FrozenMap[Any]:
 
 def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
     if isinstance(value, kind):
-        given = {n: getattr(value, n) for n in _fields(kind)}
+        given = {n: getattr(value, n) for n in keys_of(kind)}
     elif isinstance(value, Mapping):
         given = dict(value)
     else:
@@ -100,7 +100,7 @@ def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
 
 def required_keys(given: Mapping[str, object], kind: type[Any], place: str) -> None:
     """Refuse keys that are no fields of the class, and the lack of a field without a default."""
-    known = _fields(kind)
+    known = keys_of(kind)
     for key in given:
         if key not in known:
             raise unknown_name("key", str(key), known, where=place)
@@ -114,7 +114,7 @@ def _read(kind: type[Any]) -> FrozenMap[bool]:
     return FrozenMap({f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(kind)})
 
 
-_fields = cast("Callable[[type[Any]], FrozenMap[bool]]", cache(_read))
+keys_of = cast("Callable[[type[Any]], FrozenMap[bool]]", cache(_read))
 """`_read`, once a class: it is asked for every value of every model that is made."""
 
 
@@ -240,7 +240,7 @@ def _check_names(model: Model) -> None:
     owner: dict[str, str] = {}
     for section in (*VARIABLES, "outputs"):
         for name in getattr(model, section):
-            _check_name(name, _place(model, section, name))
+            check_name(name, _place(model, section, name))
             if section == "outputs":
                 continue
             if name in owner:
@@ -249,7 +249,8 @@ def _check_names(model: Model) -> None:
             owner[name] = section
 
 
-def _check_name(name: object, place: str) -> None:
+def check_name(name: object, place: str) -> None:
+    """Refuse what cannot name a variable: ModelError with the place."""
     if not is_identifier(name):
         raise ModelError(
             f"{name!r} cannot name a variable", where=place, expected="letters, digits and _, no digit first"
@@ -363,7 +364,7 @@ def _check_parameterisation(model: Model, name: str, parameterisation: Parameter
             raise unknown_name("parameter", str(replaced), model.parameters, where=f"{place}, replaces")
     kept = set(model.names) - set(parameterisation.replaces)
     for new in parameterisation.parameters:
-        _check_name(new, f"{place}, parameter '{new}'")
+        check_name(new, f"{place}, parameter '{new}'")
         if new in kept:
             raise ModelError(f"the name '{new}' is taken in the model", where=place, expected="another name")
     known = [*parameterisation.parameters, *(p for p in model.parameters if p in kept)]

@@ -17,8 +17,8 @@ from typing import Literal
 from hvdc_ident.errors import require_known
 from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Algebraic, Delay, Model, Output, Signal, State
-from hvdc_ident.models.vsc_hvdc_link import physical
+from hvdc_ident.model import Algebraic, Delay, Model, Output, Parameterisation, Signal, State
+from hvdc_ident.models import vsc_hvdc_link
 from hvdc_ident.parameters import Input, Parameter
 
 SUMMARY = "two-terminal VSC-HVDC link, average-value: currents, PLL, inner loops, dc inductance (a reference)"
@@ -173,8 +173,13 @@ def model(
         algebraic=FrozenMap(unknowns),
         outputs=FrozenMap({n: Output(parse(n), "pu") for n in OUTPUTS}),
         delays=FrozenMap({f"vq{i}_before": Delay(parse(f"vq{i}"), parse("Tpll")) for i in (1, 2)}),
-        parameterisations=FrozenMap({"physical": physical()}) if rating == "paper" else FrozenMap(),
+        parameterisations=FrozenMap({"physical": _physical()} if rating == "paper" else {}),
     )
+
+
+def _physical() -> Parameterisation:
+    """Return the phasor link's rule for the gains from capacitance and settling time."""
+    return vsc_hvdc_link.model().parameterisations["physical"]
 
 
 VARIANTS: dict[str, tuple[str, Callable[[], Model]]] = {

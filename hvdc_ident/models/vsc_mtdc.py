@@ -4,25 +4,34 @@ Station 1 controls the dc voltage, the others active power; every station contro
 two-terminal link under other names. Dc lines are resistances between neighbours, positive from the higher number to the
 lower. Gains of the dc voltage control follow the link's design rule for the grid's total capacitance, n x 0.2 s; power
 alternates in sign along the chain, so that station 1 balances one station at most. Per unit on 100 MVA and 640 kV.
-Equations: Vanfretti, Murad, Gomez Lopez 2017 (doi 10.1109/PESGM.2017.8274525), put together n times.
+Made of components of the shelf, whose equations are those of Vanfretti, Murad, Gomez Lopez 2017 (doi
+10.1109/PESGM.2017.8274525).
 """
 
 from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import sympy as sp
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.expression import parse
+from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Algebraic, Model, Output, Signal, State
-from hvdc_ident.models._phasor_station import control_p, control_q, control_vdc, grid_impedance, plant
+from hvdc_ident.model import Model, Output, State
+from hvdc_ident.model.components import Component, assembled
 from hvdc_ident.parameters import Input, Parameter
+from hvdc_ident.plants import shelf_model
 
 SUMMARY = "multi-terminal grid of phasor stations, 3 states each; vsc-mtdc-N for N terminals, 4 where none is given"
 
 MOST = 400
 _NAME = re.compile(r"vsc-mtdc-(\d{1,4})")
+_STATES = ("Vdc", "xv", "xp", "xq")
+"""The order of the states, by their names without the stations' numbers."""
 
 
 def model() -> Model:
@@ -43,18 +52,21 @@ def vsc_mtdc(terminals: int) -> Model:
             "a grid of so many terminals is not offered", expected=f"2 to {MOST} terminals", got=str(terminals)
         )
     stations = [str(i) for i in range(1, terminals + 1)]
-    return Model(
+    own: dict[str, Mapping[str, Any]] = {
+        "parameters": _parameters(stations),
+        "inputs": _inputs(stations),
+        "states": _nodes(stations),
+        "outputs": {name: Output(symbol(name), "pu") for name in _outputs(stations)},
+    }
+    grid = assembled(
+        own,
+        _components(stations),
+        {},
         name=f"vsc-mtdc-{terminals}",
         description=f"Grid of {terminals} phasor stations along a chain of dc lines; pu of 100 MVA and 640 kV",
-        parameters=FrozenMap(_parameters(stations)),
-        inputs=FrozenMap(_inputs(stations)),
-        states=FrozenMap(_states(stations)),
-        signals=FrozenMap({name: Signal(parse(text), "pu") for name, text in _signals(stations).items()}),
-        algebraic=FrozenMap(
-            {f"I{axis}{i}": Algebraic(parse(f"I{axis}order{i}"), unit="pu") for i in stations for axis in "ri"}
-        ),
-        outputs=FrozenMap({name: Output(parse(name), "pu") for name in _outputs(stations)}),
     )
+    states = sorted(grid.states.items(), key=lambda item: _STATES.index(item[0].rstrip("0123456789")))
+    return replace(grid, states=FrozenMap(states))
 
 
 def _parameters(stations: list[str]) -> dict[str, Parameter]:
@@ -92,27 +104,44 @@ def _inputs(stations: list[str]) -> dict[str, Input]:
     return found
 
 
-def _states(stations: list[str]) -> dict[str, State]:
-    lines = _lines(stations)
+def _nodes(stations: list[str]) -> dict[str, State]:
+    """Return the dc voltages of the stations' capacitors."""
     found = {}
     for i in stations:
-        into = "".join(f" + Idc{a}_{b}" if a == i else f" - Idc{a}_{b}" for a, b in lines if i in (a, b))
-        found[f"Vdc{i}"] = State(parse(f"(Pdc{i}/Vdc{i}{into} - Iload{i}) / C{i}"), guess=1.0, unit="pu")
-    found["xv"] = State(parse("KIVDC * (ev + yv - yv_u)"), guess=0.0, unit="pu")
-    for i in stations[1:]:
-        found[f"xp{i}"] = State(parse(f"KIP{i} * (ep{i} + yp{i} - yp{i}_u)"), guess=0.0, unit="pu")
-    for i in stations:
-        found[f"xq{i}"] = State(parse(f"KIQ{i} * (eq{i} + yq{i} - yq{i}_u)"), guess=0.0, unit="pu")
+        drawn = sp.Add(*(symbol(f"Idc{a}_{b}") * (1 if b == i else -1) for a, b in _lines(stations) if i in (a, b)))
+        voltage = symbol(f"Vdc{i}")
+        balance = symbol(f"Pdc{i}") / voltage - drawn - symbol(f"Iload{i}")
+        found[voltage.name] = State(balance / symbol(f"C{i}"), guess=1.0, unit="pu")
     return found
 
 
-def _signals(stations: list[str]) -> dict[str, str]:
-    found = grid_impedance() | control_vdc("1")
+def _components(stations: list[str]) -> dict[str, Component]:
+    """Return the components of the grid: variables that go by one name in several of them are one."""
+    first = {"*": "*", "Vdcref": "Vdcref1", "Vdc": "Vdc1", "Vdc_m": "Vdc1_m", "Irorder": "Irorder1"}
+    found = {
+        "grid": _component("grid-impedance", {"*": "*"}, Zg="Zg", XR="XR"),
+        "voltage1": _component("vsc-vdc-control", first, KP="KPVDC", KI="KIVDC"),
+    }
     for i in stations:
-        found |= plant(i) | control_q(i, f"KPQ{i}", f"KIQ{i}")
+        found[f"converter{i}"] = _component("vsc-phasor", _numbered(i), R="R", X="X")
+        found[f"reactive{i}"] = _component("vsc-q-control", _numbered(i), KP=f"KPQ{i}", KI=f"KIQ{i}")
     for i in stations[1:]:
-        found |= control_p(i, i)
-    return found | {f"Idc{a}_{b}": f"(Vdc{b} - Vdc{a}) / Rdc{a}_{b}" for a, b in _lines(stations)}
+        found[f"power{i}"] = _component("vsc-p-control", _numbered(i), KP=f"KPP{i}", KI=f"KIP{i}")
+    for a, b in _lines(stations):
+        ends = {"V": f"Vdc{a}", "V_far": f"Vdc{b}", "I": f"Idc{a}_{b}"}
+        found[f"line{a}_{b}"] = _component("dc-line", ends, R=f"Rdc{a}_{b}")
+    return found
+
+
+def _component(source: str, names: Mapping[str, str], **parameters: str) -> Component:
+    """Return a component of the shelf under names in the grid, with parameters of the grid for its own."""
+    values = {n: symbol(of_grid) for n, of_grid in parameters.items()}
+    return Component(shelf_model(source), FrozenMap(values), FrozenMap(names))
+
+
+def _numbered(i: str) -> dict[str, str]:
+    """Return the pattern of names that have the station's number, before _m and _u where they end so."""
+    return {"*": f"*{i}", "*_m": f"*{i}_m", "*_u": f"*{i}_u"}
 
 
 def _outputs(stations: list[str]) -> list[str]:

@@ -21,7 +21,7 @@ from pydantic import BaseModel
 
 from hvdc_ident.files import write_text
 from hvdc_ident.model.card import SCHEMA
-from hvdc_ident.model.check import EXPRESSIONS, SECTIONS
+from hvdc_ident.model.check import EXPRESSIONS, SECTIONS, keys_of
 from hvdc_ident.model.components import PARTS
 from hvdc_ident.study.schema import StudyFile
 
@@ -132,7 +132,7 @@ def card_keys() -> dict[str, list[Key]]:
     top = [_key(key, text, key in ("schema", "name"), MISSING, _top_kind(key)) for key, text in texts["card"].items()]
     return {"card": top} | {
         section: [
-            _key(f.name, texts[section][f.name], f.default is MISSING, f.default, _card_value(section, f))
+            _key(f.name, texts[section][f.name], keys_of(kind)[f.name], f.default, _card_value(section, f))
             for f in fields(kind)
         ]
         for section, (kind, _, _) in CARD.items()
@@ -185,6 +185,9 @@ def _card_value(section: str, field: Field[Any]) -> dict[str, Any]:
         return {"type": "string"}
     if (section, field.name) == ("components", "parameters"):
         return {"type": "object", "additionalProperties": {"type": ["string", "number"]}}
+    if field.name == "names":
+        text = {"type": "string"}
+        return {"anyOf": [text, {"type": "object", "additionalProperties": text}]}
     if field.name in ("parameters", "replaces"):
         item = {"$ref": "#/$defs/parameters"} if field.name == "parameters" else {"type": ["string", "number"]}
         return {"type": "object", "additionalProperties": item}

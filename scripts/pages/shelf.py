@@ -16,7 +16,9 @@ def page() -> str:
         "# Standard components",
         "",
         "Components of plants, each a model card with the names of its standard. `[components.NAME]` of a card takes one by",
-        "`source`; a unit of a `.dyr` file is put together from them. Parameters that a record of PSS/E has stand in its order.",
+        "`source`; a unit of a `.dyr` file is put together from them, and the shipped phasor links from those that begin with `vsc-`.",
+        "`H` of the component `gen` is `gen.H`, or what [`names`](model-card.md#components-names) say. Parameters that a record of PSS/E",
+        "has stand in its order.",
         "",
         "| component | |",
         "|---|---|",
@@ -29,9 +31,13 @@ def page() -> str:
 
 
 def _entry(name: str, model: Model) -> list[str]:
-    drawn = f"<figure>{diagram(model)}<figcaption>Signal flow of {name}: ∫ marks a state, dashes lead back</figcaption></figure>"
-    lines = [f"## `{name}` {{: #{name} }}", "", model.description, "", drawn, ""]
+    lines = [f"## `{name}` {{: #{name} }}", "", model.description, ""]
+    if model.inputs:  # else it computes parameters from parameters: nothing flows
+        caption = f"Signal flow of {name}: ∫ marks a state, dashes lead back"
+        lines += [f"<figure>{diagram(model)}<figcaption>{caption}</figcaption></figure>", ""]
     for title, items in (("input", model.inputs), ("output", model.outputs)):
+        if not items:
+            continue
         lines += [f"| {title} | unit | |", "|---|---|---|"]
         lines += [f"| `{n}` | {q.unit} | {_cell(_about(model, n, q.description))} |" for n, q in items.items()] + [""]
     if model.parameters:
@@ -43,6 +49,7 @@ def _entry(name: str, model: Model) -> list[str]:
             lines.append(f"| `{n}` | {p.value:g} | {bounds} | {p.unit} | {_cell(p.description)}{note} |")
         lines.append("")
     equations = [f"{n}' = {to_text(s.derivative)}" for n, s in model.states.items()]
+    equations += [f"{n} = {to_text(a.equation)}" for n, a in model.algebraic.items()]
     equations += [f"{n} = {to_text(s.value)}" for n, s in model.signals.items()]
     equations += [f"{n} = {to_text(o.value)}" for n, o in model.outputs.items() if n not in model.names]
     return [*lines, "```text", *equations, "```"]

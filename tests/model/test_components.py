@@ -113,6 +113,92 @@ def test_names_begin_with_the_component(folder) -> None:
     assert unit.signals["avr.Vt"].description == "the terminal voltage"
 
 
+NAMED = {
+    'source = "machine.toml"': 'source = "machine.toml"\nnames = "*1"',
+    'source = "regulator.toml"': 'source = "regulator.toml"\nnames = {"*" = "*_1", "V*" = "V*1", Vm = "V1_m"}',
+    '"gen.Efd" = "avr.Efd"': '"Efd1" = "Efd_1"',
+    '"avr.Vt" = "gen.V"': '"Vt1" = "V1"',
+    '"avr.Vref" = "ref"': '"Vref1" = "ref"',
+    'V = {value = "gen.V"': 'V = {value = "V1"',
+}
+
+
+def named(folder, old: str = "", new: str = ""):
+    for before, after in NAMED.items():
+        text = (folder / "unit.toml").read_text(encoding="utf-8")
+        assert before in text
+        (folder / "unit.toml").write_text(text.replace(before, after), encoding="utf-8")
+    return changed(folder, old, new)
+
+
+def test_names_of_a_component_follow_its_patterns(folder) -> None:
+    """The longest pattern that fits, a name before all; the model is the same but for its names."""
+    unit = read_card(folder / "unit.toml")
+    other = named(folder)
+    assert list(other.states) == ["E1", "V1_m", "Efd_1"]
+    assert list(other.parameters) == ["T0", "Td1", "G1", "K_1", "TA_1"]
+    assert list(other.signals) == ["V1", "MW1", "err_1", "Efd1", "Vt1", "Vref1"]
+    one, two = hi.simulate(unit, TIMES, inputs=STEP), hi.simulate(other, TIMES, inputs=STEP)
+    assert (one["V"] == two["V"]).all()
+
+
+def test_an_input_with_the_name_of_a_variable_is_that_variable(folder) -> None:
+    """Of another component or of the plant: no connection, no signal and no insertion point is added."""
+    unit = read_card(folder / "unit.toml")
+    text = (folder / "unit.toml").read_text(encoding="utf-8")
+    text = text[: text.index("[connections]")] + text[text.index("[outputs]") :]
+    text = text.replace('source = "machine.toml"', 'source = "machine.toml"\nnames = {Efd = "avr.Efd"}')
+    text = text.replace('source = "regulator.toml"', 'source = "regulator.toml"\nnames = {Vt = "gen.V", Vref = "ref"}')
+    (folder / "unit.toml").write_text(text, encoding="utf-8")
+    joined = read_card(folder / "unit.toml")
+    assert set(unit.insertion_points) - set(joined.insertion_points) == {"gen.Efd", "avr.Vt", "avr.Vref"}
+    one, other = hi.simulate(unit, TIMES, inputs=STEP), hi.simulate(joined, TIMES, inputs=STEP)
+    np.testing.assert_allclose(one["V"], other["V"], rtol=0, atol=1e-12)
+    with pytest.raises(InputError, match=r"line 12: \[components\.avr\]: 'Vt' is in pu and 'gen\.MW' in MW"):
+        changed(folder, 'Vt = "gen.V"', 'Vt = "gen.MW"')
+
+
+def test_a_parameter_that_is_one_of_the_plant_has_no_name_of_its_own(folder) -> None:
+    unit = read_card(folder / "unit.toml")
+    assert "avr.TR" not in unit.names and unit.states["avr.Vm"].vanishes == unit["T0"]
+    assert "avr.TR" in changed(folder, 'TR = "T0"', 'TR = "2*T0"').signals
+
+
+def test_a_free_start_goes_by_the_name_of_its_state(folder) -> None:
+    changed(folder, '"(Efd - E)/Td"', '"(Efd - E)/Td", start = "free"', "machine")
+    assert list(named(folder).parameters) == ["T0", "Td1", "G1", "E1_start", "K_1", "TA_1"]
+
+
+def test_parameterisations_have_names_of_their_component(folder) -> None:
+    text = MACHINE + '[parameterisations.rate]\nparameters = {a = {value = 0.2}}\nreplaces = {Td = "1/a"}\n'
+    (folder / "machine.toml").write_text(text, encoding="utf-8")
+    unit = changed(folder, "parameters = {Td = 6.0}", 'names = "gen.*"')
+    assert list(unit.parameterised("gen.rate").parameters) == ["T0", "gen.a", "gen.G", "avr.K", "avr.TA"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "words"),
+    [
+        ('names = "*1"', 'names = {"*" = "*1", G = "K_1"}', 12, "the name 'K_1' is taken: [components.gen] has it"),
+        ('names = "*1"', 'names = {"*" = "*1", Td = "T0"}', 8, "the name 'T0' is taken: the model itself has it"),
+        ('names = "*1"', 'names = {"*" = "*1", E = "ref"}', 8, "the name 'ref' is taken: the model itself has it"),
+        ('names = "*1"', 'names = {"*" = "*1", G = "Td1"}', 8, "the name 'Td1' is taken: [components.gen] has it"),
+        ('names = "*1"', 'names = {"*" = "*1", Tq = "T"}', 8, "no variable 'Tq'"),
+        ('names = "*1"', 'names = {"*" = "G1"}', 8, "no pattern of names"),
+        ('names = "*1"', 'names = "1*"', 8, "'1Td' cannot name a variable"),
+        ('TR = "T0"', 'TR = "T1"', 12, "no variable 'T1'"),
+        ('"Vt1" = "V1"', '"Vt1" = "V2"', 19, "no variable 'V2'"),
+        ('names = "*1"', "names = 1", 8, "its names are no pattern"),
+        ('names = "*1"', 'names = {"*" = 1}', 8, "the name of '*' is no text"),
+        ('T0 = {value = 0.03, unit = "s"}', 'T0 = {value = 0.03, unit = "1/s"}', 12, "'TR' is in s and 'T0' in 1/s"),
+    ],
+)
+def test_what_is_wrong_with_names_is_told_with_its_line(folder, old: str, new: str, line: int, words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        named(folder, old, new)
+    assert f"unit.toml, line {line}: " in str(caught.value) and words in str(caught.value)
+
+
 def test_a_flattened_plant_is_a_card(folder) -> None:
     unit = read_card(folder / "unit.toml")
     assert parse_card(write_card(unit)) == unit

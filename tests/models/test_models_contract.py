@@ -31,6 +31,35 @@ def test_it_survives_a_card(name):
     assert summaries()[name]
 
 
+def test_the_links_names_are_those_of_its_definition():
+    """The names that studies and results hold on to, in their order; nothing else can have an effect."""
+    link = load_model("vsc-hvdc-link")
+    names = {
+        "parameters": "KPVDC KIVDC KPQ KIQ KPP KIP KPQ2 KIQ2 C1 C2 Rdc Zg XR",
+        "inputs": "Vdcref1 Qref1 Pref2 Qref2 E1 E2 Iload1",
+        "states": "Vdc1 Vdc2 xv xp xq1 xq2",
+        "signals": "R X Vac1 P1 Q1 Pdc1 Vac2 P2 Q2 Pdc2 Vdc1_m ev yv_u yv Irorder1 P2_m ep yp_u yp Irorder2 "
+        "Q1_m eq1 yq1_u yq1 m1 Iiorder1 Q2_m eq2 yq2_u yq2 m2 Iiorder2 Idc",
+        "algebraic": "Ir1 Ii1 Ir2 Ii2",
+        "outputs": "Irorder1 Iiorder1 Irorder2 Iiorder2 Vdc1 Vdc2 P1 Q1 P2 Q2 Vac1 Vac2 Idc",
+    }
+    assert {section: " ".join(getattr(link, section)) for section in names} == names
+
+
+def test_the_grids_names_are_those_of_its_definition():
+    grid = load_model("vsc-mtdc-3")
+    names = {
+        "parameters": "KPVDC KIVDC KPP2 KIP2 KPP3 KIP3 KPQ1 KIQ1 C1 KPQ2 KIQ2 C2 KPQ3 KIQ3 C3 Rdc1_2 Rdc2_3 Zg XR",
+        "inputs": "Vdcref1 Pref2 Pref3 Qref1 E1 Iload1 Qref2 E2 Iload2 Qref3 E3 Iload3",
+        "states": "Vdc1 Vdc2 Vdc3 xv xp2 xp3 xq1 xq2 xq3",
+        "signals": "R X Vdc1_m ev yv_u yv Irorder1 Vac1 P1 Q1 Pdc1 Q1_m eq1 yq1_u yq1 m1 Iiorder1 "
+        "Vac2 P2 Q2 Pdc2 Q2_m eq2 yq2_u yq2 m2 Iiorder2 Vac3 P3 Q3 Pdc3 Q3_m eq3 yq3_u yq3 m3 Iiorder3 "
+        "P2_m ep2 yp2_u yp2 Irorder2 P3_m ep3 yp3_u yp3 Irorder3 Idc1_2 Idc2_3",
+        "algebraic": "Ir1 Ii1 Ir2 Ii2 Ir3 Ii3",
+    }
+    assert {section: " ".join(getattr(grid, section)) for section in names} == names
+
+
 def test_the_design_rule_gives_table_1():
     link = load_model("vsc-hvdc-link")
     physical = link.parameterised("physical")

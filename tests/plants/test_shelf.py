@@ -12,7 +12,9 @@ from hvdc_ident.model import read_card
 from hvdc_ident.shelf import card_of, components, record_of
 from tests.plants.test_against_andes import CASES, unit
 
-NO_RECORD = ("infinite-bus", "line", "load", "playback", "transformer")
+NETWORK = ("infinite-bus", "line", "load", "playback", "transformer", "dc-line", "grid-impedance")
+CONVERTER = ("vsc-phasor", "vsc-vdc-control", "vsc-p-control", "vsc-q-control")
+NO_RECORD = (*NETWORK, *CONVERTER)
 
 
 @pytest.mark.parametrize("name", components())
@@ -24,8 +26,10 @@ def test_a_card_loads_and_says_what_it_is(name: str) -> None:
     assert model.outputs
     if name not in NO_RECORD:
         assert model.description.startswith(f"{name.upper()}: ")
+    if name not in NETWORK:
         assert "Source: " in model.description or "Sources: " in model.description
-    for section in ("parameters", "inputs", "signals", "states"):
+    # A described state names modes by its description; the links' modes go by the states' names, which tell the station.
+    for section in ("parameters", "inputs", "signals", *(() if name in CONVERTER else ("states",))):
         for n, item in getattr(model, section).items():
             assert item.description, f"{section} {n}"
     for n, q in (model.inputs | model.states).items():

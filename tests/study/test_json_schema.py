@@ -16,7 +16,6 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.model.card import parse_card, write_card
-from hvdc_ident.model.check import SECTIONS
 from hvdc_ident.models import load_model, shipped_models
 from hvdc_ident.study import json_schema
 from hvdc_ident.study.examples import write_demo, write_starter
@@ -37,6 +36,8 @@ def _shipped() -> tuple[dict[str, str], dict[str, str]]:
         blocks = [b for b in BLOCK.findall(page.read_text("utf-8")) if b.startswith("schema = 1")]
         texts |= {f"{page.name} block {i}": b for i, b in enumerate(blocks)}
     texts |= {f"shipped model {n}": write_card(load_model(n)) for n in shipped_models()}  # type: ignore[arg-type]
+    for room in ("shelf", "models"):
+        texts |= {f"{room}/{p.name}": p.read_text("utf-8") for p in sorted((ROOT / "hvdc_ident" / room).glob("*.toml"))}
     studies = {n: t for n, t in texts.items() if "source" in tomllib.loads(t).get("model", {})}
     return studies, {n: t for n, t in texts.items() if n not in studies}
 
@@ -110,12 +111,19 @@ def test_cards_are_accepted_and_misspelt_keys_refused(name: str) -> None:
     assert _accepts("model-card", card)
     for key in card:
         assert not _accepts("model-card", {f"{k}x" if k == key else k: v for k, v in card.items()})
-    for section in SECTIONS:
+    for section in json_schema.CARD:
         for item, keys in card.get(section, {}).items():
             for key in keys if isinstance(keys, dict) else ():
                 wrong = copy.deepcopy(card)
                 wrong[section][item][f"{key}x"] = wrong[section][item].pop(key)
                 assert not _accepts("model-card", wrong), (section, item, key)
+
+
+def test_a_component_needs_no_more_than_its_source() -> None:
+    card = tomllib.loads('schema = 1\nname = "plant"\n[components.bus]\nsource = "infinite-bus"\n')
+    assert _accepts("model-card", card)
+    del card["components"]["bus"]["source"]
+    assert not _accepts("model-card", card)
 
 
 @pytest.mark.parametrize(
