@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -168,8 +168,7 @@ class Problem:
     @cached_property
     def sigma(self) -> FrozenMap[FrozenMap[float]]:
         """Standard deviation of each output, in its unit, by experiment and output."""
-        fitted = self.fitted_experiments
-        return FrozenMap({e.name: FrozenMap(sigmas(e, fitted, self.weights)) for e in self.experiments})
+        return _deviations(self.experiments, self.fitted_experiments, self.weights)
 
     @cached_property
     def noise_dof(self) -> float:
@@ -275,7 +274,7 @@ class Problem:
     @cached_property
     def _records(self) -> dict[str, tuple[ComparedRecord, ...]]:
         """Compared records of each fitted experiment."""
-        return {e.name: compared_records(e, self.guard) for e in self.fitted_experiments}
+        return _compared(self.fitted_experiments, self.guard)
 
     def nuisances(self, e: Experiment, theta: Array) -> dict[str, float]:
         """Return the value of each nuisance of an experiment of the fit; a held-out one has none."""
@@ -331,6 +330,21 @@ class Problem:
             weights=self.weights if weights is None else FrozenMap(weights),
             experiments=self.experiments if experiments is None else tuple(experiments),
         )
+
+
+# Hundreds of problems on the same records stand side by side in a search: what hangs on these alone they have in common.
+
+
+@lru_cache(maxsize=8)
+def _compared(experiments: tuple[Experiment, ...], guard: float) -> dict[str, tuple[ComparedRecord, ...]]:
+    return {e.name: compared_records(e, guard) for e in experiments}
+
+
+@lru_cache(maxsize=8)
+def _deviations(
+    experiments: tuple[Experiment, ...], fitted: tuple[Experiment, ...], weights: FrozenMap[float]
+) -> FrozenMap[FrozenMap[float]]:
+    return FrozenMap({e.name: FrozenMap(sigmas(e, fitted, weights)) for e in experiments})
 
 
 def stacked(blocks: Sequence[ResidualBlock]) -> tuple[Array, Array]:
