@@ -153,7 +153,7 @@ def stick_slip(time, mass, Fc, A, w):
             return (A / w * (np.cos(w * start) - np.cos(w * t)) - side * Fc * (t - start)) / mass
 
         end = brentq(speed, start + 0.3 * np.pi / w, start + np.pi / w)
-        assert end < start + (np.pi - 2 * np.arcsin(Fc / A) + 2 * np.arcsin(Fc / A)) / w
+        assert end < start + np.pi / w  # it comes to rest before it begins to move back
         moving = (time > start) & (time < end)
         v[moving] = speed(time[moving])
     return v
@@ -193,6 +193,49 @@ def test_breaks_within_a_slide_leave_it_as_it_is():
         np.testing.assert_allclose(found.gradient(output)[:, 0], plain.gradient(output)[:, 0], atol=1e-6)
     wanted = -stick_slip(time - 0.25, **FRICTION)
     np.testing.assert_allclose(found.gradient("late")[:, 1], wanted, atol=1e-7)
+
+
+def test_an_unknown_that_jumps_at_the_switch_is_known_on_both_sides():
+    """z = Fc sign(v) + sin(z)/5 is +-N: friction of the force N, whose slope by Fc is 1/(1 - cos(N)/5)."""
+    time, names = np.linspace(0.0, 6.0, 603), ("Fc", "A", "w")
+    states = {"v": State("A*sin(w*time) - z", start=0)}
+    model = Model(
+        "loop",
+        parameters={n: FRICTION[n] for n in names},
+        states=states,
+        algebraic={"z": "Fc*sign(v) + 0.2*sin(z)"},
+        outputs={"v": "v", "z": "z"},
+    )
+    found = simulate(model, experiment("force", time), sensitivities=names, rtol=1e-10)
+    force = brentq(lambda z: z - 1.0 - 0.2 * np.sin(z), 1.0, 2.0)
+    values = {**FRICTION, "mass": 1.0, "Fc": force}
+    v = stick_slip(time, **values)
+    np.testing.assert_allclose(found["v"], v, atol=1e-9)
+    wanted = slopes(lambda **given: stick_slip(time, **given), values, names)
+    wanted[:, 0] /= 1.0 - 0.2 * np.cos(force)
+    off = np.abs(found.gradient("v") - wanted).max(axis=0) / np.abs(wanted).max(axis=0)
+    assert (off < 1e-5).all(), off
+    rest = (v == 0.0) & (np.abs(1.5 * np.sin(3.0 * time)) < 0.99 * force)
+    assert rest.sum() > 100
+    np.testing.assert_allclose(found["z"][rest], 1.5 * np.sin(3.0 * time[rest]), atol=1e-7)
+
+
+def test_a_switch_on_an_unknown_slides():
+    """The unknown s, of v = s - 0.3 sin(s), has the sign of v: the friction is that of v."""
+    time, names = np.linspace(0.0, 6.0, 603), ("Fc", "A", "w")
+    model = Model(
+        "measured",
+        parameters={n: FRICTION[n] for n in names},
+        states={"v": State("A*sin(w*time) - Fc*sign(s)", start=0)},
+        algebraic={"s": "v + 0.3*sin(s)"},
+        outputs={"v": "v"},
+    )
+    found = simulate(model, experiment("force", time), sensitivities=names, rtol=1e-10)
+    values = {**FRICTION, "mass": 1.0}
+    np.testing.assert_allclose(found["v"], stick_slip(time, **values), atol=1e-9)
+    wanted = slopes(lambda **given: stick_slip(time, **given), values, names)
+    off = np.abs(found.gradient("v") - wanted).max(axis=0) / np.abs(wanted).max(axis=0)
+    assert (off < 1e-5).all(), off
 
 
 # --- limits that move, surfaces that bend ---
