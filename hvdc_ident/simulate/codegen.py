@@ -17,7 +17,7 @@ from hvdc_ident.simulate.graph import Graph
 # Names of the generated functions, in the order in which the integrators take their addresses.
 NAMES = (
     "f", "fs", "jac", "hess", "ft", "sw", "sws", "swd", "modes", "out", "outs", "rows", "src", "srcs", "srcd",
-    "rest", "rest_jac", "rest_p", "const", "lu", "solve",
+    "rest", "rest_jac", "rest_p", "const", "lu", "solve", "surface",
 )  # fmt: skip
 ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
 LANES = 4  # instants that a function over several of them takes at once

@@ -9,6 +9,7 @@ from threading import Lock
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, InputSignal
 from hvdc_ident.errors import ModelError, SimulationError, TimingError
@@ -16,13 +17,14 @@ from hvdc_ident.model import Model
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.equations import ModelEquations, by_structure, padded
 from hvdc_ident.simulate.object_code import Code, entry, evaluate
-from hvdc_ident.simulate.run_state import COUNTED, RUN, place
+from hvdc_ident.simulate.run_state import COUNTED, HEAD, HEAD_FIELDS, RUN, place
 from hvdc_ident.simulate.simulation import HINTS, STATUSES, Statistics
 from hvdc_ident.simulate.steady_state import Equilibria
 
 Method = Literal["auto", "nonstiff", "explicit", "rosenbrock"]
 """auto: chosen by the first run of a structure in a process. nonstiff: the explicit pair where it can be, and the Rosenbrock method for
 a run that proves stiff, whatever was run before."""
+Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,51 @@ def check_times(model: Model, times: Array) -> None:
             )
 
 
+class _Equations:
+    """One set of equations with its machine code: of the model as it is, or of a slide."""
+
+    def __init__(self, structure: ModelEquations) -> None:
+        self.structure = structure
+        self._code = structure.compile()
+        self._late: Code | None = None
+        self.address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
+        self._second = [np.zeros(0, dtype=np.int64)] * 2
+
+    def head(self, rosenbrock: bool) -> Integers:
+        """What a run's record has of these equations, (HEAD,) integers: sizes and addresses, which live as long as this object.
+
+        The code that only the Rosenbrock method needs is compiled when it is first asked for.
+        """
+        if rosenbrock and self._late is None:
+            self._late = self.structure.compile_late()
+            for name, start in self._late.address.items():
+                self.address[NAMES.index(name)] = start
+            second = self.structure.second
+            self._second = [np.array([found[k] for found in second], dtype=np.int64) for k in (0, 1)]
+        s, m = self.structure.sizes, self.structure
+        n, address = s.nx + s.nz, dict(zip(NAMES, self.address.tolist(), strict=True))
+        given: dict[str, int] = {
+            **{k: getattr(s, k) for k in ("nx", "nz", "nu", "nd", "nq", "ns", "no", "np", "width")},
+            "n": n,
+            "size": n * (1 + s.width),
+            "stride": padded(n * (1 + s.width)),
+            "nw": 1 + s.nu + s.nd + s.nq,
+            "hessians": self._second[0].size if rosenbrock else 0,
+            "factors": m.elimination.count if rosenbrock and m.elimination else 0,
+            "timed": m.moves_by_itself,
+            "rosenbrock": rosenbrock,
+            "sliding": -1 if m.switch is None else m.switch,
+            "twin": m.twin,
+            **{f"do_{k}": v for k, v in address.items()},
+            "do_rhs": address["fs" if s.width else "f"],
+            "do_observe": address["outs" if s.width else "out"],
+            "do_sources": address["srcs" if s.width else "src"],
+            "hess_row": self._second[0].ctypes.data,
+            "hess_column": self._second[1].ctypes.data,
+        }
+        return np.array([given[name] for name in HEAD_FIELDS], dtype=np.int64)
+
+
 class Engine:
     """Machine code of one model structure for one list of sensitivity parameters and outputs; reusable for any values."""
 
@@ -71,15 +118,14 @@ class Engine:
         brief: bool = False,
     ) -> None:
         self._integrate, self._room = entry("integrate"), entry("room")
-        self.structure = ModelEquations(model, sensitivities, outputs, brief)
-        self._code = self.structure.compile()
-        self._late: Code | None = None
-        self._address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
+        self.structure = ModelEquations(model, sensitivities, outputs, brief=brief)
+        self._equations = _Equations(self.structure)
+        self._slides: dict[int, _Equations] = {}
+        self._address = self._equations.address
         self._equilibria = Equilibria(self.structure, self._address)
-        self._hess = [np.zeros(0, dtype=np.int64)] * 2
         self._explicit: bool | None = None
         self._lock = Lock()
-        self._states: dict[bool, tuple[Any, int]] = {}
+        self._states: dict[bool, tuple[Integers, Integers, int]] = {}
 
     # --- the start ---
 
@@ -154,16 +200,17 @@ class Engine:
         t_out = np.ascontiguousarray(time, dtype=float)
         explicit = self._is_explicit(method, p, y, w, end - begin)
         while True:
-            state, work = self._state(not explicit)
+            state, heads, work = self._state(not explicit)
             span = np.array([begin, end])
             state[self._max_steps] = tolerance.max_steps
-            status = self._integrate(
-                state, work, span, allowed, y, w, p, constants, *tables, t_out, out, sizes, *self._hess
-            )
+            status = self._integrate(state, work, span, allowed, y, w, p, constants, *tables, t_out, out, sizes, heads)
             if STATUSES[status] == "stiff" and method in ("auto", "nonstiff"):
                 explicit = False
                 if method == "auto":
                     self._explicit = False
+                continue
+            if STATUSES[status] == "sliding":  # now with the code of that slide
+                self._compile_slide(int(state[place("last_switch")]))
                 continue
             break
         counts = state[self._counted].tolist()
@@ -177,47 +224,32 @@ class Engine:
             )
         return out, statistics
 
-    def _state(self, rosenbrock: bool) -> tuple[Any, Array]:
-        """A new run's record as integers, with sizes and addresses, and its workspace.
-
-        The code that only the Rosenbrock method needs is there afterwards.
-        """
-        with self._lock:  # two threads that compile would free the code that one of them runs
-            if rosenbrock and self._late is None:
-                self._late = self.structure.compile_late()
-                second = self.structure.second
-                self._hess = [np.array([entry[k] for entry in second], dtype=np.int64) for k in (0, 1)]
-                for name, address in self._late.address.items():
-                    self._address[NAMES.index(name)] = address
+    def _compile_slide(self, switch: int) -> None:
+        """Make the equations of the slide on a switch known to later runs."""
+        m = self.structure
+        with self._lock:
+            if switch not in self._slides:
+                equations = ModelEquations(m.model, m.sensitivities, m.outputs, switch, brief=m.brief)
+                self._slides[switch] = _Equations(equations)
                 self._states.clear()
+
+    def _state(self, rosenbrock: bool) -> tuple[Integers, Integers, Array]:
+        """A new run's record as integers, the heads of the equations it may use, and its workspace."""
+        with self._lock:  # two threads that compile would free the code that one of them runs
             if rosenbrock not in self._states:
                 self._states[rosenbrock] = self._template(rosenbrock)
-            template, room = self._states[rosenbrock]
-        return template.copy(), np.zeros(room)
+            template, heads, room = self._states[rosenbrock]
+        return template.copy(), heads, np.zeros(room)
 
-    def _template(self, rosenbrock: bool) -> tuple[Any, int]:
-        """The record before a run, and how many doubles of workspace a run takes."""
-        s = self.structure.sizes
-        n, address = s.nx + s.nz, dict(zip(NAMES, self._address.tolist(), strict=True))
-        given = {k: getattr(s, k) for k in ("nx", "nz", "nu", "nd", "nq", "ns", "no", "np", "width")} | {
-            "n": n,
-            "size": n * (1 + s.width),
-            "stride": padded(n * (1 + s.width)),
-            "nw": 1 + s.nu + s.nd + s.nq,
-            "hessians": self._hess[0].size if rosenbrock else 0,
-            "factors": self.structure.elimination.count if rosenbrock and self.structure.elimination else 0,
-            "timed": self.structure.moves_by_itself,
-            "rosenbrock": rosenbrock,
-            **{f"do_{k}": v for k, v in address.items()},
-            "do_rhs": address["fs" if s.width else "f"],
-            "do_observe": address["outs" if s.width else "out"],
-            "do_sources": address["srcs" if s.width else "src"],
-        }
+    def _template(self, rosenbrock: bool) -> tuple[Integers, Integers, int]:
+        """The record before a run, its heads, and how many doubles of workspace a run takes."""
+        heads = np.zeros((self.structure.sizes.ns + 1, HEAD), dtype=np.int64)
+        for row, equations in {**self._slides, -1: self._equations}.items():
+            heads[row] = equations.head(rosenbrock)
         state = np.zeros(len(RUN.fields or ()), dtype=np.int64)
-        for name, value in given.items():
-            state[place(name)] = value
+        state[:HEAD] = heads.max(axis=0)  # room for the largest
         self._counted, self._max_steps = [place(name) for name in COUNTED], place("max_steps")
-        return state, self._room(state.copy())
+        return state, heads, self._room(state.copy())
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
         """True where the explicit pair is the better choice: no unknowns, and no eigenvalue so fast that it would rule the step."""

@@ -22,6 +22,7 @@ from hvdc_ident.model import Model, dependency_order
 from hvdc_ident.simulate.codegen import Elimination, Function, Row, eliminate, function_text, solve_text
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.object_code import Code
+from hvdc_ident.simulate.sliding_equations import sliding
 
 ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
 SHORTEST = 2.0**-16  # of a path of values: a step that has to be shorter means that the path ends
@@ -79,16 +80,21 @@ class Sizes:
 
 
 class ModelEquations:
-    """A model's equations as a graph, and the machine code made from it for the given sensitivity parameters and outputs."""
+    """A model's equations as a graph, and the machine code made from it for the given sensitivity parameters and outputs.
+
+    switch: the one along whose surface the model slides; its equations have no steady state. None: no slide. brief: whether the machine
+    code is made quickly instead of well.
+    """
 
     def __init__(
         self,
         model: Model,
         sensitivities: Sequence[str] = (),
         outputs: Sequence[str] | None = None,
+        switch: int | None = None,
+        *,
         brief: bool = False,
     ) -> None:
-        """brief: whether the machine code is made quickly instead of well."""
         self.model, self.brief = model, brief
         self.sensitivities = tuple(sensitivities)
         self.outputs = tuple(model.outputs if outputs is None else outputs)
@@ -96,7 +102,10 @@ class ModelEquations:
         self.states = tuple(model.states)
         self.unknowns = torn(model)
         self.graph = Graph()
+        self.switch, self.twin, self.surface = switch, -1, list[int]()
         self._define()
+        if switch is not None:
+            self._slide(switch)
 
     # --- leaves and equations ---
 
@@ -134,6 +143,16 @@ class ModelEquations:
         self.rests = [None if s.rest is None else node(s.rest) for s in m.states.values()]
         self.rhs = [*self.derivatives, *self.residuals]
 
+    def _slide(self, switch: int) -> None:
+        found = sliding(
+            self.graph, switch, self.derivatives, self.residuals, self.observed, self.sources, self.partial, self.rate
+        )
+        self.twin, self.surface = found.twin, found.surface
+        self.derivatives, self.residuals = found.derivatives, found.residuals
+        self.observed, self.sources = found.observed, found.sources
+        self.graph.switches[:] = found.switches
+        self.rhs = [*self.derivatives, *self.residuals]
+
     def _observed(self, name: str, node: Callable[[sp.Expr], int]) -> int:
         if name in self.model.outputs:
             return node(self.model.outputs[name].value)
@@ -149,7 +168,7 @@ class ModelEquations:
         width = padded(n)
         return Sizes(
             len(self.states),
-            len(self.unknowns),
+            len(self.residuals),
             len(m.inputs),
             len(m.delays),
             len(m.sampled),
@@ -182,7 +201,7 @@ class ModelEquations:
         """The total derivative of a node over the sensitivity parameters, as a row of the product with S and W."""
         m, column = self.model, self._columns
         scalars = {column[i]: d for i, d in self.partial(node, "p").items() if i in column}
-        size = len(self.states) + len(self.unknowns)
+        size = len(self.rhs)
         width = self.sizes.width
         products = [(d, "y", size + j * width) for j, d in sorted(self.partial(node, "y").items())]
         first, total = 1 + len(m.inputs), 1 + len(m.inputs) + len(m.delays) + len(m.sampled)
@@ -229,20 +248,21 @@ class ModelEquations:
 
         jacobian = [(i * n + j, d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()]
         by_time = [self.rate(v, False) for v in self.rhs]
-        modes = self._modes()
         result = [
             plain("f", self.rhs, hot=not width),
             Function("jac", jacobian, hot=True),
             both("ft", by_time),
             plain("sw", list(g.switches), hot=True),
             plain("swd", [self.rate(v, True) for v in g.switches]),
-            modes,
             plain("out", self.observed, hot=not width),
             plain("src", self.sources),
             plain("srcd", [self.rate(v, True) for v in self.sources]),
-            both("const", self.timing),
-            *self._rest(),
         ]
+        if self.switch is None:
+            result += [self._modes(), both("const", self.timing), *self._rest()]
+        else:
+            surface = list(enumerate(self.surface))
+            result.append(Function("surface", surface, rows(self.surface[:1], len(surface))))
         if not width:
             result.append(Function("rows", list(enumerate(self.observed)), hot=True, stride=(padded(n), s.no)))
         if width:
@@ -263,9 +283,8 @@ class ModelEquations:
     def _modes(self) -> Function:
         """One value a switch: 1 where it is negative, else 0."""
         g = self.graph
-        return Function(
-            "modes", [(k, g.select(g.negative(v), g.one, g.zero)) for k, v in enumerate(list(g.switches))], live=True
-        )
+        modes = [(k, g.select(g.condition(k), g.one, g.zero)) for k in range(len(g.switches))]
+        return Function("modes", modes, live=True)
 
     def _rest(self) -> list[Function]:
         """Residual of the steady state over [x, z, delays, sampled], its Jacobian and its derivative by the sensitivity parameters.

@@ -178,6 +178,14 @@ class Graph:
             self.switches.append(a)
         return self._node("switch", self._switch_of[a])
 
+    def condition(self, switch: int) -> int:
+        """The node of a switch's condition."""
+        return self._node("switch", switch)
+
+    def truth(self, value: bool) -> int:
+        """The condition that always holds, or never."""
+        return self._node("bool", value)
+
     def logic(self, op: str, *conditions: int) -> int:
         """Return the node of "and", "or" or "not" of conditions."""
         known = [self.nodes[c][1] if self.nodes[c][0] == "bool" else None for c in conditions]
@@ -200,6 +208,25 @@ class Graph:
         if key[0] == "bool":
             return a if key[1] else b
         return a if a == b else self._node("select", condition, a, b)
+
+    # --- copies ---
+
+    def replaced(self, roots: Iterable[int], known: Mapping[int, int]) -> list[int]:
+        """The roots with every node of `known` replaced by its partner; what stands behind a switch stays as it is."""
+        roots, made = list(roots), dict(known)
+        for n in self.reachable(roots, known=known):
+            op, *a = self.nodes[n]
+            if not self.arguments(n):
+                made[n] = n
+                continue
+            a = [made[k] for k in a]
+            if op in ("and", "or", "not"):
+                made[n] = self.logic(op, *a)
+            elif op in ("add", "sub", "neg", "mul", "div", "select"):  # what a known condition simplifies
+                made[n] = getattr(self, op)(*a)
+            else:
+                made[n] = self._node(op, *a)
+        return [made[r] for r in roots]
 
     # --- from sympy ---
 

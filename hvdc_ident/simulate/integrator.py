@@ -10,11 +10,8 @@ import numpy as np
 from hvdc_ident.simulate.codegen import LANES
 from hvdc_ident.simulate.events import (
     AGAIN,
-    NONE,
     add_echo,
-    consistent,
     find_switch,
-    rates,
     shift_rows,
     switch,
     widen,
@@ -41,7 +38,9 @@ from hvdc_ident.simulate.run_state import (
     STEP_LIMIT,
     STIFF,
 )
+from hvdc_ident.simulate.sliding import NONE, force, settle, stay, use
 from hvdc_ident.simulate.steps import attempt, evaluate, interpolate, interpolate_four, make_dense
+from hvdc_ident.simulate.unknowns import consistent, rates
 
 # --- the workspace ---
 
@@ -78,6 +77,7 @@ def arrange(r):  # type: ignore[no-untyped-def]
     r.tick, r.publish, r.ticks, r.pending = _take(r, r.nq), _take(r, r.nq), _take(r, r.nq), _take(r, r.nq)
     r.pending_p, r.publish_p = _take(r, r.nq * r.width), _take(r, r.nq * r.width)
     r.jump_p, r.at = _take(r, r.width), _take(r, r.nu)
+    r.surface = _take(r, 3 + r.nx + r.width)
     r.instants, r.block = _take(r, 4), _take(r, 4 * r.stride)
     return r.free
 
@@ -191,7 +191,7 @@ def begin_segment(r):  # type: ignore[no-untyped-def]
     vector(r.wd, 1)[0] = 1.0
     r.still = r.quiet = 0
     outside(r, r.t, r.t)  # what comes from outside is seen after its jump
-    if not consistent(r, True):
+    if not settle(r):
         return False
     if not r.first and r.width and r.echo_now:
         evaluate(r, r.do_fs, r.y, r.f_after)
@@ -268,7 +268,7 @@ def _publish(r):  # type: ignore[no-untyped-def]
         w[1 + r.nu + nd + i] = pending[i]
         for c in range(width):
             w[r.nw + (nd + i) * width + c] = pending_p[i * width + c]
-        if not consistent(r, True):
+        if not settle(r):
             return False
         if width:
             evaluate(r, r.do_f, r.y, r.f_after)
@@ -301,11 +301,7 @@ def prepare_segment(r):  # type: ignore[no-untyped-def]
         still = still and slopes[1 + i] == 0.0
     r.still = still
     r.quiet = still and r.nd == 0
-    r.forced = r.timed > 0 or r.nd > 0 or not still
-    if not r.forced:
-        ft = vector(r.ft, r.size)
-        for q in range(r.size):
-            ft[q] = 0.0
+    force(r)
     if r.ns:
         evaluate(r, r.do_sw, r.y, r.sv)
         values, top, slack = vector(r.sv, r.ns), vector(r.top, r.ns), vector(r.slack, r.ns)
@@ -392,15 +388,11 @@ def longer(rows, count, room):  # type: ignore[no-untyped-def]
 def _begin(r, y, w):  # type: ignore[no-untyped-def]
     """Fill the workspace for a run from the flat start vector y and what comes from outside, w."""
     nd, nq, width = r.nd, r.nq, r.width
-    start, outside, mass = vector(r.y, y.size), vector(r.w, w.size), vector(r.mass, r.size)
+    start, outside = vector(r.y, y.size), vector(r.w, w.size)
     for i in range(y.size):
         start[i] = y[i]
     for i in range(w.size):
         outside[i] = w[i]
-    for i in range(r.nx):
-        mass[i] = 1.0
-        for c in range(width):
-            mass[r.n + i * width + c] = 1.0
     scale, floors = vector(r.scale, max(r.np, 1)), vector(r.floors, width)
     for c in range(width):
         floors[c] = r.atol / scale[c] if c < r.np else np.inf
@@ -482,7 +474,11 @@ def _accept(r, factor):  # type: ignore[no-untyped-def]
     r.h = max(r.h, r.hs * factor) if r.last and factor >= 1.0 else r.hs * factor
     if r.ns:
         widen(r)
-    return CONVERGED if event == NONE else switch(r, event)
+    if event != NONE:
+        return switch(r, event)
+    if r.sliding != NONE:
+        stay(r)
+    return CONVERGED
 
 
 def integrate(a):  # type: ignore[no-untyped-def]
@@ -492,7 +488,8 @@ def integrate(a):  # type: ignore[no-untyped-def]
     many doubles as `arrange` asks for. span, start and end; on return its first is the time reached. tolerance: relative,
     absolute. y, the flat start vector, consistent to solver tolerance, w and p. constants: delay times, sampling periods
     and compute times with their rows. breaks, then pointer, times and values of the inputs' pieces. t_out, out. scale of
-    each parameter. hess_row and hess_column of the second derivatives.
+    each parameter. heads, (switches + 1, HEAD): functions and sizes of the slide on each switch, 0 where it is not compiled,
+    then those without a slide; in a they are large enough for all of them.
     """
     r = record(address(a, 0))
     r.free = address(a, 1)
@@ -503,7 +500,8 @@ def integrate(a):  # type: ignore[no-untyped-def]
     r.breaks, r.n_breaks = address(a, 8), length(a, 8, 0)
     r.pointer, r.times, r.values = address(a, 9), address(a, 10), address(a, 11)
     r.t_out, r.n_out, r.out = address(a, 12), length(a, 12, 0), address(a, 13)
-    r.hess_row, r.hess_column = address(a, 15), address(a, 16)
+    r.heads, r.here = address(a, 15), address(a, 0)
+    use(r, r.ns)
     at = indices(r.at, r.nu)
     for i in range(r.nu):
         at[i] = pointer[i]

@@ -229,8 +229,8 @@ ENTRIES = dict.fromkeys(("integrate", "room"), "integrator") | dict.fromkeys(
 )
 """Functions of compiled code that Python calls, with their modules."""
 KERNEL_FILES = (
-    "codegen", "equations", "events", "exogenous", "integrator", "native", "run_state", "simd", "simulation",
-    "steady_state_kernels", "steps",
+    "codegen", "equations", "events", "exogenous", "integrator", "native", "run_state", "simd", "simulation", "sliding",
+    "steady_state_kernels", "steps", "unknowns",
 )  # fmt: skip
 """Modules that these functions are made from."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.simulation import STATUSES
 
-CONVERGED, STEP_LIMIT, NOT_FINITE, CHATTER, INCONSISTENT, STIFF = range(len(STATUSES))
+CONVERGED, STEP_LIMIT, NOT_FINITE, CHATTER, INCONSISTENT, STIFF, SLIDING, TWO_SLIDES = range(len(STATUSES))
 
 NODES = 5  # a delayed signal is kept as a quartic in each step, through five equidistant values
 
@@ -26,6 +26,7 @@ SIZES = (
     "factors",  # factors of the generated elimination; 0: dense pivoting alone
     "timed",  # whether an equation uses time itself
     "rosenbrock",  # the method
+    "sliding", "twin",  # the switch on whose surface the run slides, and its twin there; -1: none
 )  # fmt: skip
 VECTORS = (
     "y", "yn", "u",  # flat: at the step's start, at its end, at a stage
@@ -43,7 +44,7 @@ VECTORS = (
     "tick", "publish", "ticks", "pending", "pending_p", "publish_p",  # samples
     "jump_p",  # derivative of the present jump's instant by the parameters
     "constants", "breaks", "at", "pointer", "times", "values",  # timing constants; inputs
-    "hess_row", "hess_column",
+    "surface", "heads", "here",  # of a slide; heads of this record without a slide and for each one; the record itself
     "t_out", "out", "instants", "block",  # outputs; four instants and their flat vectors
 )  # fmt: skip
 COUNTS = (
@@ -65,11 +66,15 @@ INSTANTS = (
     "start", "end", "t", "tb",  # tb: the present segment's end
     "h", "hs", "step_end",  # the step wanted, the step taken, its end
     "rtol", "atol", "order", "shortest", "last_event", "error", "stiffness",
+    "surface_top",  # largest value of the sliding switch so far
 )  # fmt: skip
 
 # Every field takes eight bytes: a run's record is made, copied and read as one vector of integers, which is quick.
+FUNCTIONS = (*(f"do_{n}" for n in NAMES), "do_rhs", "do_observe", "do_sources")
+HEAD_FIELDS = (*SIZES, *FUNCTIONS, "hess_row", "hess_column")  # what one set of equations brings; first in the record
+HEAD = len(HEAD_FIELDS)
 RUN = np.dtype(
-    [(f, np.int64) for f in (*SIZES, *(f"do_{n}" for n in NAMES), "do_rhs", "do_observe", "do_sources", *VECTORS)]
+    [(f, np.int64) for f in (*HEAD_FIELDS, *VECTORS)]
     + [(f, np.int64) for f in (*COUNTS, *FLAGS)]
     + [(f, np.float64) for f in INSTANTS]
     + [("free", np.int64)]  # where the workspace goes on

@@ -172,7 +172,7 @@ def test_a_steady_start_depends_on_the_parameters():
 
 @pytest.mark.parametrize(
     ("derivative", "start", "status"),
-    [("-sign(x - 0.6)", 0, "chatter"), ("x**2", 1, "not-finite"), ("sin(1e5*time)", 0, "step-limit")],
+    [("x**2", 1, "not-finite"), ("sin(1e5*time)", 0, "step-limit")],
 )
 def test_every_failure_has_a_name(derivative, start, status):
     model = Model("fails", states={"x": State(derivative, start=start)}, outputs={"x": "x"}, parameters={})

@@ -87,3 +87,21 @@ def test_the_slope_of_a_cut_root_is_zero_where_it_is_cut():
     slope = graph.gradient(root)[nodes["a"]]
     leaves = dict(zip(nodes.values(), (1.0, 2.0, 0.0), strict=True))
     assert graph.evaluate([root, slope], leaves) == [0.0, 0.0]
+
+
+@pytest.mark.parametrize("text", TEXTS)
+def test_a_part_replaced_has_the_value_of_its_partner(text):
+    """b^2 + c in place of a, and the first condition's outcome in place of the condition."""
+    graph, nodes, root = graph_of(text)
+    partner = graph.add(graph.mul(nodes["b"], nodes["b"]), nodes["c"])
+    point = {"b": 0.7, "c": 0.4}
+    a = point["b"] ** 2 + point["c"]
+    leaves = {nodes[n]: v for n, v in point.items()}
+    known = {nodes["a"]: partner}
+    wanted = graph.evaluate([root], {**leaves, nodes["a"]: a})[0]
+    for switch, value in enumerate(list(graph.switches)):
+        negative = graph.evaluate([value], {**leaves, nodes["a"]: a})[0] < 0.0
+        known[graph.condition(switch)] = graph.truth(negative)
+    (replaced,) = graph.replaced([root], known)
+    assert graph.evaluate([replaced], leaves)[0] == pytest.approx(wanted, rel=1e-13)
+    assert nodes["a"] not in graph.reachable([replaced])
