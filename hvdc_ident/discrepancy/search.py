@@ -61,7 +61,7 @@ from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE, Se
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.residual_checks import tones
 from hvdc_ident.discrepancy.screen import Shot
-from hvdc_ident.discrepancy.stand import Race, Round, Stand, done, gains_of
+from hvdc_ident.discrepancy.stand import BEHIND, Race, Round, Stand, done, gains_of
 from hvdc_ident.effects import effects
 from hvdc_ident.model import AnyModel
 
@@ -184,11 +184,21 @@ def _led_on(
         more: list[CandidateFit] = []
         for t in leaders:
             opened, shots = _beside(stand, opened, t, number)
+            shots = _promising(opened.before, shots, [*trials, *more])
             more += stand.refitted(opened.candidates, shots, f"round {number}: neighbours", [*trials, *more])
         trials = best_each([*trials, *more])
         if cost_of(by_cost(trials)[0]) > least - TIED:
             break
     return replace(opened, led=led), trials
+
+
+def _promising(before: Refit, shots: Sequence[Shot], trials: Sequence[CandidateFit]) -> list[Shot]:
+    """Return the shots that promise more than their candidates' refits have come to."""
+    came_to: dict[int, float] = {}
+    for t in trials:
+        if t.refit.failure in ("", BEHIND):
+            came_to[t.pick.candidate] = min(t.refit.chi2, came_to.get(t.pick.candidate, math.inf))
+    return [s for s in shots if before.chi2 - s.fall < came_to.get(s.candidate, math.inf) - TIED]
 
 
 def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit]:

@@ -15,7 +15,6 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, excess
 from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, RefitResult, failed_at, find, job
-from hvdc_ident.discrepancy.implied import TIED
 from hvdc_ident.discrepancy.movable import Form, Movable
 from hvdc_ident.discrepancy.nominal import thinned
 from hvdc_ident.discrepancy.options import SearchContext
@@ -224,8 +223,7 @@ class Stand:
         self, found: Sequence[CandidateEffect], shots: Sequence[Shot], text: str, earlier: Sequence[CandidateFit] = ()
     ) -> list[CandidateFit]:
         """Return the shots refitted, in a race with each other and with those refitted earlier; and their larger forms where none
-        leaves noise: beside equations of one size that do, more sizes gain nothing but their price. A shot that promises no less than
-        its candidate's earlier refit came to is none."""
+        leaves noise: beside equations of one size that do, more sizes gain nothing but their price."""
         trials = self._raced(found, shots, text, earlier)
         if any(not t.refit.failure and not excess(t.refit) for t in (*earlier, *trials)):
             return trials
@@ -244,11 +242,6 @@ class Stand:
         jobs: list[RefitJob] = []
         of: list[Pick] = []
         trials: list[CandidateFit] = []
-        came_to: dict[int, float] = {}
-        for t in earlier:
-            if t.refit.failure in ("", BEHIND):
-                came_to[t.pick.candidate] = min(t.refit.chi2, came_to.get(t.pick.candidate, math.inf))
-        shots = [s for s in shots if self.before.chi2 - s.fall < came_to.get(s.candidate, math.inf) - TIED]
         for s in sorted(shots, key=lambda s: (found[s.candidate].effect, s.candidate)):  # those of one model together
             pick = Pick(s.candidate, s.probe, s.factor, s.fall)
             c = found[s.candidate]

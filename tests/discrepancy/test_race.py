@@ -41,7 +41,7 @@ def test_where_none_is_better_than_nothing_yet_all_come_to_their_ends(
     alone = [run(j) for j in jobs]
     for found, expected in zip(Race(laps=(4,)).run(SEARCH, before, jobs, ["a", "b"]), alone, strict=True):
         assert found.ended
-        assert found.chi2 == pytest.approx(expected.chi2, rel=1e-5)
+        assert found.chi2 == pytest.approx(expected.chi2, rel=1e-4), "a walk ends where a step gains a millionth"
         assert found.theta == pytest.approx(expected.theta, rel=1e-2)
 
 
