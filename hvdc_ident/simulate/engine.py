@@ -31,8 +31,9 @@ Integers = NDArray[np.int64]
 class Tolerance:
     """Error control: relative and absolute tolerance (states' own units) per step, and the step budget of one run.
 
-    search: whether a steady start that Newton's method does not find at once is looked for by slower means. brief: whether the model
-    has few runs to come: its machine code is then made in a fraction of the time, and takes longer to run.
+    search: whether what takes longer is done for a run: a steady start that Newton's method does not find at once is looked for by
+    slower means, and a slide along the surface of a switch is compiled. brief: whether the model has few runs to come: its machine code
+    is then made in a fraction of the time, and takes longer to run.
     """
 
     rtol: float = 1e-8
@@ -209,7 +210,7 @@ class Engine:
                 if method == "auto":
                     self._explicit = False
                 continue
-            if STATUSES[status] == "sliding":  # now with the code of that slide
+            if STATUSES[status] == "sliding" and tolerance.search:  # now with the code of that slide
                 self._compile_slide(int(state[place("last_switch")]))
                 continue
             break
