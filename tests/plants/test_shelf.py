@@ -12,7 +12,7 @@ from hvdc_ident.model import read_card
 from hvdc_ident.shelf import card_of, components, record_of
 from tests.plants.test_against_andes import CASES, unit
 
-NO_RECORD = ("infinite-bus", "line", "load", "playback", "transformer")
+NO_RECORD = ("bus-frequency", "infinite-bus", "line", "load", "playback", "transformer")
 
 
 @pytest.mark.parametrize("name", components())
