@@ -256,7 +256,10 @@ def _open_lines(r: Mapped) -> Iterator[str]:
         yield f"column {name} is not mapped; candidates: {may_be}"
     if len(open_) > COLUMNS_SHOWN:
         yield f"and {len(open_) - COLUMNS_SHOWN} more columns are not mapped; the study has their candidates"
-    inputs = [t for t in r.columns.missing if t.kind == "input"]
+    trim = _trim(r)
+    if trim:
+        yield f"levels before the event: {', '.join(f'{level} = that of {o}' for level, o in trim.items())}"
+    inputs = [t for t in r.columns.missing if t.kind == "input" and t.name not in trim]
     if inputs:
         yield f"inputs without a column keep their values: {', '.join(_value(t) for t in inputs)}"
     outputs = [t.name for t in r.columns.missing if t.kind == "output"]

@@ -92,6 +92,23 @@ def test_from_a_dyr_file_to_a_fitted_one(folder) -> None:
     )
 
 
+CONVERTER = """101 'REGCA1' 1 0 0.02 10 0.9 0.4 1.22 1.2 0.8 0.4 -1.3 0.02 0.7 99 -99 0.7 /
+101 'REECB1' 1 0 0 {VFLAG} {QFLAG} 1 0.5 1.3 0 -0.02 0.02 2 1.05 -1.05 1.02 0.05 0.8 -0.8 1.3 -1.3 0.3 0.1 1 10 0.02 99 -99 1.2 0 1.5 0.05 /
+"""
+
+
+@pytest.mark.parametrize(
+    ("flags", "asked"),
+    [({"VFLAG": 1, "QFLAG": 1}, "elec.Kvp"), ({"VFLAG": 1, "QFLAG": 0}, "elec.Kqv")],
+)
+def test_a_gain_that_a_flag_switches_off_is_not_asked_about(folder, tmp_path, flags, asked) -> None:
+    (tmp_path / "plant.dyr").write_text(CONVERTER.format(**flags), encoding="utf-8")
+    new = ["new", tmp_path / "a", "--dyr", tmp_path / "plant.dyr", "--raw", folder / "grid.raw", "--bus", 101]
+    code, out, _ = called(*new, "--from", folder / "event.csv")
+    assert code == 0 and "levels before the event: P0 = that of P, Q0 = that of Q" in out
+    assert list(hi.load_study(tmp_path / "a" / "study.toml").candidates) == [asked]
+
+
 def test_what_is_missing_is_told(folder, tmp_path) -> None:
     event, dyr = folder / "event.csv", folder / "plant.dyr"
     code, _, err = called("new", tmp_path / "a", "--dyr", dyr, "--bus", 101, "--from", event)
