@@ -109,6 +109,17 @@ def test_a_gain_that_a_flag_switches_off_is_not_asked_about(folder, tmp_path, fl
     assert list(hi.load_study(tmp_path / "a" / "study.toml").candidates) == [asked]
 
 
+def test_a_recorded_voltage_does_not_jump_between_rows(folder, tmp_path) -> None:
+    """A dip by 0.04 pu from one row, at 1 s, to the next: halfway between them the voltage is their mean."""
+    rows = np.loadtxt(folder / "event.csv", delimiter=",", skiprows=1)
+    rows[:, 1] = np.where(rows[:, 0] < 1.005, 1.02, 0.98) + 1e-4 * np.sin(1e3 * rows[:, 0])
+    np.savetxt(tmp_path / "dip.csv", rows, delimiter=",", header="time,V,theta,P,Q", comments="")
+    new = ["new", tmp_path / "a", "--dyr", folder / "plant.dyr", "--raw", folder / "grid.raw", "--bus", 101]
+    assert called(*new, "--from", tmp_path / "dip.csv", "--quiet")[0] == 0
+    (record,) = hi.load_study(tmp_path / "a" / "study.toml").experiments
+    assert float(record.inputs["V"](1.005)) == pytest.approx(1.0, abs=2e-4)
+
+
 def test_what_is_missing_is_told(folder, tmp_path) -> None:
     event, dyr = folder / "event.csv", folder / "plant.dyr"
     code, _, err = called("new", tmp_path / "a", "--dyr", dyr, "--bus", 101, "--from", event)
