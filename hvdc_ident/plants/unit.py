@@ -33,6 +33,8 @@ SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", 
 """Outputs of a unit, where one of its components has them, with their units."""
 
 
+METER = "freq.dwn"
+"""What controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts."""
 MACHINE = "gen"
 NAMES = FrozenMap({"Ir": MACHINE, "Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd": "elec", "Qext": "plant"})
 """Name of a part in a unit by the output that it gives; another goes by the name of its component."""
@@ -68,7 +70,7 @@ def unit_card(
     models = {n: shelf_model(p.source) for n, p in parts.items()}
     machine = _one_that_gives(models, "Ir")
     played = network == "playback"
-    connections, references = _wired(models, _network(machine, network), played)
+    connections, references = _wired(models, machine, _network(machine, network), played)
     inputs: dict[str, Input] = {**(shelf_model("playback").inputs if played else {"E": VOLTAGE}), **references}
     found = _references(inputs, parts[machine]) if played else {}
     known = {"f": f0} | dict(levels)
@@ -77,6 +79,9 @@ def unit_card(
         if played
         else {"grid": UnitPart("infinite-bus"), "line": UnitPart("line", {"R": R, "X": X})}
     )
+    if METER in connections.values():
+        connections |= {"freq.theta": "theta", "freq.f": "f"}
+        grid["freq"] = UnitPart("bus-frequency", {"f0": f0})
     shared = {n: {"f0": f0} if "f0" in m.parameters else {} for n, m in models.items()}
     components = {n: replace(p, values=shared[n] | dict(p.values)) for n, p in parts.items()} | grid
     lines = [
@@ -98,7 +103,7 @@ def unit_card(
 
 
 def _wired(
-    models: Mapping[str, Model], connections: Mapping[str, str], played: bool
+    models: Mapping[str, Model], machine: str, connections: Mapping[str, str], played: bool
 ) -> tuple[dict[str, str], FrozenMap[Input]]:
     """Return what each input of the parts follows, and the inputs of the unit that are left. connections: those with the network."""
     found, inputs = dict(connections), dict[str, Input]()
@@ -112,7 +117,7 @@ def _wired(
         if sources:
             found[f"{part}.{u}"] = f"{sources[0]}.{u}"
         elif played and u == "dwn":
-            found[f"{part}.{u}"] = "bus.dwn"
+            found[f"{part}.{u}"] = "bus.dwn" if part == machine else METER
         else:
             found[f"{part}.{u}"] = UNCONNECTED.get(u, u)
             if u not in UNCONNECTED:

@@ -256,7 +256,10 @@ def _open_lines(r: Mapped) -> Iterator[str]:
         yield f"column {name} is not mapped; candidates: {may_be}"
     if len(open_) > COLUMNS_SHOWN:
         yield f"and {len(open_) - COLUMNS_SHOWN} more columns are not mapped; the study has their candidates"
-    inputs = [t for t in r.columns.missing if t.kind == "input"]
+    trim = _trim(r)
+    if trim:
+        yield f"levels before the event: {', '.join(f'{level} = that of {o}' for level, o in trim.items())}"
+    inputs = [t for t in r.columns.missing if t.kind == "input" and t.name not in trim]
     if inputs:
         yield f"inputs without a column keep their values: {', '.join(_value(t) for t in inputs)}"
     outputs = [t.name for t in r.columns.missing if t.kind == "output"]
@@ -314,7 +317,7 @@ def _study_text(
     more = len(model.parameters) - len(asked) - MOST_LISTED
     yield from [f"# and {more} more parameters of the model"] if more > 0 else []
     for r in recordings:
-        yield from ("", *_experiment_text(r))
+        yield from ("", *_experiment_text(r, played=dyr is not None))
     yield ""
     yield "# The stages. A stage runs if its table is in this file; `simulate` always runs."
     mark = "" if asked and any(r.experiment is not None for r in recordings) else "# "
@@ -324,13 +327,18 @@ def _study_text(
         yield f"{mark}places = [{', '.join(map(toml_string, dyr.places))}]   # the controls, and what they act on"
 
 
-def _experiment_text(r: Mapped) -> Iterator[str]:
-    """The lines of one experiment; all of them comments where no output is mapped, as none may be without."""
+def _experiment_text(r: Mapped, played: bool) -> Iterator[str]:
+    """The lines of one experiment; all of them comments where no output is mapped, as none may be without.
+
+    played: its inputs are measured ones, which have no jumps.
+    """
     mark = "" if r.experiment is not None else "# "
     yield f"# {_comment(_found(r))}"
     yield f"{mark}[[experiment]]"
     yield f"{mark}name = {toml_string(r.name)}"
     yield f"{mark}data = {toml_string(r.data)}"
+    if played:
+        yield f'{mark}interpolation = "linear"   # a measured voltage moves from row to row, and does not jump at the later one'
     yield '# role = "holdout"   # not fitted: validates the estimates'
     if r.experiment is not None and r.experiment.event is not None:
         yield f"# event = {r.experiment.event!r}   # s, as found from the inputs"

@@ -8,13 +8,16 @@ from pathlib import Path
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.plants import LEVELS, MACHINE, RecordedUnit, machine_records, recorded_unit, shelf_model, unit_card
 from hvdc_ident.psse import read_dyr, read_raw
 from hvdc_ident.study.new_study import DyrOfStudy, NewStudy, new_study
 from hvdc_ident.study.recordings import level_before
 
-USUAL = ("H", "KA", "K", "KS1", "KS", "R", "r", "Rperm", "Kvp", "Kqp", "Kp")
+USUAL = ("H", "KA", "K", "KS1", "KS", "R", "r", "Rperm", "Kvp", "Kqp", "Kqv", "Kp")
 """Parameters that are asked about first, of each part the first that it has: inertia, gains of voltage control and stabiliser, droop."""
+FLAGS = FrozenMap({"Kvp": ("QFLAG",), "Kqp": ("QFLAG", "VFLAG")})
+"""Flags of its part that must be 1 for a parameter to count."""
 COMMANDS = ("Pm", "Efd", "Ipcmd", "Iqcmd")
 """Inputs of a machine or converter that its controls give."""
 SPAN = 4.0
@@ -96,7 +99,8 @@ def _places(unit: RecordedUnit) -> tuple[str, ...]:
 def _candidates(unit: RecordedUnit) -> dict[str, tuple[float, float]]:
     found = {}
     for name, part in unit.parts.items():
-        usual = next((n for n in USUAL if part.values.get(n, 0.0) > 0.0), None)
+        off = {n for n, flags in FLAGS.items() if any(part.values.get(f) == 0.0 for f in flags)}
+        usual = next((n for n in USUAL if n not in off and part.values.get(n, 0.0) > 0.0), None)
         if usual is not None:
             found[f"{name}.{usual}"] = (part.values[usual] / SPAN, part.values[usual] * SPAN)
     return found

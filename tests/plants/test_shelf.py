@@ -12,7 +12,7 @@ from hvdc_ident.model import read_card
 from hvdc_ident.shelf import card_of, components, record_of
 from tests.plants.test_against_andes import CASES, unit
 
-NETWORK = ("infinite-bus", "line", "load", "playback", "transformer", "dc-line", "grid-impedance")
+NETWORK = ("bus-frequency", "infinite-bus", "line", "load", "playback", "transformer", "dc-line", "grid-impedance")
 CONVERTER = ("vsc-phasor", "vsc-vdc-control", "vsc-p-control", "vsc-q-control")
 NO_RECORD = (*NETWORK, *CONVERTER)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 import hvdc_ident as hi
@@ -25,3 +26,21 @@ def test_a_plant_of_converters_follows_the_recorded_frequency() -> None:
     high = hi.find_operating_point(held, {"f": 60.2}, guess=point.states)
     assert high.outputs["P"] == pytest.approx(80.0 - 100.0 * 20.0 * (0.2 / 60.0 - 6e-4))
     assert high.outputs["Q"] == pytest.approx(10.0)
+
+
+def test_controls_measure_the_frequency_of_a_recorded_angle() -> None:
+    """A ramp of the angle and a frequency give the plant controller one and the same: P differs by the lag of the measurement alone."""
+    control = {"Fflag": 1.0, "Ddn": 20.0, "Dup": 20.0, "fdbd1": 0.0, "fdbd2": 0.0}
+    parts = {
+        "gen": UnitPart("regca1"),
+        "elec": UnitPart("reeca1", {"QFLAG": 0.0}),
+        "plant": UnitPart("repca1", control),
+    }
+    model = parse_card(unit_card(parts, network="playback", f0=50.0)).with_values({"P0": 80.0, "Q0": 10.0})
+    times = np.arange(0.0, 8.0, 0.02)
+    fall = 0.1
+    angle = -2.0 * np.pi * fall * np.maximum(times - 1.0, 0.0)
+    turned = hi.simulate(model, times, inputs={"theta": angle})["P"]
+    slowed = hi.simulate(model, times, inputs={"f": hi.step(50.0, 50.0 - fall, at=1.0)})["P"]
+    assert slowed[-1] - slowed[0] == pytest.approx(100.0 * 20.0 * fall / 50.0, rel=0.05)
+    assert np.abs(turned - slowed).max() < 0.02 / 0.25 * np.ptp(slowed)

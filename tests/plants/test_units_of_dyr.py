@@ -92,6 +92,34 @@ def test_from_a_dyr_file_to_a_fitted_one(folder) -> None:
     )
 
 
+CONVERTER = """101 'REGCA1' 1 0 0.02 10 0.9 0.4 1.22 1.2 0.8 0.4 -1.3 0.02 0.7 99 -99 0.7 /
+101 'REECB1' 1 0 0 {VFLAG} {QFLAG} 1 0.5 1.3 0 -0.02 0.02 2 1.05 -1.05 1.02 0.05 0.8 -0.8 1.3 -1.3 0.3 0.1 1 10 0.02 99 -99 1.2 0 1.5 0.05 /
+"""
+
+
+@pytest.mark.parametrize(
+    ("flags", "asked"),
+    [({"VFLAG": 1, "QFLAG": 1}, "elec.Kvp"), ({"VFLAG": 1, "QFLAG": 0}, "elec.Kqv")],
+)
+def test_a_gain_that_a_flag_switches_off_is_not_asked_about(folder, tmp_path, flags, asked) -> None:
+    (tmp_path / "plant.dyr").write_text(CONVERTER.format(**flags), encoding="utf-8")
+    new = ["new", tmp_path / "a", "--dyr", tmp_path / "plant.dyr", "--raw", folder / "grid.raw", "--bus", 101]
+    code, out, _ = called(*new, "--from", folder / "event.csv")
+    assert code == 0 and "levels before the event: P0 = that of P, Q0 = that of Q" in out
+    assert list(hi.load_study(tmp_path / "a" / "study.toml").candidates) == [asked]
+
+
+def test_a_recorded_voltage_does_not_jump_between_rows(folder, tmp_path) -> None:
+    """A dip by 0.04 pu from one row, at 1 s, to the next: halfway between them the voltage is their mean."""
+    rows = np.loadtxt(folder / "event.csv", delimiter=",", skiprows=1)
+    rows[:, 1] = np.where(rows[:, 0] < 1.005, 1.02, 0.98) + 1e-4 * np.sin(1e3 * rows[:, 0])
+    np.savetxt(tmp_path / "dip.csv", rows, delimiter=",", header="time,V,theta,P,Q", comments="")
+    new = ["new", tmp_path / "a", "--dyr", folder / "plant.dyr", "--raw", folder / "grid.raw", "--bus", 101]
+    assert called(*new, "--from", tmp_path / "dip.csv", "--quiet")[0] == 0
+    (record,) = hi.load_study(tmp_path / "a" / "study.toml").experiments
+    assert float(record.inputs["V"](1.005)) == pytest.approx(1.0, abs=2e-4)
+
+
 def test_what_is_missing_is_told(folder, tmp_path) -> None:
     event, dyr = folder / "event.csv", folder / "plant.dyr"
     code, _, err = called("new", tmp_path / "a", "--dyr", dyr, "--bus", 101, "--from", event)
