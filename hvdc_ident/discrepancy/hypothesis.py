@@ -633,9 +633,10 @@ def slot_signals(before: Refit) -> dict[str, tuple[Array, ...]]:
     kept = [p for p in slots if kinds[p][0] != "output" or kinds[p][1] in recorded]
     names = list(dict.fromkeys(kinds[p][1] for p in kept))
     tolerance = before.problem.simulator.tolerance if isinstance(before.problem.simulator, ModelSimulator) else None
+    once = replace(tolerance or Tolerance(), brief=True)  # one run of each experiment with all of them
     found: dict[str, list[Array]] = {p: [] for p in kept}
     for e in experiments:
-        run = simulate(model, e.with_(measured=None, instrument={}), before.values, outputs=names, tolerance=tolerance)
+        run = simulate(model, e.with_(measured=None, instrument={}), before.values, outputs=names, tolerance=once)
         for p in kept:
             found[p].append(np.asarray(run[kinds[p][1]]))
     return {p: tuple(own) for p, own in found.items()}

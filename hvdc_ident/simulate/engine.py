@@ -31,9 +31,9 @@ Integers = NDArray[np.int64]
 class Tolerance:
     """Error control: relative and absolute tolerance (states' own units) per step, and the step budget of one run.
 
-    search: whether what takes longer is done for a run: a steady start that Newton's method does not find at once is looked for by
-    slower means, and a slide along the surface of a switch is compiled. brief: whether the model has few runs to come: its machine code
-    is then made in a fraction of the time, and takes longer to run.
+    search: whether a steady start that Newton's method does not find at once is looked for by slower means. brief: whether the model
+    has few runs to come: its machine code is then made in a fraction of the time, and takes longer to run; a run that slides along the
+    surface of a switch, for which more would have to be compiled, chatters.
     """
 
     rtol: float = 1e-8
@@ -203,14 +203,14 @@ class Engine:
         while True:
             state, heads, work = self._state(not explicit)
             span = np.array([begin, end])
-            state[self._max_steps] = tolerance.max_steps
+            state[self._max_steps], state[self._slides_too] = tolerance.max_steps, not tolerance.brief
             status = self._integrate(state, work, span, allowed, y, w, p, constants, *tables, t_out, out, sizes, heads)
             if STATUSES[status] == "stiff" and method in ("auto", "nonstiff"):
                 explicit = False
                 if method == "auto":
                     self._explicit = False
                 continue
-            if STATUSES[status] == "sliding" and tolerance.search:  # now with the code of that slide
+            if STATUSES[status] == "sliding":  # now with the code of that slide
                 self._compile_slide(int(state[place("last_switch")]))
                 continue
             break
@@ -249,7 +249,8 @@ class Engine:
             heads[row] = equations.head(rosenbrock)
         state = np.zeros(len(RUN.fields or ()), dtype=np.int64)
         state[:HEAD] = heads.max(axis=0)  # room for the largest
-        self._counted, self._max_steps = [place(name) for name in COUNTED], place("max_steps")
+        self._counted = [place(name) for name in COUNTED]
+        self._max_steps, self._slides_too = place("max_steps"), place("slides")
         return state, heads, self._room(state.copy())
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:

@@ -191,7 +191,7 @@ def _cross(r, event):  # type: ignore[no-untyped-def]
         biggest = max(biggest, abs(before[i] - after[i]) / (1e-9 + abs(before[i]) + abs(after[i])))
     if width and speed != 0.0:
         _jump(r, event, speed, biggest > 1e-7)
-    if biggest > 1e-7 and leads_back(r, event, value):
+    if r.slides and biggest > 1e-7 and leads_back(r, event, value):
         return begin_slide(r, event)
     return CONVERGED
 

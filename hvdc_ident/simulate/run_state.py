@@ -53,6 +53,7 @@ COUNTS = (
 )  # fmt: skip
 COUNTED = ("accepted", "rejected", "events", "evaluations", "segments", "forced_steps")  # what a run reports
 FLAGS = (
+    "slides",  # whether the run may slide along the surface of a switch
     "still",  # no input has a slope in this segment
     "quiet",  # nothing comes from outside in this segment but time
     "forced",  # the right-hand side may change with time alone

@@ -24,7 +24,6 @@ HINTS = {
     "not-finite": "a value grew without bound or left a function's domain: check parameter values and limits",
     "chatter": "a limit switches on and off without end: add a hysteresis or a small lag where it acts",
     "inconsistent": "no solution of the algebraic loop was found there: check the operating point, or give the unknown another start",
-    "sliding": "from Python, Tolerance(search=True) follows a slide along the surface of a switch",
     "two-slides": "two limits are held at once, each by its own reaction, which is not simulated: give one of them a hysteresis or a "
     "small lag where it acts",
     "stiff": "use the Rosenbrock method",

@@ -95,7 +95,8 @@ def begin_slide(r, event):  # type: ignore[no-untyped-def]
         m[r.twin] = 0.0
     if consistent(r, False) and slides_on(r):
         to_surface(r)
-        return CONVERGED
+        if slides_on(r):  # beside the surface a steep field without a jump leads to it too
+            return CONVERGED
     twin = r.twin
     _leave(r)
     m[event] = side
