@@ -61,9 +61,19 @@ class PatientPool:
         """Yield outcomes of the pool, which is opened for the first; `source` keeps the items that are there."""
         if self._pool is None:
             self._pool = self._stack.enter_context(self._settings.open())
+        following, done, failed = source.following, set[int](), dict[int, Any]()
         for outcome in self._pool.run(function, source):
             index, item = source.given.pop(outcome.index)
-            yield Outcome(index, function(item)) if outcome.failure else Outcome(index, outcome.value)
+            done.add(index)
+            if outcome.failure:
+                failed[index] = item
+            else:
+                yield Outcome(index, outcome.value)
+            while following in done:  # an error is raised after the values of the items before, as without workers
+                if following in failed:
+                    yield Outcome(following, function(failed.pop(following)))
+                done.discard(following)
+                following += 1
 
 
 class _Items:
@@ -81,6 +91,11 @@ class _Items:
         if self._next is None:
             self._next = next(self._source, None)
         return self._next is not None
+
+    @property
+    def following(self) -> int:
+        """Return the index of the next item; -1 where there is none."""
+        return self._next[0] if self.left and self._next is not None else -1
 
     def take(self) -> tuple[int, Any]:
         """Return the next index and item; -1 where there is none."""
