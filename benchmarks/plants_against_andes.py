@@ -1,9 +1,11 @@
 """Eigenvalues and step responses of the units of tests/plants/cases.toml by andes 2.0, as tests/plants/andes.json.
 
     python benchmarks/plants_against_andes.py [CASE ...]
+    python benchmarks/plants_against_andes.py playback
 
 andes (extra `bench`) shares no code with the package: it reads the same .dyr records and a .raw of two buses. The tests compare with
-the numbers that stand in the file, so that they need no andes. Cases that are not named keep theirs.
+the numbers that stand in the file, so that they need no andes. Cases that are not named keep theirs. `playback`: units at andes'
+playback bus, PLBVFU1, as tests/plants/playback_andes.json.
 """
 
 from __future__ import annotations
@@ -74,6 +76,20 @@ ESAC8B = {
 """Values of AC8B that make it ESAC8B, which andes does not have: by name, the value or the name of ESAC8B's."""
 ABSENT = {"SCRX", "PSS2B", "STAB2A"}
 """Models that andes does not have, or takes another for."""
+PLAYED = ("ieeet1", "sexs")
+"""Cases that are played back."""
+TABLE = {
+    "t": [0.0, *np.round(np.arange(0.5, 1.0, 0.1), 6).tolist(), *np.round(np.arange(2.0, 3.0, 0.1), 6).tolist()],
+    "V": [1.0, 0.99, 0.98, 0.97, 0.96, 0.95, *np.linspace(0.955, 1.0, 10).round(6).tolist()],
+    "f": [1.0, *np.linspace(0.9995, 0.9975, 5).round(6).tolist(), *np.linspace(0.9977, 0.9995, 10).round(6).tolist()],
+}
+"""What PLBVFU1 plays back, pu: each value holds until the next. A dip and a fall of the frequency by ramps, and back, in stairs that
+the lags below make smooth; the frequency does not come back entirely."""
+LAGS = {"V": 0.2, "f": 0.15}
+"""Time constants of the lags behind which PLBVFU1 plays back, Tv and Tf, s."""
+SMALL = 1e-6
+"""Reactance of the playback bus, and of the line between it and the unit, pu of 100 MVA: small enough for the voltage at the unit to
+be the played one within 1e-6 pu."""
 RAW = """0, 100.00, 32, 0, 1, 60.00 / two buses
 a unit at an infinite bus
 
@@ -185,6 +201,81 @@ def response(records: dict[str, list[float]], step: str, folder: Path) -> dict[s
     return runs
 
 
+def played(records: dict[str, list[float]], folder: Path) -> dict[str, list[float]]:
+    """Return P (MW), Q (Mvar), the voltage V at the unit (pu) and its angle theta since the start (rad) at TIMES."""
+    lines = [line(model, values) for model, values in records.items()]
+    (folder / "unit.dyr").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    grid = 1.02 - 0.2 * SMALL / 1.02  # about 20 Mvar from the unit
+    raw = RAW.replace(" 0.01, 0.3,", f" 0.0, {SMALL!r},").replace(
+        "-999.0, 1.0, 0, 100.0", f"-999.0, {grid!r}, 0, 100.0"
+    )
+    (folder / "unit.raw").write_text(raw, encoding="utf-8")
+    rows = zip(*TABLE.values(), strict=True)
+    table = [",".join(TABLE), *(",".join(map(repr, row)) for row in rows)]
+    (folder / "table.csv").write_text("\n".join(table) + "\n", encoding="utf-8")
+    found = andes.load(
+        str(folder / "unit.raw"), addfile=str(folder / "unit.dyr"), no_output=True, default_config=True, setup=False
+    )
+    bus = {
+        "bus": 2,
+        "gen": found.Slack.idx.v[0],
+        "xs": SMALL,
+        "Tv": LAGS["V"],
+        "Tf": LAGS["f"],
+        "filename": "table.csv",
+    }
+    found.add("PLBVFU1", {"idx": "bus", "Sn": 100.0, "Vn": 20.0, "fn": 60.0, **bus})
+    course = {
+        "path": str(folder / "table.csv"),
+        "sheet": "",
+        "fields": "V,f",
+        "dests": "Vts,fts",
+        "tkey": "t",
+        "mode": 1,
+    }
+    found.add("TimeSeries", {"idx": "table", "model": "PLBVFU1", "dev": "bus", **course})
+    found.setup()
+    found.PFlow.config.tol = 1e-8
+    found.PFlow.run()
+    found.TDS.config.fixt, found.TDS.config.shrinkt, found.TDS.config.reset_tiny = 1, 0, 1
+    found.TDS.config.tstep = TIME_STEPS["SynGen"]
+    found.TDS.config.criteria = 0
+    found.TDS.config.tf = ENDS["SynGen"] + 0.01
+    found.TDS.run()
+    series = found.dae.ts
+    # andes goes 0.1 ms beyond every row of the table at once, and the trapezoidal rule takes the row in the middle of that.
+    times = np.where(TABLE["t"][1] < TIMES, TIMES + 5e-5, TIMES)
+    machine, terminals = found.GENROU, found.Bus.idx2uid(1)
+    columns = {
+        "P": 100.0 * series.y[:, machine.Pe.a[0]],
+        "Q": 100.0 * series.y[:, machine.Qe.a[0]],
+        "V": series.y[:, found.Bus.v.a[terminals]],
+        "theta": series.y[:, found.Bus.a.a[terminals]],
+    }
+    return {
+        n: np.interp(times, series.t, column - (column[0] if n == "theta" else 0.0)).tolist()
+        for n, column in columns.items()
+    }
+
+
+def playback() -> None:
+    """Write the numbers of the units that are played back."""
+    cases = tomllib.loads((HERE / "cases.toml").read_text(encoding="utf-8"))
+    runs = {}
+    for name in PLAYED:
+        with tempfile.TemporaryDirectory() as folder:
+            runs[name] = played(cases[name], Path(folder))
+        print(name, {n: round(float(np.ptp(v)), 4) for n, v in runs[name].items()}, flush=True)
+    known = {"andes": andes.__version__, "table": TABLE, "lags": LAGS, "times": TIMES.tolist(), "cases": runs}
+    write(HERE / "playback_andes.json", known)
+
+
+def write(path: Path, known: dict[str, Any]) -> None:
+    """Write numbers with nine digits."""
+    rounded = json.loads(json.dumps(known), parse_float=lambda x: float(f"{float(x):.9g}"))
+    path.write_text(json.dumps(rounded) + "\n", encoding="utf-8")
+
+
 def main(names: list[str]) -> None:
     """Write the numbers of the named cases, or of all."""
     cases = tomllib.loads((HERE / "cases.toml").read_text(encoding="utf-8"))
@@ -199,9 +290,8 @@ def main(names: list[str]) -> None:
         print(name, len(found["eigenvalues"]), list(found["responses"]), flush=True)
         known |= {"andes": andes.__version__, "steps": STEPS, "times": TIMES.tolist()}
         known["cases"] = {n: known["cases"][n] for n in cases if n in known["cases"]}
-        rounded = json.loads(json.dumps(known), parse_float=lambda x: float(f"{float(x):.9g}"))
-        path.write_text(json.dumps(rounded) + "\n", encoding="utf-8")
+        write(path, known)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    playback() if sys.argv[1:] == ["playback"] else main(sys.argv[1:])
