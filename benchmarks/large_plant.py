@@ -1,4 +1,4 @@
-"""What a plant of 63 states costs, beside the link's figures.
+"""Times of a plant of 63 states, beside those of the link.
 
     python benchmarks/large_plant.py
 
@@ -34,7 +34,7 @@ UNITS = {"steam": "sexs", "reheat": "ieeeg1", "hydro": "hygov"}
 """By unit: the case whose governor it has. Machine and stabiliser are those of `ieeest`, the exciter that of `exst1`."""
 POWERS = {"steam": 80.0, "reheat": 60.0, "hydro": 70.0}
 VOLTAGES = {"steam": 1.02, "reheat": 1.01, "hydro": 1.02}
-"""What the units deliver, MW, and their terminal voltages, pu."""
+"""Powers of the units, MW, and their terminal voltages, pu."""
 SPEED = {"steam": "Pref", "reheat": "Pref", "hydro": "nref"}
 """The reference of each unit's governor."""
 GAINS = ("steam.gen.H", "steam.avr.KA", "steam.pss.KS", "reheat.gov.K", "hydro.gov.R")

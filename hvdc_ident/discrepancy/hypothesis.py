@@ -195,18 +195,32 @@ class Refit:
         added = {n for p in self.placed for n in p.names.values()}
         return [k for k, f in enumerate(self.problem.free) if f.name not in added]
 
+    def _runs_with(self, tolerance: Tolerance) -> list[Statistics]:
+        """Return the statistics of a run of each fitted experiment; none of a model that is closed inside and steps as it likes."""
+        if not isinstance(self.model, Model):
+            return []
+        plain = [e.with_(measured=None) for e in self.problem.fitted_experiments]
+        return [simulate(self.model, e, self.values, tolerance=tolerance).statistics for e in plain]
+
     @cached_property
     def _runs(self) -> list[Statistics]:
-        """What a run of each fitted experiment costs."""
-        experiments = self.problem.fitted_experiments
-        return [simulate(self.model, e.with_(measured=None), self.values, tolerance=PATIENCE).statistics for e in experiments]
+        return self._runs_with(PATIENCE)
+
+    @cached_property
+    def _slides(self) -> bool:
+        """Return True where the model slides by itself: candidates on it have to, too."""
+        try:
+            self._runs_with(replace(PATIENCE, slides=False))
+        except SimulationError:
+            return True
+        return False
 
     @cached_property
     def patience(self) -> Tolerance:
         """Tolerance of the runs of a model with more than this one has, with the steps that they may take."""
         own = max((s.accepted + s.rejected for s in self._runs), default=0)
         rows = max((e.time.size for e in self.problem.fitted_experiments), default=0)
-        return replace(PATIENCE, max_steps=OWN * own + BETWEEN * rows)
+        return replace(PATIENCE, max_steps=OWN * own + BETWEEN * rows, slides=self._slides)
 
     @property
     def method(self) -> Method:

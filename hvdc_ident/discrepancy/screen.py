@@ -176,7 +176,7 @@ class Bench:
     @property
     def haste(self) -> Tolerance:
         """Tolerance of the runs of a first look."""
-        return replace(HASTE, max_steps=self.patience.max_steps)
+        return replace(HASTE, max_steps=self.patience.max_steps, slides=self.patience.slides)
 
     def movable(self, form: Form) -> Movable:
         """Return the model with an effect of this form, at one place, to be moved. It has to be one with equations."""

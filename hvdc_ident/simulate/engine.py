@@ -32,8 +32,8 @@ class Tolerance:
     """Error control: relative and absolute tolerance (states' own units) per step, and the step budget of one run.
 
     search: whether a steady start that Newton's method does not find at once is looked for by slower means. brief: whether the model
-    has few runs to come: its machine code is then made in a fraction of the time, and takes longer to run; a run that slides along the
-    surface of a switch, for which more would have to be compiled, chatters.
+    has few runs to come: its machine code is then made in a fraction of the time, and takes longer to run. slides: whether a run may slide
+    along the surface of a switch, for which more has to be compiled; one that may not chatters there.
     """
 
     rtol: float = 1e-8
@@ -41,6 +41,7 @@ class Tolerance:
     max_steps: int = 200_000
     search: bool = True
     brief: bool = False
+    slides: bool = True
 
 
 def check_times(model: Model, times: Array) -> None:
@@ -74,7 +75,8 @@ class _Equations:
         self._second = [np.zeros(0, dtype=np.int64)] * 2
 
     def head(self, rosenbrock: bool) -> Integers:
-        """What a run's record has of these equations, (HEAD,) integers: sizes and addresses, which live as long as this object.
+        """Return the part of a run's record that describes these equations, (HEAD,) integers: sizes, and addresses that live as long as
+        this object.
 
         The code that only the Rosenbrock method needs is compiled when it is first asked for.
         """
@@ -203,7 +205,7 @@ class Engine:
         while True:
             state, heads, work = self._state(not explicit)
             span = np.array([begin, end])
-            state[self._max_steps], state[self._slides_too] = tolerance.max_steps, not tolerance.brief
+            state[self._max_steps], state[self._slides_too] = tolerance.max_steps, tolerance.slides
             status = self._integrate(state, work, span, allowed, y, w, p, constants, *tables, t_out, out, sizes, heads)
             if STATUSES[status] == "stiff" and method in ("auto", "nonstiff"):
                 explicit = False
