@@ -374,7 +374,8 @@ def without_common(times: Sequence[Array], records: Sequence[Array]) -> list[Arr
     """
     if len(records) < 2:
         return list(records)
-    step = float(np.median(np.diff(times[0])))
+    # The shortest step: of records with gaps a longer one would put two rows at one place.
+    step = min(float(np.diff(t).min()) for t in times)
     places = [np.round(t / step).astype(int) for t in times]
     shared = reduce(np.intersect1d, places)
     alike = [

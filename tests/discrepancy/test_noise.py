@@ -58,6 +58,15 @@ def test_a_sine_of_common_phase_is_no_noise_and_noise_is_no_sine() -> None:
     assert all(np.array_equal(a, b) for a, b in zip(without_common(times, noise), noise, strict=True))
 
 
+def test_records_of_which_most_rows_are_missing_are_compared_at_the_rows_that_they_share() -> None:
+    random = np.random.default_rng(4)
+    rows = [np.arange(0, 120, 2), np.sort(random.choice(120, 90, replace=False))]
+    tone = 3.0 * np.sin(2 * np.pi * 17.0 * TIME[:120] + 0.4)
+    left = without_common([TIME[k] for k in rows], [tone[k] + random.standard_normal(k.size) for k in rows])
+    assert len(left) == 1 and left[0].size == np.intersect1d(*rows).size
+    assert np.std(left[0]) == pytest.approx(1.0, abs=0.25)
+
+
 SWING = np.arange(800) * 0.01
 """Instants of a record that swings from its beginning, s; its input jumps at 4 s."""
 
