@@ -153,7 +153,7 @@ class Refit:
 
     chi2: sum of squared residuals (`ResidualBlock.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
     holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press:
-    the same for parts of the fitted ones predicted from the rest. std: standard deviation of each free parameter, of the
+    the root mean score of parts of the fitted ones predicted from the rest. std: standard deviation of each free parameter, of the
     effects and of the model, by its name in the model. apart: of each effect, by how many standard deviations its parameters
     together are off doing nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
     """
@@ -447,35 +447,49 @@ def held_out(problem: Problem, theta: Array) -> tuple[ResidualBlock, ...] | None
 
 
 def press(blocks: Sequence[ResidualBlock], parts: int = 4) -> float | None:
-    """Root mean square of each part's residuals predicted from the others, to first order (Allen's PRESS, by blocks).
+    """Return the root mean score of each part of the residuals predicted from the others, in noise units; None where nothing can be
+    left out.
 
-    Parts: experiments; of a single one, stretches of its rows. None where nothing can be left out.
+    Parts: experiments; of a single one, stretches of its rows. The score of a part is -2 log p of its rows under the model fitted
+    to the others (to first order, Gaussian), less that of noise alone: e' S^-1 e + log det S with the prediction error e and its
+    covariance S = I + J C J'. C is that of the unknowns by the other parts and a prior that is worth one row of all data (unit
+    information, Kass and Wasserman 1995, of which BIC is the logarithm), for one part may be the only one that tells an unknown.
     """
-    names = list(dict.fromkeys(b.experiment for b in blocks))
-    pieces: list[tuple[Array, Array]] = []
-    if len(names) > 1:
-        for n in names:
-            own = [b for b in blocks if b.experiment == n]
-            pieces.append((np.concatenate([b.residual for b in own]), np.vstack([b.jacobian for b in own])))
-    else:
-        for k in range(parts):
-            cut = [slice(k * b.residual.size // parts, (k + 1) * b.residual.size // parts) for b in blocks]
-            pieces.append(
-                (
-                    np.concatenate([b.residual[c] for b, c in zip(blocks, cut, strict=True)]),
-                    np.vstack([b.jacobian[c] for b, c in zip(blocks, cut, strict=True)]),
-                )
-            )
-    matrix = sum(j.T @ j for _, j in pieces)
+    pieces = _parts(blocks, parts)
+    rows = sum(r.size for r, _ in pieces)
+    if not rows:
+        return None
+    matrix = np.asarray(sum(j.T @ j for _, j in pieces))
     d = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-    total, rows = 0.0, 0
+    information, directions = np.linalg.eigh(matrix / np.outer(d, d))
+    told = information > 1e-9 * max(information[-1], 1e-300) if information.size else information > 0
+    scaled = directions[:, told] / np.sqrt(information[told]) / d[:, None]  # in these coordinates all data have information I
+    whole = 1.0 + 1.0 / rows
+    score = 0.0
     for r, j in pieces:
-        rest = (matrix - j.T @ j) / np.outer(d, d)
-        shift = np.linalg.lstsq(rest, (j.T @ r) / d, rcond=1e-9)[0] / d
-        predicted = r + j @ shift
-        total, rows = total + float(predicted @ predicted), rows + r.size
+        slopes = j @ scaled
+        gradient, rest = slopes.T @ r, whole * np.eye(slopes.shape[1]) - slopes.T @ slopes
+        error = r + slopes @ np.linalg.solve(rest, gradient)
+        pulled = slopes.T @ error
+        spread = slopes.shape[1] * np.log(whole) - np.linalg.slogdet(rest)[1]
+        score += float(error @ error - pulled @ pulled / whole + spread)
     spare = sum(b.spare * b.residual.size for b in blocks)
-    return float(np.sqrt((total + spare) / rows)) if rows else None
+    return float(np.sqrt((score + spare) / rows))
+
+
+def _parts(blocks: Sequence[ResidualBlock], parts: int) -> list[tuple[Array, Array]]:
+    """Return the residuals and their Jacobian of each experiment; of a single one, of stretches of its rows."""
+    names = list(dict.fromkeys(b.experiment for b in blocks))
+    if len(names) > 1:
+        cuts = [[(b, slice(None)) for b in blocks if b.experiment == n] for n in names]
+    else:
+        ends = [(k / parts, (k + 1) / parts) for k in range(parts)]
+        cuts = [
+            [(b, slice(int(low * b.residual.size), int(high * b.residual.size))) for b in blocks] for low, high in ends
+        ]
+    return [
+        (np.concatenate([b.residual[c] for b, c in cut]), np.vstack([b.jacobian[c] for b, c in cut])) for cut in cuts
+    ]
 
 
 def signal(refit: Refit, place: str) -> dict[str, Array]:
