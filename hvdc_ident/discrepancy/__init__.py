@@ -5,15 +5,15 @@ of one diagnosis through the modules:
 
     nominal                 the model without effects at its own best, and the noise of the records
     candidates, movable     every effect at every place in a few sizes; an effect compiled once whose place is chosen at run time
-    screen, stand           all of them simulated, with the parameters' answer; the best refitted in a race
+    screen, rounds          all of them simulated, with the parameters' answer; the best refitted in a race
     hypothesis, evidence    effects with sizes and the model's parameters, refitted together; what that gains and leaves
-    met                     sizes that no slope leads to: levels of a quantiser, periods of a sampler
+    size_search             sizes that no slope leads to: levels of a quantiser, periods of a sampler
     search                  one effect after the other, each looked for again beside the others, or done without
     moves                   parameters that were held, and clocks, set free where the records speak against their values
     forms                   what is tried where no effect of the catalogue explains the records
     classes, implied        effects that are one equation, wherever they are, and the values of the parameters that they imply
     pushes, remainder       what any effect at an insertion point could explain, and what of it is left
-    verdict, findings       what is told, in sentences (explain, stand_ins), of what is where (location, residual_checks)
+    verdict, findings       what is said, in sentences (explain, stand_ins), of what is where (location, residual_checks)
     diagnosis, result       the verb and its result
 """
 

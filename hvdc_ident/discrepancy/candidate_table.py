@@ -6,11 +6,11 @@ import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.evidence import CandidateFit
-from hvdc_ident.discrepancy.hypothesis import unseen
+from hvdc_ident.discrepancy.hypothesis import prediction_error
 from hvdc_ident.discrepancy.result import Line
-from hvdc_ident.discrepancy.screen import Shot
+from hvdc_ident.discrepancy.rounds import LEFT_BEHIND, Round
+from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.discrepancy.search import SearchOutcome
-from hvdc_ident.discrepancy.stand import BEHIND, Round
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -28,17 +28,24 @@ def lines(outcome: SearchOutcome) -> tuple[Line, ...]:
 
 
 def _line(
-    r: Round, k: int, c: CandidateEffect, shot: Shot | None, trial: CandidateFit | None, number: int, *, absorbed: bool
+    r: Round,
+    k: int,
+    c: CandidateEffect,
+    score: Score | None,
+    trial: CandidateFit | None,
+    number: int,
+    *,
+    absorbed: bool,
 ) -> Line:
     status = f"failed: {r.screen.failures[k]}" if k in r.screen.failures else "not-excited"
-    score, values, delta, hold = 0.0, FrozenMap[float](), None, None
-    if shot is not None:
-        score, values = max(shot.fall, 0.0), c.probes[shot.probe].values
+    fall, values, delta, hold = 0.0, FrozenMap[float](), None, None
+    if score is not None:
+        fall, values = max(score.fall, 0.0), c.probes[score.probe].values
         excited = any(r.screen.usable(column) for column in r.screen.size if column[0] == k)
         status = "absorbed" if absorbed else "screened" if excited else "not-excited"
-    if trial is not None and trial.refit.failure != BEHIND:
+    if trial is not None and trial.refit.failure != LEFT_BEHIND:
         status = f"failed: {trial.refit.failure}" if trial.refit.failure else "refitted"
         if not trial.refit.failure:
-            delta, hold = trial.gain, unseen(trial.refit)
+            delta, hold = trial.gain, prediction_error(trial.refit)
             values = FrozenMap(trial.refit.sizes(trial.refit.placed[-1]))
-    return Line(c.effect, c.at, score, r.screen.p(score), status, values, delta, hold, c.source, number)
+    return Line(c.effect, c.at, fall, r.screen.p(fall), status, values, delta, hold, c.source, number)

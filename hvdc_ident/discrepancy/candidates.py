@@ -29,11 +29,11 @@ from hvdc_ident.model import AnyModel, Model, insertion_point
 Signals = Mapping[str, tuple[Array, ...]]
 """By place: the signal in each fitted experiment."""
 
-ROOM = 0.1
+BOUND_MARGIN = 0.1
 """Share of a size that its bounds leave it, at least."""
-SAME = 1e-9
+EQUAL = 1e-9
 """Of their size: by how much two signals may differ that are one, as a source."""
-STILL = 1e-9
+MOTIONLESS = 1e-9
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class CandidateEffect:
                 continue
             known.add(own)
             free = {
-                n: (min(low, own[n] - ROOM * abs(own[n])), max(high, own[n] + ROOM * abs(own[n])))
+                n: (min(low, own[n] - BOUND_MARGIN * abs(own[n])), max(high, own[n] + BOUND_MARGIN * abs(own[n])))
                 for n, (low, high) in model.free.items()
             }
             probes.append(Probe(self.effect, own, FrozenMap(free)))
@@ -121,7 +121,7 @@ def candidates(
     found: list[CandidateEffect] = []
     for at in groups:
         joined = SignalScales.joined([about[p] for p in at])
-        still = joined.high - joined.low <= STILL * max(joined.peak, STILL)
+        still = joined.high - joined.low <= MOTIONLESS * max(joined.peak, MOTIONLESS)
         kinds = {kind_of(model, p) for p in at}
         for effect in tried:
             if not kinds <= set(effect.insertion_kinds):
@@ -196,7 +196,7 @@ LETTERS = {"voltage": "VvUE", "current": "Ii", "power": "PS", "reactive power": 
 
 
 def quantity(model: AnyModel, place: str) -> str:
-    """Return what a signal is, by its unit, or in per unit by the letter that its name begins with; empty where neither tells."""
+    """Return what a signal is, by its unit, or in per unit by the letter that its name begins with; empty where neither says."""
     kind, name = kind_of(model, place), place.removeprefix("outputs.")
     sections: Any = {
         "input": "inputs",
@@ -224,7 +224,7 @@ def leaks(model: AnyModel, at: Sequence[str], source: str) -> bool:
 
 
 def own_sources(at: Sequence[str], brought: Sequence[str], known: Collection[str]) -> list[tuple[str, ...]]:
-    """By place what an effect brings in: any signal at one place; at one slot of each of several stations, told by a number
+    """By place what an effect brings in: any signal at one place; at one slot of each of several stations, distinguished by a number
     in its name, the same signal of each station. known: signals there are, of which some are not worth bringing in alone.
     """
     if len(at) == 1:
@@ -244,7 +244,7 @@ def proportional(a: Sequence[Array], b: Sequence[Array]) -> bool:
     """Return True where one signal is the other times a number, in all experiments."""
     u, v = np.concatenate(a), np.concatenate(b)
     across = u * float(np.linalg.norm(v)) - float(np.sign(u @ v)) * v * float(np.linalg.norm(u))
-    return bool(np.linalg.norm(across) <= STILL * max(float(np.linalg.norm(u) * np.linalg.norm(v)), STILL))
+    return bool(np.linalg.norm(across) <= MOTIONLESS * max(float(np.linalg.norm(u) * np.linalg.norm(v)), MOTIONLESS))
 
 
 def additive(effect: Effect) -> bool:
@@ -319,10 +319,10 @@ def source_signals(model: AnyModel, signals: Signals) -> tuple[str, ...]:
     for p in order:
         whole = np.concatenate([v - v[0] for v in signals[p]])
         size = float(np.linalg.norm(whole))
-        if size <= STILL * max(1.0, float(np.abs(np.concatenate(signals[p])).max())):
+        if size <= MOTIONLESS * max(1.0, float(np.abs(np.concatenate(signals[p])).max())):
             continue
         shape = whole / size
-        if any(np.linalg.norm(shape - np.sign(shape @ s) * s) < SAME for s in shapes):
+        if any(np.linalg.norm(shape - np.sign(shape @ s) * s) < EQUAL for s in shapes):
             continue
         kept.append(p)
         shapes.append(shape)

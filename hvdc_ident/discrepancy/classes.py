@@ -1,4 +1,4 @@
-"""Which candidates explain the data as well as the one that was put in, and what would tell them apart."""
+"""Which candidates explain the data as well as the one that was put in, and what would distinguish them."""
 
 from __future__ import annotations
 
@@ -11,33 +11,41 @@ from typing import TypeVar
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, at_edge, behinds, best_gain, evidence_between
+from hvdc_ident.discrepancy.evidence import (
+    CandidateFit,
+    Ruler,
+    at_edge,
+    best_gain,
+    deficits,
+    evidence_between,
+    same_answers,
+)
 from hvdc_ident.discrepancy.forms import expression
-from hvdc_ident.discrepancy.hypothesis import Refit, unseen
+from hvdc_ident.discrepancy.hypothesis import Refit, prediction_error
 from hvdc_ident.discrepancy.implied import TIED, apart, implied, nearest, off_given
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.result import Hypothesis, Rival
+from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.discrepancy.search import SearchOutcome
-from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 
-SLIGHT = 1e-3
+SLIGHT_SHARE = 1e-3
 """Share of what a form explains by which a formula may explain more and not refute it: of so much the noise is not known."""
-MISSED = 0.15
+UNNOTICED_SHARE = 0.15
 """Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
 
 
 def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True) -> tuple[Rival, ...]:
     """The winner and every candidate within delta BIC of it, the best first, and those that are the same equation or do the same.
 
-    What does the same within the tolerance, with no parameter more, is told however far behind it is: no model is right to
+    What does the same within the tolerance, with no parameter more, is listed however far behind it is: no model is right to
     the last unit of evidence.
     tries: whether an effect is one of those that are looked for.
     """
     assert found.winner is not None and found.ruler is not None
-    behind_by = behinds(found.trials)
+    behind_by = deficits(found.trials)
     # One that explains as much is no nothing, even where gains make good any size of it; one at its edge is another's work.
     sound = [t is found.winner or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
     # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
@@ -53,7 +61,7 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
         rival = Rival(c.effect, c.at, behind, sizes, c.source, values=values, off_given=off)
         if good and behind <= options.set_bic + (found.ruler.price if spared else 0.0):
             group.append(rival)
-        elif good and more <= 0 and trial.told >= (1.0 - TOLERANCE) * found.winner.told:
+        elif good and more <= 0 and trial.total_gain >= (1.0 - TOLERANCE) * found.winner.total_gain:
             further.append(rival)
     group += _unfitted(found, best_gain(found.trials), options)
     group += _at_rest(found, group)
@@ -65,12 +73,12 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
         if r.same_as:
             same[r.effect, r.at, r.source] = r.same_as
     count = Counter(c.effect for c in found.candidates)
-    told = [replace(r, same_as=same.get(key, "")) for key, r in each.items()]
+    within = [replace(r, same_as=same.get(key, "")) for key, r in each.items()]
     further = [r for r in further if (r.effect, r.at, r.source) not in each]
-    akin = _akin(found, told, further)
-    whole = [replace(r, akin=a) for r, a in zip([*told, *further], akin, strict=True)]
+    akin = _akin(found, within, further)
+    whole = [replace(r, akin=a) for r, a in zip([*within, *further], akin, strict=True)]
     return tuple(
-        replace(r, prior=1.0 / max(count[r.effect], 1)) for k, r in enumerate(whole) if k < len(told) or r.akin
+        replace(r, prior=1.0 / max(count[r.effect], 1)) for k, r in enumerate(whole) if k < len(within) or r.akin
     )
 
 
@@ -100,7 +108,7 @@ def _akin(found: Round, group: Sequence[Rival], further: Sequence[Rival] = ()) -
             and other is not None
             and q.at == r.at
             and q.effect != r.effect
-            and alike(one, other, found.before)
+            and same_answers(one, other, found.before)
         )
         akin.append(next(earlier, ""))
     return akin
@@ -113,7 +121,7 @@ def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) 
     assert found.winner is not None and found.ruler is not None
     best = found.candidates[found.winner.pick.candidate]
     one, two = effects()[best.effect], effects()[other.effect]
-    weak = found.winner.gain * MISSED**2 < options.set_bic + found.ruler.price
+    weak = found.winner.gain * UNNOTICED_SHARE**2 < options.set_bic + found.ruler.price
     delays = one.equivalent_delay is not None and two.equivalent_delay is not None and one.name not in two.generalises
     return other.at == best.at and (weak or delays)
 
@@ -122,13 +130,13 @@ def formula_rivals(
     found: Round, formulas: Sequence[tuple[CandidateFit, float]], options: DiagnosisOptions
 ) -> tuple[float, tuple[Rival, ...]]:
     """By how much the winner is behind the best formula outside the catalogue, in BIC, and the formulas that are near it; infinite
-    where one is further ahead than they can be told apart.
+    where one is further ahead than they can be distinguished.
 
     formulas: refitted in the winner's stead, each with its prior; none is near of which that is 0.
     """
     assert found.winner is not None
-    own, *behind = behinds([found.winner, *(t for t, _ in formulas)])
-    within = max(options.set_bic, SLIGHT * found.winner.told)
+    own, *behind = deficits([found.winner, *(t for t, _ in formulas)])
+    within = max(options.set_bic, SLIGHT_SHARE * found.winner.total_gain)
     if own > within:
         return np.inf, ()
     near = [
@@ -153,15 +161,15 @@ def _unfitted(found: Round, best: float, options: DiagnosisOptions) -> list[Riva
     assert found.ruler is not None
     done = {t.pick.candidate for t in (*found.trials, *found.failed)}
     group = []
-    for k, shot in found.screen.best().items():
+    for k, score in found.screen.best().items():
         c = found.candidates[k]
-        if k in done or shot.probe >= len(c.probes) or not in_proportion(c, shot.probe):
+        if k in done or score.probe >= len(c.probes) or not in_proportion(c, score.probe):
             continue
-        probe = c.probes[shot.probe]
-        behind = best - found.ruler.gain(shot.fall, 0.0, len(probe.free))
+        probe = c.probes[score.probe]
+        behind = best - found.ruler.gain(score.fall, 0.0, len(probe.free))
         if behind <= options.set_bic:
             only = dict(probe.values) if len(probe.free) == 1 else {}
-            sizes = FrozenMap({n: shot.factor * v if n in probe.free else v for n, v in only.items()})
+            sizes = FrozenMap({n: score.factor * v if n in probe.free else v for n, v in only.items()})
             group.append(Rival(c.effect, c.at, max(behind, 0.0), sizes, c.source, refitted=False))
     return group
 
@@ -191,17 +199,17 @@ def _equal(found: Round, group: Sequence[Rival], tries: Callable[[str], bool]) -
     for r, other, equality in known:
         own = [s for s in split_sources(r.source, r.at) if s in found.signals]
         brought = [u for s in own for u in found.signals[s]] or [np.empty(0)]
-        told = [equality(r.parameters, signal) if r.parameters or not r.refitted else None for signal in brought]
-        if all(t is not None for t in told):
-            sizes = FrozenMap(told[0] or {})
+        equal_sizes = [equality(r.parameters, signal) if r.parameters or not r.refitted else None for signal in brought]
+        if all(t is not None for t in equal_sizes):
+            sizes = FrozenMap(equal_sizes[0] or {})
             equal.append(replace(r, effect=other, parameters=sizes, refitted=False, same_as=r.effect, akin=""))
     return equal
 
 
 CERTAIN = 0.95
 """Probability of an effect class from which it is named."""
-TOLD = 20
-"""Hypotheses that are told, the likeliest."""
+MAX_HYPOTHESES = 20
+"""Hypotheses in the result at most, the likeliest."""
 
 
 @dataclass(frozen=True)
@@ -314,11 +322,11 @@ def compared(first: Refit, outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
     }
     most = max(evidence.values())
     total = sum(np.exp(v - most) for v in evidence.values())
-    order = sorted(evidence, key=lambda k: -evidence[k])[:TOLD]
+    order = sorted(evidence, key=lambda k: -evidence[k])[:MAX_HYPOTHESES]
     return tuple(_hypothesis(k, refits[k], evidence[k], float(np.exp(evidence[k] - most) / total)) for k in order)
 
 
 def _hypothesis(names: tuple[str, ...], refit: Refit, evidence: float, probability: float) -> Hypothesis:
     sizes = tuple(FrozenMap(refit.sizes(p)) for p in refit.placed)
     values = FrozenMap({n: size.value for n, size in implied(refit).items()})
-    return Hypothesis(names, evidence, unseen(refit), probability, sizes, values)
+    return Hypothesis(names, evidence, prediction_error(refit), probability, sizes, values)

@@ -14,20 +14,20 @@ from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.candidate_table import lines
 from hvdc_ident.discrepancy.candidates import entries
 from hvdc_ident.discrepancy.classes import compared
-from hvdc_ident.discrepancy.evidence import all_far, louder_than_noise
+from hvdc_ident.discrepancy.evidence import all_far_from_noise, louder_than_noise
 from hvdc_ident.discrepancy.explain import at_given, beside_stand_ins, found_of, gap, off_given
 from hvdc_ident.discrepancy.findings import separating
-from hvdc_ident.discrepancy.forms import Told, course, described, standing, tried
+from hvdc_ident.discrepancy.forms import DescribedForm, best_form, described, disturbance_course, refitted_forms
 from hvdc_ident.discrepancy.hypothesis import Refit, judged
 from hvdc_ident.discrepancy.location import localise, responses
-from hvdc_ident.discrepancy.moves import clocks, stated, told
+from hvdc_ident.discrepancy.moves import clock_sentence, clocks, stated
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect, StandIn
-from hvdc_ident.discrepancy.screen import UNTRIED as NOT_BEGUN
-from hvdc_ident.discrepancy.search import SearchOutcome, from_either_side
-from hvdc_ident.discrepancy.stand import Round
+from hvdc_ident.discrepancy.rounds import Round
+from hvdc_ident.discrepancy.screen import NOT_TRIED as NOT_BEGUN
+from hvdc_ident.discrepancy.search import SearchOutcome, two_start_search
 from hvdc_ident.discrepancy.stand_ins import stand_ins
 from hvdc_ident.discrepancy.verdict import (
     Conclusion,
@@ -77,17 +77,17 @@ def diagnose(
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """Return what the model lacks, as far as the data tell: the effect with its place and size, the model with it, and the gap.
+    """Return what the model lacks, as far as the data show: the effect with its place and size, the model with it, and the gap.
 
     subject: a model; or anything that can be simulated, with effects at its inputs and outputs only.
     experiments: with measured outputs; those of role "holdout" judge, the others are fitted. parameters: what may be
-    fitted, with start and bounds, and with the given value, which the results are told against. effects: names of the catalogue
+    fitted, with start and bounds, and with the given value, with which the results are compared. effects: names of the catalogue
     to try, "all" beside others for what is tried by default. places: slots to try them at, a tuple for one effect at several
     slots with shared parameters (default:
     every slot, and families of like slots).
     tolerance: by output, an error (in its unit) below which a gap is of no interest. held: values of other parameters.
     report: `IdentifiabilityReport.to_dict()` of these data, whose identifiable set is fitted; without one, the set that
-    the sensitivities at the pilot fit can tell apart.
+    the sensitivities at the pilot fit can distinguish.
 
     Raises StudyError or UnknownNameError where there is nothing to diagnose, SimulationError where the nominal model
     cannot be run.
@@ -109,7 +109,7 @@ def diagnose(
     first = judged(Refit(model, (), start.problem, start.noise, start.theta))
     held_now = tuple(f for f in free if f.name not in first.problem.names)
     search = replace(search, held=held_now, stated=stated(model, free), records=first.problem.experiments)
-    outcome = from_either_side(search, first)
+    outcome = two_start_search(search, first)
     judgement = judge(search, first, outcome)
     if search.spent and outcome.kept:
         notes = (*notes, UNTESTED)
@@ -130,16 +130,16 @@ def diagnose(
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
 
 
-def _outside(search: SearchContext, opened: Round) -> Told:
+def _outside(search: SearchContext, opened: Round) -> DescribedForm:
     """Return the form outside the catalogue that explains most of the gap, or what is missing over time where none stands."""
-    forms = tried(search, opened) if opened.forms is None else opened.forms
-    form = standing(search, opened, forms)
-    return course(search, opened) if form is None else described(form)
+    forms = refitted_forms(search, opened) if opened.forms is None else opened.forms
+    form = best_form(search, opened, forms)
+    return disturbance_course(search, opened) if form is None else described(form)
 
 
 def _left_out(first: Refit, found: Round) -> int:
     """Return how many candidates of a round were not refitted, where those that were leave more than anybody asks about; else 0."""
-    if not found.significant or not all_far(first, found.trials):
+    if not found.significant or not all_far_from_noise(first, found.trials):
         return 0
     tried = {t.pick.candidate for t in (*found.trials, *found.failed)}
     return len(set(found.screen.best()) - tried)
@@ -176,7 +176,7 @@ def _assembled(
     first: Refit,
     outcome: SearchOutcome,
     judgement: Conclusion,
-    other: Told | None,
+    other: DescribedForm | None,
     free: tuple[FitParameter, ...],
     notes: tuple[str, ...],
 ) -> Diagnosis:
@@ -211,7 +211,7 @@ def _assembled(
     if search.spent and not in_place:
         text = f"{text} {UNFINISHED}"
     if off := clocks(search, last):
-        text = f"{text} {told(off)}"
+        text = f"{text} {clock_sentence(off)}"
     if louder := contradiction(model, first.noise, LOUDER):
         text = f"{text} {louder}"
     notes = (*notes, *filter(None, [contradiction(model, first.noise, QUIETER)]))

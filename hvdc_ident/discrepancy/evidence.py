@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.discrepancy.hypothesis import Refit, held_out, held_out_by_record, unseen
+from hvdc_ident.discrepancy.hypothesis import Refit, held_out, held_out_by_record, prediction_error
 from hvdc_ident.discrepancy.implied import TIED, off_given
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
-from hvdc_ident.discrepancy.residual_checks import loud_after_breaks, residual_tests
+from hvdc_ident.discrepancy.residual_checks import is_louder_after_breaks, residual_tests
 from hvdc_ident.effects import effects
 from hvdc_ident.fit.noise import SURE, freedom_of
 from hvdc_ident.text import figures, percentage
 
-CLEARLY = 30.0
+CLEAR_CHI2 = 30.0
 """In BIC: from where held-out data speak clearly against a candidate, whatever the fitted ones say. With a smaller squared
 difference of their answers, in noise units, two models are one to these data."""
-CLEAR = 2.0
+CLEAR_DEVIATIONS = 2.0
 """Standard deviations by which an effect has to be off doing nothing."""
 
 
@@ -46,25 +46,28 @@ class CandidateFit:
     evidence: float | None = None
 
     @property
-    def told(self) -> float:
+    def total_gain(self) -> float:
         """Evidence of all data for it, as far as that is known, in BIC."""
         return self.gain if self.evidence is None else self.evidence
 
 
-def behinds(trials: Sequence[CandidateFit]) -> list[float]:
+def deficits(trials: Sequence[CandidateFit]) -> list[float]:
     """By how much each is behind the best, in BIC: on all data together; or on the fitted ones, where that is less and the
     held-out ones do not speak clearly against it, for a difference of a few units there is not known better than the noise.
 
     On the fitted ones the best is the best of those that the held-out ones do not speak clearly against either.
     """
-    told, gain = max((t.told for t in trials), default=0.0), best_gain(trials)
-    return [min(gain - t.gain, told - t.told) if told - t.told < CLEARLY else told - t.told for t in trials]
+    best, gain = max((t.total_gain for t in trials), default=0.0), best_gain(trials)
+    return [
+        min(gain - t.gain, best - t.total_gain) if best - t.total_gain < CLEAR_CHI2 else best - t.total_gain
+        for t in trials
+    ]
 
 
 def best_gain(trials: Sequence[CandidateFit]) -> float:
     """The largest gain of those that the held-out data do not speak clearly against."""
-    told = max((t.told for t in trials), default=0.0)
-    return max((t.gain for t in trials if told - t.told < CLEARLY), default=0.0)
+    best = max((t.total_gain for t in trials), default=0.0)
+    return max((t.gain for t in trials if best - t.total_gain < CLEAR_CHI2), default=0.0)
 
 
 @dataclass(frozen=True)
@@ -95,9 +98,9 @@ class Ruler:
         return float(np.log(self.effective))
 
 
-def clear(refit: Refit, which: int) -> bool:
+def is_clear(refit: Refit, which: int) -> bool:
     """Return True where the parameters of an effect together are clearly off neutral."""
-    return refit.apart[which] > CLEAR
+    return refit.apart[which] > CLEAR_DEVIATIONS
 
 
 def at_edge(refit: Refit, which: int) -> bool:
@@ -141,7 +144,7 @@ def level_error(refit: Refit) -> float:
     return float(np.sqrt(2.0 / freedom_of(refit.noise, refit.problem.outputs)))
 
 
-STEP = 0.05
+LEAST_STEP = 0.05
 """Share of the gap that a second effect has to take away at least."""
 
 
@@ -164,16 +167,18 @@ def objections(
         return f"its score is what noise gives somewhere (p = {p:.2g})"
     if not trial.gain > options.named_bic:
         return f"it gains {trial.gain:.3g} in BIC, {options.named_bic:g} would be needed"
-    if at_edge(refit, last) or not clear(refit, last):
-        return "its size cannot be told from nothing"
-    was, now = unseen(before), unseen(refit)
+    if at_edge(refit, last) or not is_clear(refit, last):
+        return "its size cannot be distinguished from none"
+    was, now = prediction_error(before), prediction_error(refit)
     if was is None or now is None:
         return "nothing can be left out to judge it by"
     # Records that an effect does not move are better or worse by the noise they hold.
-    if not now < was and ((now**2 - was**2) * unseen_rows(refit) > options.named_bic or not silent(before, refit)):
+    if not now < was and (
+        (now**2 - was**2) * unseen_rows(refit) > options.named_bic or not leaves_holdout_alone(before, refit)
+    ):
         pooled = f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
-        return speaks_against(before, refit) or pooled
-    tables = (worst(before), worst(refit)) if tolerance else None
+        return worst_held_out_record(before, refit) or pooled
+    tables = (largest_rmse(before), largest_rmse(refit)) if tolerance else None
     fitted = (float(np.sqrt(before.chi2 / refit.rows)), float(np.sqrt(refit.chi2 / refit.rows)))
     if not material_gap(was, now, options.holdout_share, tolerance, tables):
         # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, or to have
@@ -182,12 +187,13 @@ def objections(
         then, since = as_recorded(before), as_recorded(refit)
         gaps = (fitted, *((then.get(role), since.get(role)) for role in ("fit", "holdout")))
         shown = not tolerance and any(material_gap(*gap, options.holdout_share, None, None) for gap in gaps)
-        if not (shown and ((was**2 - now**2) * unseen_rows(refit) > options.named_bic or silent(before, refit))):
+        if not (
+            shown
+            and ((was**2 - now**2) * unseen_rows(refit) > options.named_bic or leaves_holdout_alone(before, refit))
+        ):
             return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
-    if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < STEP:
-        return (
-            f"it closes less than {percentage(STEP)} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
-        )
+    if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < LEAST_STEP:
+        return f"it closes less than {percentage(LEAST_STEP)} of what is left ({was:.4g} to {now:.4g} in noise units, held out)"
     return ""
 
 
@@ -197,21 +203,21 @@ def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> fl
     more: parameters that the second has more.
     """
     fitted = ruler.gain(before.chi2, after.chi2, more)
-    was, now = unseen(before), unseen(after)
+    was, now = prediction_error(before), prediction_error(after)
     if was is None or now is None or not np.isfinite(was) or not np.isfinite(now):
         return fitted
     share = ruler.effective / ruler.rows / ruler.scale
     return fitted + share * (was**2 - now**2) * unseen_rows(after)
 
 
-def gained(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
+def with_gain(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
     """Return the trial with what it gains in BIC over the model before, and what the held-out data add to that."""
     more = len(trial.refit.problem.free) - len(before.problem.free)
     gain = ruler.between(before, trial.refit)
     return CandidateFit(trial.pick, trial.refit, gain, evidence_between(before, trial.refit, ruler, more))
 
 
-def alike(one: Refit, other: Refit, before: Refit) -> bool:
+def same_answers(one: Refit, other: Refit, before: Refit) -> bool:
     """Return True for two hypotheses whose answers differ, in the fitted records, by less than the tolerance: that share of the
     square of what the effects do beside the model without them."""
     was, a, b = (
@@ -220,7 +226,7 @@ def alike(one: Refit, other: Refit, before: Refit) -> bool:
     return bool(np.sum((a - b) ** 2) <= TOLERANCE * max(np.sum((was - a) ** 2), np.sum((was - b) ** 2)))
 
 
-def speaks_against(before: Refit, after: Refit) -> str:
+def worst_held_out_record(before: Refit, after: Refit) -> str:
     """Return in words which held-out record an effect makes worse most, with what is left there; empty where none is held out."""
     was, now = held_out_by_record(before), held_out_by_record(after)
     worse = {name: value for name, value in now.items() if name in was and value > was[name]}
@@ -237,12 +243,12 @@ def unseen_rows(refit: Refit) -> int:
     return sum(int(e.compared.sum()) * len(e.outputs) for e in held) or refit.rows
 
 
-def silent(before: Refit, after: Refit) -> bool:
+def leaves_holdout_alone(before: Refit, after: Refit) -> bool:
     """Return True where the held-out experiments would look the same with the effect and without."""
     one, two = (held_out(r.problem, r.theta) for r in (before, after))
     if not one or not two:
         return False
-    return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < CLEARLY
+    return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < CLEAR_CHI2
 
 
 def as_recorded(refit: Refit) -> dict[str, float]:
@@ -257,7 +263,7 @@ def as_recorded(refit: Refit) -> dict[str, float]:
     return {role: float(np.sqrt(np.mean(found))) for role, found in squares.items()}
 
 
-def worst(refit: Refit) -> dict[str, float]:
+def largest_rmse(refit: Refit) -> dict[str, float]:
     """The largest RMSE of each output over all experiments, in its unit."""
     found: dict[str, float] = {}
     for output, row in refit.problem.rmse(refit.theta).items():
@@ -267,26 +273,26 @@ def worst(refit: Refit) -> dict[str, float]:
     return found
 
 
-PRICE = 8.0
+PARAMETER_PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
-NEAR = 0.05
+SMALL_REMAINDER = 0.05
 """Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
-LOUD = 1.4
+MAX_NOISE_POWER = 1.4
 """Times the noise's power up to which what is left may be noise that is louder than it was taken for."""
-SHAPED = 0.01
+STRUCTURE_P = 0.01
 """Chance under noise of sums over time below which what is left has a shape: as small as for an effect to be named. What is there is
 looked for by a whole round more, and by forms outside the catalogue."""
-FAINT = 0.1
+MAX_LAG1_AUTOCORRELATION = 0.1
 """Correlation of neighbours up to which nothing is made of it: records that stand still are rounded alike."""
-LOOKED_AT = 3
+N_BEST = 3
 """Of the refits the best, of which this is asked."""
-TELLING = 0.1
-"""Share of what the model before leaves beyond noise from which it is: noise that is louder than was told leaves falls too."""
+LOUD_NOISE_SHARE = 0.1
+"""Share of what the model before leaves beyond noise that a fall of chi2 has to come to: noise that is louder than stated falls too."""
 
 
-def telling(before: Refit) -> float:
-    """The fall of chi2 from which a refit is more than what noise that is louder than was told leaves to take away."""
-    return TELLING * (before.chi2 - before.rows)
+def fall_beyond_loud_noise(before: Refit) -> float:
+    """Return the fall of chi2 that noise which is louder than stated does not give."""
+    return LOUD_NOISE_SHARE * (before.chi2 - before.rows)
 
 
 def best_each(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
@@ -311,18 +317,18 @@ def by_cost(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
 
 def cost_of(trial: CandidateFit) -> float:
     """Chi2 of a refit on all data plus the price of its parameters, before the scale of BIC is known."""
-    refit, held = trial.refit, unseen(trial.refit)
-    return refit.chi2 + PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
+    refit, held = trial.refit, prediction_error(trial.refit)
+    return refit.chi2 + PARAMETER_PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
 
 
-def excess(refit: Refit) -> bool:
+def exceeds_noise(refit: Refit) -> bool:
     """Return True where a model leaves more than noise, by size."""
     return refit.chi2 / refit.rows > 1.0 + SURE * _power_error(refit)
 
 
-def misses(refit: Refit) -> bool:
+def predicts_worse(refit: Refit) -> bool:
     """Return True where a model leaves more of unseen data than of those it was fitted to, by more than chance."""
-    seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
+    seen, now = max(refit.chi2 / refit.rows, 1.0), prediction_error(refit)
     return now is not None and now**2 > seen * (1.0 + SURE * _power_error(refit))
 
 
@@ -333,46 +339,50 @@ def _power_error(refit: Refit) -> float:
 
 def left_by(refit: Refit) -> float:
     """Misfit beyond noise per row, of the fitted data or of the others."""
-    return max(refit.chi2 / refit.rows, (unseen(refit) or 0.0) ** 2) - 1.0
+    return max(refit.chi2 / refit.rows, (prediction_error(refit) or 0.0) ** 2) - 1.0
 
 
-def all_far(before: Refit, trials: Sequence[CandidateFit], near: float = NEAR) -> bool:
+def all_far_from_noise(before: Refit, trials: Sequence[CandidateFit], near: float = SMALL_REMAINDER) -> bool:
     """Return True where no refit comes near the noise, or to a small share of the misfit before, on fitted and held-out data."""
     far = all(_leaves_much(before, t.refit, near) for t in trials if not t.refit.failure)
-    return far and not any(like_noise(t.refit) for t in by_cost(trials)[:LOOKED_AT])
+    return far and not any(resembles_noise(t.refit) for t in by_cost(trials)[:N_BEST])
 
 
-def is_far(before: Refit, refit: Refit) -> bool:
+def is_far_from_noise(before: Refit, refit: Refit) -> bool:
     """Return True where this refit does not come near the noise, or to a small share of the misfit before."""
-    return _leaves_much(before, refit, NEAR) and not like_noise(refit)
+    return _leaves_much(before, refit, SMALL_REMAINDER) and not resembles_noise(refit)
 
 
 def _leaves_much(before: Refit, refit: Refit, near: float) -> bool:
-    return (excess(refit) or misses(refit)) and left_by(refit) > near * left_by(before)
+    return (exceeds_noise(refit) or predicts_worse(refit)) and left_by(refit) > near * left_by(before)
 
 
-def like_noise(refit: Refit) -> bool:
-    """Return True where the residual is without shape, though somewhat loud: noise is told from few rows.
+def resembles_noise(refit: Refit) -> bool:
+    """Return True where the residual is without shape, though somewhat loud: noise is estimated from few rows.
 
     Of the held-out data too, where more is left of them: their noise may be louder than that of the others.
     """
-    seen, now = max(refit.chi2 / refit.rows, 1.0), unseen(refit)
-    if seen > LOUD or refit.correlation > FAINT or (now is not None and now**2 > LOUD * seen):
+    seen, now = max(refit.chi2 / refit.rows, 1.0), prediction_error(refit)
+    if (
+        seen > MAX_NOISE_POWER
+        or refit.correlation > MAX_LAG1_AUTOCORRELATION
+        or (now is not None and now**2 > MAX_NOISE_POWER * seen)
+    ):
         return False
     left = refit.nominal()
-    if loud_after_breaks(left) or not shapeless(left, 0):
+    if is_louder_after_breaks(left) or not is_unstructured(left, 0):
         return False
-    if not misses(refit):
+    if not predicts_worse(refit):
         return True
     held = of_held_out(refit.problem)
-    return held is not None and shapeless(Nominal(held, refit.theta[: len(held.free)], refit.noise), 0)
+    return held is not None and is_unstructured(Nominal(held, refit.theta[: len(held.free)], refit.noise), 0)
 
 
 def is_noise(refit: Refit, seed: int) -> bool:
     """Return True where the residual is noise, by its size and over time: then there is nothing more to look for."""
-    return not excess(refit) and shapeless(refit.nominal(), seed)
+    return not exceeds_noise(refit) and is_unstructured(refit.nominal(), seed)
 
 
-def shapeless(nominal: Nominal, seed: int) -> bool:
+def is_unstructured(nominal: Nominal, seed: int) -> bool:
     """Return True where sums of the residual over time are like those of noise."""
-    return all(b.p > SHAPED for b in residual_tests(nominal, {}, bootstraps=200, seed=seed))
+    return all(b.p > STRUCTURE_P for b in residual_tests(nominal, {}, bootstraps=200, seed=seed))

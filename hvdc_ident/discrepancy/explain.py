@@ -10,7 +10,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import Placed, Refit, held_out, uncertainty_of, unseen
+from hvdc_ident.discrepancy.hypothesis import Placed, Refit, held_out, prediction_error, uncertainty_of
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, StandIn, Table
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
@@ -20,7 +20,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures, listed, percentage, quantity
 
 MOST_STAND_INS = 3
-"""Effects that are told beside parameters that are off."""
+"""Effects that a sentence lists beside parameters that are off."""
 MOST_PLACES = 4
 """Signals at most that are asked for."""
 
@@ -81,12 +81,12 @@ def _without(sentence: str, absent: Collection[str]) -> str:
 def advice(
     first: str, others: list[tuple[str, tuple[str, ...]]], at: tuple[str, ...], recorded: Collection[str] = ()
 ) -> str:
-    """Experiment or record that would tell the members of an ambiguity set apart, in words; nothing already recorded."""
+    """Return the experiment or record that would distinguish the members of an ambiguity set, in words; nothing already recorded."""
     entry = effects()[first]
     parts = []
     for name in dict.fromkeys(n for n, _ in others if n != first):
-        told = entry.confusable.get(name) or effects()[name].confusable.get(first)
-        parts.append(f"{first} or {name}: {told or f'{entry.excited_by}; {effects()[name].excited_by}'}")
+        how = entry.confusable.get(name) or effects()[name].confusable.get(first)
+        parts.append(f"{first} or {name}: {how or f'{entry.excited_by}; {effects()[name].excited_by}'}")
     wanted = [at[0]]  # a signal of each place that is not of the others
     for name, place in others:
         own = [p for p in place if p not in at] or [p for p in at if p not in place]
@@ -108,10 +108,10 @@ def gap(given: Refit, refitted: Refit, augmented: Refit) -> Gap:
     """RMSE by output and experiment of the model with the given gains, refitted, and with the effects."""
     tables = [_tables(r.problem, r.theta) for r in (given, refitted, augmented)]
     pooled: dict[str, Mapping[str, float | None]] = {
-        name: {"fit": _pooled(r.problem, r.theta), "holdout": unseen(r) if name != "nominal" else _held(r)}
+        name: {"fit": _pooled(r.problem, r.theta), "holdout": prediction_error(r) if name != "nominal" else _held(r)}
         for name, r in (("nominal", given), ("refitted", refitted), ("augmented", augmented))
     }
-    was, now = unseen(refitted), unseen(augmented)
+    was, now = prediction_error(refitted), prediction_error(augmented)
     shrink = None if was is None or now is None or not was > 0 or not np.isfinite(was) else 1.0 - now / was
     floor = {o: n.std for o, n in refitted.noise.items() if n.std is not None}
     held = "experiments" if refitted.holdout is not None else "parts of the fitted experiments, predicted from the rest"
@@ -180,20 +180,20 @@ def off_given(last: Refit, given: Refit, adequate: bool, matters: bool) -> Findi
 
 
 def beside_stand_ins(moved: Finding, others: Sequence[StandIn]) -> Finding:
-    """The finding on parameters that are off, told beside the effects that explain the records as well with these as given."""
+    """The finding on parameters that are off, beside the effects that explain the records as well with these as given."""
     if not others:
         return moved
-    told = "; or ".join(f"{s.text} (with {listed(s.values)} as given)" for s in others[:MOST_STAND_INS])
+    others_text = "; or ".join(f"{s.text} (with {listed(s.values)} as given)" for s in others[:MOST_STAND_INS])
     more = f"; or one of {len(others) - MOST_STAND_INS} more effects" if len(others) > MOST_STAND_INS else ""
     text = moved.text.replace("No effect is missing:", "No effect is needed:")
-    return replace(moved, text=f"{text} The records do not tell this from: {told}{more}.")
+    return replace(moved, text=f"{text} The records do not distinguish this from: {others_text}{more}.")
 
 
 def moved_parameters(last: Refit, names: Collection[str]) -> Finding | None:
     """The parameters, of those named, whose estimates are clearly off the given values, as one finding; None where none is."""
     problem = last.problem
     known = uncertainty_of(problem, problem.blocks(last.theta))
-    sizes, told = {}, []
+    sizes, texts = {}, []
     for k in last.gains:
         free, value, std = problem.free[k], float(last.theta[k]), known.std(problem.free[k].name)
         # A value on its bound is no estimate.
@@ -201,8 +201,8 @@ def moved_parameters(last: Refit, names: Collection[str]) -> Finding | None:
             continue
         unit = last.model.parameters[free.name].unit
         sizes[free.name] = EffectSize(value, (value - 1.96 * std, value + 1.96 * std), unit)
-        told.append(f"{free.name} is {quantity(value, unit)}, not {quantity(free.given, unit)}")
+        texts.append(f"{free.name} is {quantity(value, unit)}, not {quantity(free.given, unit)}")
     if not sizes:
         return None
     places = tuple(Place((n,), 1.0) for n in sizes)
-    return Finding("parameter", ("parameter",), 1.0, FrozenMap(sizes), places, f"{listed(told)}.")
+    return Finding("parameter", ("parameter",), 1.0, FrozenMap(sizes), places, f"{listed(texts)}.")

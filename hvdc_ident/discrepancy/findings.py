@@ -1,4 +1,4 @@
-"""Findings: an effect class in words, with its sizes, places and what would tell it from others."""
+"""Findings: an effect class in words, with its sizes, places and what would distinguish it from others."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from hvdc_ident.discrepancy.forms import with_values
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.implied import apart
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival, ValueAt
-from hvdc_ident.discrepancy.stand import Round
+from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures_of, listed, quantity
 
 SHARED = ("s", "rad/s", "Hz", "")
 """Units of parameters that mean the same at every place."""
-TOLD = 3
+MAX_LISTED = 3
 """Places with other values of the parameters that a sentence lists."""
 
 
@@ -34,11 +34,11 @@ def finding(
     *,
     with_intervals: bool = True,
 ) -> Finding:
-    """The class as it is told: what one of its likely members does, and where else it may be.
+    """The class in a sentence: what one of its likely members does, and where else it may be.
 
     put_in: what was put into the model: where that is a likely member, it is the one, with its sizes beside all other effects;
     else it is the likeliest, as its own refit has it. values: of the model's own parameters beside what was put in.
-    with_intervals: whether the sentence tells the intervals of the sizes.
+    with_intervals: whether the sentence has the intervals of the sizes.
     """
     refits = {_key_of(t.refit): t.refit for t in found.trials}
     likely_ones = credible(one.members)
@@ -62,11 +62,11 @@ def finding(
     by_place: dict[tuple[tuple[str, ...], str], float] = {}
     for r, p in likely_ones:
         by_place[r.at, r.source] = by_place.get((r.at, r.source), 0.0) + p / one.probability
-    told = _one_each(likely_ones, best)
+    each = _one_each(likely_ones, best)
     shown = [
         Place(at, p, source, r.effect, _with_spans(r, refits.get(_key(r))), r.values)
         for (at, source), p in sorted(by_place.items(), key=lambda kv: (kv[0] != (best.at, best.source), -kv[1]))
-        for r in [told[at, source]]
+        for r in [each[at, source]]
     ]
     if own is not None and (shown[0].at, shown[0].source) == (best.at, best.source):
         # Values that effects found later have moved are not to be compared with those of the other places.
@@ -180,7 +180,7 @@ def _sizes(parameters: Mapping[str, EffectSize]) -> str:
 
 
 def _likely(one: EffectClass) -> list[str]:
-    """The effects of a class that the records do not tell from its best, the likeliest first: whether one does the same is for
+    """The effects of a class that the records do not distinguish from its best, the likeliest first: whether one does the same is for
     the data alone to say, however many places each was looked for at."""
     least = min(r.delta_bic for r, _ in one.members)
     near = {r.same_as or r.effect for r, _ in one.members if np.exp(0.5 * (least - r.delta_bic)) >= 1.0 - CERTAIN}
@@ -216,10 +216,10 @@ def _apart(best: Rival, places: Sequence[Place]) -> str:
     from_others += (
         [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if best.source and sources_too else []
     )
-    from_others += [f"this place from {_with_values(p, names)}" for p in others[:TOLD]]
-    from_others += [f"from {len(others) - TOLD} more with other values"] if len(others) > TOLD else []
+    from_others += [f"this place from {_with_values(p, names)}" for p in others[:MAX_LISTED]]
+    from_others += [f"from {len(others) - MAX_LISTED} more with other values"] if len(others) > MAX_LISTED else []
     then = f", where {_values(own.values, names)}" if others else ""
-    return f"{then}; the records do not tell {', nor '.join(from_others)}" if from_others else ""
+    return f"{then}; the records do not distinguish {', nor '.join(from_others)}" if from_others else ""
 
 
 def _with_values(place: Place, names: Sequence[str]) -> str:
@@ -243,14 +243,14 @@ def _some(names: Sequence[str]) -> str:
 
 
 def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> Mapping[str, Any]:
-    """For each set with more than one member what would tell them apart, in words; empty where there is none."""
+    """For each set with more than one member what would distinguish them, in words; empty where there is none."""
     texts = []
     for group in groups:
         if len(group) > 1:
             first = group[0]
-            # No experiment tells one equation from itself under another name.
+            # No experiment distinguishes one equation from itself under another name.
             others = [(r.effect, r.at) for r in group[1:] if not r.same_as]
-            told = advice(first.effect, others, first.at, recorded)
-            if told:
-                texts.append(told)
+            how = advice(first.effect, others, first.at, recorded)
+            if how:
+                texts.append(how)
     return {"text": ". ".join(t[:1].upper() + t[1:] for t in texts)} if texts else {}

@@ -1,8 +1,8 @@
 """Forms outside the catalogue, for what no effect of it explains: bends, products, drifts, dry friction, characteristics, filters.
 
 Each is a kind of its own in `hvdc_ident.effects`, which is tried where it is asked for only. They are looked for as effects are, at
-the places where effects of the catalogue explain most, and told by their formula, their transfer function or their curve. Where
-none stands either, the course over time of what is missing is told.
+the places where effects of the catalogue explain most, and described by their formula, their transfer function or their curve. Where
+none stands either, the course over time of what is missing is described.
 """
 
 from __future__ import annotations
@@ -15,14 +15,22 @@ import numpy as np
 import sympy as sp
 
 from hvdc_ident.discrepancy.candidates import additive, candidates
-from hvdc_ident.discrepancy.evidence import CandidateFit, Ruler, alike, best_each, gained, is_far, left_by
+from hvdc_ident.discrepancy.evidence import (
+    CandidateFit,
+    Ruler,
+    best_each,
+    is_far_from_noise,
+    left_by,
+    same_answers,
+    with_gain,
+)
 from hvdc_ident.discrepancy.explain import sentence
-from hvdc_ident.discrepancy.hypothesis import Refit, in_place, uncertainty_of, unseen
+from hvdc_ident.discrepancy.hypothesis import Refit, built_in, prediction_error, uncertainty_of
 from hvdc_ident.discrepancy.movable import equations, in_proportion
 from hvdc_ident.discrepancy.options import REFUTED, SearchContext
 from hvdc_ident.discrepancy.pushes import answered, hats
-from hvdc_ident.discrepancy.screen import Shot
-from hvdc_ident.discrepancy.stand import FoundForm, Round, Stand
+from hvdc_ident.discrepancy.rounds import FoundForm, Round, RoundModel
+from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.effects import effects
 from hvdc_ident.expression import parse, symbol, to_text
 from hvdc_ident.files import plain
@@ -30,16 +38,16 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.text import listed
 
-PLACES = 12
+FORM_PLACES = 12
 """Insertion points that forms are looked for at."""
-EACH = 4
+REFITS_PER_FORM = 4
 """Refits of one form."""
 TIME_KNOTS = 24
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """A form outside the catalogue as it is told. kind: term, filter, curve, disturbance or nothing.
+class DescribedForm:
+    """A form outside the catalogue, described. kind: term, filter, curve, disturbance or nothing.
 
     at: the insertion point; expression and coefficients: of a term or a filter; curve: of the others, {over, at, value, std}.
     refit: the model with the form; text: a sentence.
@@ -59,7 +67,7 @@ class Told:
         return {n: plain(getattr(self, n)) for n in self.__dataclass_fields__ if n != "refit"}
 
 
-def tried(
+def refitted_forms(
     search: SearchContext,
     opened: Round,
     at: Collection[str] | None = None,
@@ -82,20 +90,20 @@ def tried(
         if len(c.at) == 1 and c.at[0] in places and not c.still
     ]
     curves = [k for k, c in enumerate(found) if effects()[c.effect].outside == "curve"]
-    stand = Stand.of(search, before, found, 1)
-    screen = stand.screen(found, "outside the catalogue", [k for k in range(len(found)) if k not in curves])
-    shots: list[Shot] = []
+    round_model = RoundModel.of(search, before, found, 1)
+    screen = round_model.screen(found, "outside the catalogue", [k for k in range(len(found)) if k not in curves])
+    scores: list[Score] = []
     for effect in {c.effect: None for c in found}:
-        shots += [s for k, s in screen.best().items() if found[k].effect == effect][:EACH]
-    shots += [Shot(k, 0, 0.0, before.theta) for k in curves]
-    trials = best_each(stand.refitted(found, shots, "outside the catalogue"))
+        scores += [s for k, s in screen.best().items() if found[k].effect == effect][:REFITS_PER_FORM]
+    scores += [Score(k, 0, 0.0, before.theta) for k in curves]
+    trials = best_each(round_model.refitted(found, scores, "outside the catalogue"))
     return tuple(t for t in trials if not t.refit.failure and _is_own(t.refit))
 
 
 def _promising(opened: Round) -> list[str]:
     """Return the places at which an effect of the catalogue, whichever, makes chi2 fall most."""
     order = [opened.candidates[k].at for k in opened.screen.best()]
-    return list(dict.fromkeys(at[0] for at in order if len(at) == 1))[:PLACES]
+    return list(dict.fromkeys(at[0] for at in order if len(at) == 1))[:FORM_PLACES]
 
 
 def _is_own(refit: Refit) -> bool:
@@ -103,7 +111,7 @@ def _is_own(refit: Refit) -> bool:
     return entry.is_own is None or entry.is_own(refit.sizes(refit.placed[-1]))
 
 
-def standing(
+def best_form(
     search: SearchContext, opened: Round, trials: Sequence[CandidateFit], best: Refit | None = None
 ) -> FoundForm | None:
     """Return the form that leaves least for the price of its values, of those that stand the tests of an effect; None where none
@@ -126,16 +134,16 @@ def _gain(search: SearchContext, before: Refit, refit: Refit, best: Refit | None
     """Return what a form gains, in BIC; None where it does not stand."""
     ruler = Ruler.of(refit)
     gain = ruler.between(before, refit)
-    was, now = unseen(before), unseen(refit)
+    was, now = prediction_error(before), prediction_error(refit)
     if was is None or now is None or gain <= search.options.named_bic or was - now <= search.options.holdout_share:
         return None
     if best is None:
         return gain if left_by(refit) <= REFUTED * left_by(before) else None
     ahead = ruler.between(best, refit) > search.options.named_bic
-    return gain if ahead and not is_far(before, refit) else None
+    return gain if ahead and not is_far_from_noise(before, refit) else None
 
 
-def instead_of(search: SearchContext, opened: Round) -> tuple[tuple[CandidateFit, float], ...]:
+def alternatives(search: SearchContext, opened: Round) -> tuple[tuple[CandidateFit, float], ...]:
     """Return the refits of forms in the stead of a round's winner, each with its prior; none that failed.
 
     Of what bends a signal or brings one in, without memory, at one place inside a model: terms there, with what the winner brings
@@ -144,7 +152,7 @@ def instead_of(search: SearchContext, opened: Round) -> tuple[tuple[CandidateFit
     as a winner that is linear is no other hypothesis, its prior 0: where signals move so little, a form is its own tangent.
 
     A saturation bends by the third order, a coupling is a product at its operating point: whoever has only the catalogue's name for it
-    takes a form for told that the data do not tell.
+    takes a form for known that the data do not show.
     """
     winner = opened.winner
     assert winner is not None and opened.ruler is not None
@@ -158,7 +166,7 @@ def instead_of(search: SearchContext, opened: Round) -> tuple[tuple[CandidateFit
     kind = "filter" if delays else "term"
     refits = opened.forms if delays else None
     if refits is None:
-        refits = tried(search, opened, None if delays else (place,), (kind,))
+        refits = refitted_forms(search, opened, None if delays else (place,), (kind,))
     count = sum(c.effect == effect.name and len(c.at) == 1 for c in opened.candidates)
     linear = in_proportion(opened.candidates[winner.pick.candidate], winner.pick.probe)
     weighed = []
@@ -169,27 +177,27 @@ def instead_of(search: SearchContext, opened: Round) -> tuple[tuple[CandidateFit
             entry.needs_source and effect.needs_source and c.source != placed.candidate.source
         ):
             continue
-        same = linear and not delays and alike(winner.refit, t.refit, opened.before)
-        trial = gained(replace(t, pick=winner.pick), opened.before, opened.ruler)
+        same = linear and not delays and same_answers(winner.refit, t.refit, opened.before)
+        trial = with_gain(replace(t, pick=winner.pick), opened.before, opened.ruler)
         weighed.append((trial, 0.0 if same else 1.0 / count))
     return tuple(weighed)
 
 
-def described(form: FoundForm) -> Told:
-    """Return what is told of a form, which is put into its model for good: its formula, its transfer function or its curve."""
-    refit = in_place(form.before, form.refit)
+def described(form: FoundForm) -> DescribedForm:
+    """Return the description of a form, which is compiled into its model: its formula, its transfer function or its curve."""
+    refit = built_in(form.before, form.refit)
     placed = refit.placed[-1]
     if refit.failure:
         text = f"{labelled(form.refit)} explains it, but cannot be put into the model: {refit.failure}"
-        return Told("nothing", placed.candidate.at[0], text)
+        return DescribedForm("nothing", placed.candidate.at[0], text)
     entry, (place,) = effects()[placed.candidate.effect], placed.candidate.at
     said = [f"Found from the data, outside the catalogue: {sentence(placed.candidate, refit.sizes(placed))}."]
     if form.others:
         said.append(f"As good: {listed([labelled(r) for r in form.others])}.")
     text = " ".join(said)
     if entry.outside == "curve":
-        return Told("curve", place, text, delta_bic=form.gain, curve=_curve(refit), refit=refit)
-    return Told(entry.outside, place, text, expression(refit), _coefficients(refit), form.gain, refit=refit)
+        return DescribedForm("curve", place, text, delta_bic=form.gain, curve=_curve(refit), refit=refit)
+    return DescribedForm(entry.outside, place, text, expression(refit), _coefficients(refit), form.gain, refit=refit)
 
 
 def labelled(refit: Refit) -> str:
@@ -232,7 +240,7 @@ def _coefficients(refit: Refit) -> FrozenMap[Any]:
 
 
 def _curve(refit: Refit) -> dict[str, Any]:
-    """Return the curve {over, at, value, std}: what is added, with its standard deviation where the records tell it."""
+    """Return the curve {over, at, value, std}: what is added, with its standard deviation where the records determine it."""
     placed = refit.placed[-1]
     entry, sizes = effects()[placed.candidate.effect], refit.sizes(placed)
     assert entry.curve is not None
@@ -251,7 +259,7 @@ def _curve(refit: Refit) -> dict[str, Any]:
     return {"over": over, "at": at.tolist(), "value": value.tolist(), "std": std}
 
 
-def course(search: SearchContext, opened: Round) -> Told:
+def disturbance_course(search: SearchContext, opened: Round) -> DescribedForm:
     """Return what would have to be added at the place that explains most, over time and the same in every experiment.
 
     Each of some hats over time is put on the place as the model runs; its answer at the outputs, whitened and freed of what the
@@ -274,12 +282,12 @@ def course(search: SearchContext, opened: Round) -> Told:
         if worth > (0.0 if best is None else best[0]):
             best = worth, place, values, columns
     if best is None:
-        return Told("nothing", "", "No hidden input at any one place explains it.")
+        return DescribedForm("nothing", "", "No hidden input at any one place explains it.")
     worth, place, values, columns = best
     spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(columns.T @ columns, rcond=1e-10)), 0.0))
     curve = {"over": "time", "at": at.tolist(), "value": values.tolist(), "std": spread.tolist()}
     if len(experiments) > 1:
         text = f"It acts at {place} at the same times in every experiment, whatever the state: a disturbance."
-        return Told("disturbance", place, text, delta_bic=worth, curve=curve)
-    text = f"It acts at {place}; with one experiment a disturbance cannot be told from a form."
-    return Told("curve", place, text, delta_bic=worth, curve=curve)
+        return DescribedForm("disturbance", place, text, delta_bic=worth, curve=curve)
+    text = f"It acts at {place}; with one experiment a disturbance cannot be distinguished from a form."
+    return DescribedForm("curve", place, text, delta_bic=worth, curve=curve)

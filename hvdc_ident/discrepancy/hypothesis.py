@@ -28,17 +28,17 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, insertion_point
 from hvdc_ident.simulate import Method, ModelSimulator, Statistics, Tolerance, equilibria, simulate
 
-PATIENCE = Tolerance(rtol=1e-6, atol=1e-9, brief=True)
+REFIT_TOLERANCE = Tolerance(rtol=1e-6, atol=1e-9, brief=True)
 """Of a refit's runs. A candidate's model has some hundred of them: to compile it well would take longer than they do."""
-OWN, BETWEEN = 10, 3
+STEPS_PER_OWN_STEP, STEPS_PER_ROW = 10, 3
 """Steps of a candidate's run: times those of the model without it, and more for each row. What happens several times between two rows
-(a chatter, a window of a microsecond) is not told by the record: a candidate that takes more steps is none."""
-FAR = 5.0
+(a chatter, a window of a microsecond) does not show in the record: a candidate that takes more steps is none."""
+MAX_SIZE_FACTOR = 5.0
 """Times a probe's size at most, or this share of it at least, that a refit begins at: a score far from its size says little. Where the
 score asks for another size, that is a second start: a dead band far from 0 is an offset, and its score is exact."""
-EXACT = 1e3
+MAX_PROPORTIONAL_FACTOR = 1e3
 """Largest such factor for an effect in proportion to its size, whose score at one size is that at every."""
-ROOM = 3.0
+BOUND_FACTOR = 3.0
 """Times the size asked for: how far a refit may go."""
 
 
@@ -77,7 +77,7 @@ def _determinant(model: Model) -> float | None:
     return None if anchor is None else anchor.sign
 
 
-def reaching(candidate: CandidateEffect, probe: int, factor: float) -> CandidateEffect:
+def with_wider_bounds(candidate: CandidateEffect, probe: int, factor: float) -> CandidateEffect:
     """The candidate with room in the probe's bounds for the size that a score asks for, where it is in proportion to that.
 
     What a slot carries by itself is no measure of what is added there: a friction that hardly moves may be kicked hard.
@@ -87,21 +87,21 @@ def reaching(candidate: CandidateEffect, probe: int, factor: float) -> Candidate
         return candidate
     free = dict(chosen.free)
     for n in (n for n in free if entry.parameters[n].neutral == 0.0):
-        asked, (low, high) = ROOM * min(abs(factor), EXACT) * abs(chosen.values[n]), free[n]
+        asked, (low, high) = BOUND_FACTOR * min(abs(factor), MAX_PROPORTIONAL_FACTOR) * abs(chosen.values[n]), free[n]
         q = entry.parameters[n]
         free[n] = (max(min(low, -asked), q.min) if low < 0 else low, min(max(high, asked), q.max))
     wider = replace(chosen, free=FrozenMap(free))
     return replace(candidate, probes=(*candidate.probes[:probe], wider, *candidate.probes[probe + 1 :]))
 
 
-def moved(candidate: CandidateEffect, probe: int, factor: float, most: float | None = None) -> dict[str, float]:
+def scaled_sizes(candidate: CandidateEffect, probe: int, factor: float, most: float | None = None) -> dict[str, float]:
     """The probe's values with its size multiplied, within the refit's bounds; a reversed phase where that is meant.
 
     most: the largest factor, and the inverse of the least; left out, as far as a score of the effect's size can be trusted.
     """
     values, free = candidate.probes[probe].values, candidate.probes[probe].free
     entry, found = effects()[candidate.effect], dict(values)
-    most = most or (EXACT if in_proportion(candidate, probe) else FAR)
+    most = most or (MAX_PROPORTIONAL_FACTOR if in_proportion(candidate, probe) else MAX_SIZE_FACTOR)
     size = float(np.clip(abs(factor), 1.0 / most, most)) if np.isfinite(factor) and factor else 1.0
     if factor < 0 and "phase" in found:
         found["phase"] += np.pi if found["phase"] <= 0 else -np.pi
@@ -122,12 +122,12 @@ def moved(candidate: CandidateEffect, probe: int, factor: float, most: float | N
     return found
 
 
-METHOD = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
+OPTIMISER = TrustRegion(max_evaluations=60, gradient=1e-5, reduction=1e-6, step=1e-7)
 """A reduction by this share is a hundredth of a unit of chi2 with ten thousand rows of noise."""
 FAILURES = (HvdcIdentError, ValueError, ArithmeticError)
 """Errors of the work on one candidate that cannot be done: the candidate has failed then, with this as its reason, and the
 search goes on. numpy's LinAlgError is a ValueError."""
-SCANNED = 15
+EVALUATIONS_AFTER_SCAN = 15
 """Evaluations where the size was scanned for, a walk begins at the end of its way or leads nowhere."""
 
 
@@ -143,7 +143,7 @@ class RefitJob:
     problem: Problem
     begins: tuple[Array, ...]
     noise: FrozenMap[OutputNoise]
-    evaluations: int = METHOD.max_evaluations
+    evaluations: int = OPTIMISER.max_evaluations
     judged: bool = True
 
 
@@ -152,7 +152,7 @@ class Refit:
     """Result of a refit. failure: why it has no result, empty where it has one.
 
     chi2: sum of squared residuals (`ResidualBlock.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
-    holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. press:
+    holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. cross_validated:
     the root mean score of parts of the fitted ones predicted from the rest. std: standard deviation of each free parameter, of the
     effects and of the model, by its name in the model. apart: of each effect, by how many standard deviations its parameters
     together are off doing nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
@@ -167,7 +167,7 @@ class Refit:
     rows: int = 0
     correlation: float = 0.0
     holdout: float | None = None
-    press: float | None = None
+    cross_validated: float | None = None
     std: FrozenMap[float | None] = field(default_factory=FrozenMap)
     apart: tuple[float, ...] = ()
     failure: str = ""
@@ -204,13 +204,13 @@ class Refit:
 
     @cached_property
     def _runs(self) -> list[Statistics]:
-        return self._runs_with(PATIENCE)
+        return self._runs_with(REFIT_TOLERANCE)
 
     @cached_property
     def _slides(self) -> bool:
         """Return True where the model slides by itself: candidates on it have to, too."""
         try:
-            self._runs_with(replace(PATIENCE, slides=False))
+            self._runs_with(replace(REFIT_TOLERANCE, slides=False))
         except SimulationError:
             return True
         return False
@@ -220,7 +220,7 @@ class Refit:
         """Tolerance of the runs of a model with more than this one has, with the steps that they may take."""
         own = max((s.accepted + s.rejected for s in self._runs), default=0)
         rows = max((e.time.size for e in self.problem.fitted_experiments), default=0)
-        return replace(PATIENCE, max_steps=OWN * own + BETWEEN * rows, slides=self._slides)
+        return replace(REFIT_TOLERANCE, max_steps=STEPS_PER_OWN_STEP * own + STEPS_PER_ROW * rows, slides=self._slides)
 
     @property
     def method(self) -> Method:
@@ -254,7 +254,7 @@ class RefitResult:
     rows: int
     correlation: float
     holdout: float | None
-    press: float | None
+    cross_validated: float | None
     std: FrozenMap[float | None]
     apart: tuple[float, ...]
     failure: str
@@ -266,16 +266,16 @@ class RefitResult:
         return Refit(job.model, job.placed, job.problem, job.noise, **own)
 
 
-def find(job: RefitJob) -> RefitResult:
+def refit_result(job: RefitJob) -> RefitResult:
     """Result of `run` without its job; what it raises is its failure."""
     try:
-        return found_by(run(job))
+        return result_of(refitted(job))
     except FAILURES as error:
-        return found_by(failed(job, error))
+        return result_of(failed(job, error))
 
 
 def failed_at(before: Refit, why: str) -> Refit:
-    """The refit of a model with one more effect that could not be made, told by the model before it."""
+    """The refit of a model with one more effect that could not be made, with the model before it."""
     return Refit(before.model, before.placed, before.problem, before.noise, before.theta, failure=why)
 
 
@@ -286,15 +286,15 @@ def failed(job: RefitJob, error: Exception) -> Refit:
     )
 
 
-def found_by(refit: Refit) -> RefitResult:
+def result_of(refit: Refit) -> RefitResult:
     """Result of a refit without its job."""
     return RefitResult(**{f.name: getattr(refit, f.name) for f in fields(RefitResult)})
 
 
-def run(job: RefitJob) -> Refit:
-    """The end of the best start, judged on the held-out experiments too; a failure is told, not raised."""
+def refitted(job: RefitJob) -> Refit:
+    """The end of the best start, judged on the held-out experiments too; a failure is returned, not raised."""
     scanned = any(effects()[p.candidate.effect].needs_grid for p in job.placed)
-    most = min(job.evaluations, SCANNED) if scanned else job.evaluations
+    most = min(job.evaluations, EVALUATIONS_AFTER_SCAN) if scanned else job.evaluations
     end = _best_walk(job, most)
     # A walk that stalled stands somewhere all the same: with samplers and levels the cost has steps of its own.
     if end.cost is None:
@@ -332,7 +332,7 @@ def _cost_at(job: RefitJob, begin: Array) -> float:
 def _walk(problem: Problem, begin: Array, evaluations: int) -> OptimiserResult:
     """The end of a walk, failed with the reason where the model raises."""
     try:
-        return replace(METHOD, max_evaluations=evaluations).run(problem, begin)
+        return replace(OPTIMISER, max_evaluations=evaluations).run(problem, begin)
     except FAILURES as error:
         return OptimiserResult(begin, None, "failed", str(error), 0)
 
@@ -354,7 +354,7 @@ def judged(refit: Refit) -> Refit:
     apart = tuple(_apart_from_nothing(refit, p, known, blocks) / wider for p in refit.placed)
     return replace(
         refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=holdout(refit.problem, refit.theta),
-        press=press(blocks), std=FrozenMap(std), apart=apart,
+        cross_validated=cross_validated(blocks), std=FrozenMap(std), apart=apart,
     )  # fmt: skip
 
 
@@ -389,7 +389,7 @@ def _apart_from_nothing(refit: Refit, placed: Placed, known: Uncertainty, blocks
 
 
 def _covariance(known: Uncertainty, at: Sequence[int], blocks: Sequence[ResidualBlock]) -> Array:
-    """The covariance of some unknowns; where only combinations of them are told, of those, and 0 along the others.
+    """The covariance of some unknowns; where the data determine only combinations of them, of those, and 0 along the others.
 
     The constant and the linear part of a loss are one where a signal has two levels, and are there all the same.
     """
@@ -400,8 +400,8 @@ def _covariance(known: Uncertainty, at: Sequence[int], blocks: Sequence[Residual
     scale = np.where(scale > 0.0, scale, 1.0)
     own, others = jacobian[:, at] / scale, orthonormal(np.delete(jacobian, at, axis=1))
     _, s, directions = np.linalg.svd(own - others @ (others.T @ own), full_matrices=False)
-    told = directions[s > SINGULAR] / s[s > SINGULAR, None]
-    return np.asarray(told.T @ told / np.outer(scale, scale))
+    scaled = directions[s > SINGULAR] / s[s > SINGULAR, None]
+    return np.asarray(scaled.T @ scaled / np.outer(scale, scale))
 
 
 def _correlation(blocks: Sequence[ResidualBlock]) -> float:
@@ -446,14 +446,14 @@ def held_out(problem: Problem, theta: Array) -> tuple[ResidualBlock, ...] | None
     return tuple(b for b in blocks if b.output in problem.outputs)
 
 
-def press(blocks: Sequence[ResidualBlock], parts: int = 4) -> float | None:
+def cross_validated(blocks: Sequence[ResidualBlock], parts: int = 4) -> float | None:
     """Return the root mean score of each part of the residuals predicted from the others, in noise units; None where nothing can be
     left out.
 
     Parts: experiments; of a single one, stretches of its rows. The score of a part is -2 log p of its rows under the model fitted
     to the others (to first order, Gaussian), less that of noise alone: e' S^-1 e + log det S with the prediction error e and its
     covariance S = I + J C J'. C is that of the unknowns by the other parts and a prior that is worth one row of all data (unit
-    information, Kass and Wasserman 1995, of which BIC is the logarithm), for one part may be the only one that tells an unknown.
+    information, Kass and Wasserman 1995, of which BIC is the logarithm), for one part may be the only one that determines an unknown.
     """
     pieces = _parts(blocks, parts)
     rows = sum(r.size for r, _ in pieces)
@@ -462,8 +462,10 @@ def press(blocks: Sequence[ResidualBlock], parts: int = 4) -> float | None:
     matrix = np.asarray(sum(j.T @ j for _, j in pieces))
     d = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
     information, directions = np.linalg.eigh(matrix / np.outer(d, d))
-    told = information > 1e-9 * max(information[-1], 1e-300) if information.size else information > 0
-    scaled = directions[:, told] / np.sqrt(information[told]) / d[:, None]  # in these coordinates all data have information I
+    known = information > 1e-9 * max(information[-1], 1e-300) if information.size else information > 0
+    scaled = (
+        directions[:, known] / np.sqrt(information[known]) / d[:, None]
+    )  # in these coordinates all data have information I
     whole = 1.0 + 1.0 / rows
     score = 0.0
     for r, j in pieces:
@@ -508,17 +510,17 @@ def signal(refit: Refit, place: str) -> dict[str, Array]:
 
 def _input(experiment: Experiment, name: str, at_rest: float) -> Array:
     """An input at the experiment's rows, (n,); at_rest: what it is where the experiment does not move it."""
-    moved = experiment.inputs.get(name)
-    course = np.full(experiment.time.size, at_rest) if moved is None else moved(experiment.time)
+    scaled_sizes = experiment.inputs.get(name)
+    course = np.full(experiment.time.size, at_rest) if scaled_sizes is None else scaled_sizes(experiment.time)
     return np.asarray(course + experiment.offsets.get(name, 0.0))
 
 
-def unseen(refit: Refit) -> float | None:
+def prediction_error(refit: Refit) -> float | None:
     """The held-out residual in noise units; without held-out experiments that of parts left out."""
-    return refit.holdout if refit.holdout is not None else refit.press
+    return refit.holdout if refit.holdout is not None else refit.cross_validated
 
 
-def job(
+def refit_job(
     before: Refit,
     candidate: CandidateEffect,
     probe: int,
@@ -533,8 +535,8 @@ def job(
     movable: the model with an effect of this form that can be moved, where there is one; else the effect is put in.
     Raises ModelError where the effect cannot sit there.
     """
-    candidate = reaching(candidate, probe, factor)
-    chosen, values = candidate.probes[probe], moved(candidate, probe, factor)
+    candidate = with_wider_bounds(candidate, probe, factor)
+    chosen, values = candidate.probes[probe], scaled_sizes(candidate, probe, factor)
     use = candidate.use(replace(chosen, values=FrozenMap(values)))
     entry, plain = effects()[candidate.effect], before.model
     anywhere = before.problem.free_initial_states
@@ -562,23 +564,23 @@ def job(
     )
     placed = Placed(candidate, use, FrozenMap(names), FrozenMap(bounds), FrozenMap(values), movable=movable is not None)
     k = len(before.problem.free)
-    asked = moved(candidate, probe, factor, EXACT)
-    beside = [(theta, values), (theta, asked), *([] if ran is None else [(ran, moved(candidate, probe, 1.0))])]
+    asked = scaled_sizes(candidate, probe, factor, MAX_PROPORTIONAL_FACTOR)
+    beside = [(theta, values), (theta, asked), *([] if ran is None else [(ran, scaled_sizes(candidate, probe, 1.0))])]
     begins = tuple(np.concatenate([at[:k], [size[n] for n in bounds], at[k:]]) for at, size in beside)
     return RefitJob(model, (*before.placed, placed), problem, begins, before.noise)
 
 
-BIASED = 0.4
+FAR_SHARE = 0.4
 """Share of its given value by which a gain has moved when it may have taken an effect's place."""
 
 
-def moved_far(refit: Refit) -> bool:
+def gains_moved_far(refit: Refit) -> bool:
     """Return True where a gain has moved so far, or stands on a bound, that it may have taken an effect's place."""
     gains = ((refit.problem.free[k], float(refit.theta[k])) for k in refit.gains)
-    return any(abs(value - f.given) > BIASED * abs(f.given) or f.on_bound(value) for f, value in gains)
+    return any(abs(value - f.given) > FAR_SHARE * abs(f.given) or f.on_bound(value) for f, value in gains)
 
 
-def as_given(refit: Refit) -> Array | None:
+def with_given_gains(refit: Refit) -> Array | None:
     """The unknowns with the gains at their given values, as near as the bounds let; None where they are there already."""
     theta = refit.theta_at_given
     for k in refit.gains:
@@ -587,8 +589,8 @@ def as_given(refit: Refit) -> Array | None:
     return None if np.array_equal(theta, refit.theta) else theta
 
 
-def in_place(before: Refit, trial: Refit) -> Refit:
-    """Return a refit with its last effect put into the model `before` for good, refitted from there; a failure is told."""
+def built_in(before: Refit, trial: Refit) -> Refit:
+    """Return a refit with its last effect compiled into the model `before`, refitted from there; a failure is returned."""
     placed = trial.placed[-1]
     if not placed.movable:
         return trial
@@ -596,7 +598,7 @@ def in_place(before: Refit, trial: Refit) -> Refit:
     probe = Probe(placed.candidate.effect, sizes, placed.bounds)
     try:
         only = replace(placed.candidate, probes=(probe,))
-        found = run(replace(job(before, only, 0, 1.0, before.theta), begins=(trial.theta,)))
+        found = refitted(replace(refit_job(before, only, 0, 1.0, before.theta), begins=(trial.theta,)))
     except FAILURES as error:
         return replace(trial, failure=str(error))
     candidate = replace(found.placed[-1].candidate, probes=placed.candidate.probes)
@@ -604,14 +606,16 @@ def in_place(before: Refit, trial: Refit) -> Refit:
 
 
 def refit_again(first: Refit, here: Refit, placed: Sequence[Placed]) -> Refit:
-    """The nominal model `first` with these effects, refitted from where they stand in the hypothesis `here`; a failure is told."""
+    """The nominal model `first` with these effects, refitted from where they stand in the hypothesis `here`; a failure is returned."""
     try:
-        return run(job_of(first, here, placed, {}))
+        return refitted(joint_refit_job(first, here, placed, {}))
     except FAILURES as error:
         return replace(here, failure=str(error))
 
 
-def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]) -> RefitJob:
+def joint_refit_job(
+    first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int, dict[str, float]]
+) -> RefitJob:
     """The refit of the nominal model with these effects; sizes: of some, by their place, instead of where they stand."""
     model, free, again = first.model, list(first.problem.free), []
     at = here.values
@@ -626,8 +630,8 @@ def job_of(first: Refit, here: Refit, placed: Sequence[Placed], sizes: dict[int,
         new = [n for n in model.parameters if n not in before]
         names = dict(zip(p.names, new, strict=True))
         free += [FitParameter(names[n], values[n], *p.bounds[n]) for n in p.bounds]
-        moved = replace(p.candidate, at=use.at, source=use.source)
-        again.append(replace(p, candidate=moved, use=use, names=FrozenMap(names), start=FrozenMap(values)))
+        scaled_sizes = replace(p.candidate, at=use.at, source=use.source)
+        again.append(replace(p, candidate=scaled_sizes, use=use, names=FrozenMap(names), start=FrozenMap(values)))
     problem = replace(
         here.problem,
         simulator=ModelSimulator(model, first.patience),

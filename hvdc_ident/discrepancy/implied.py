@@ -1,7 +1,7 @@
 """Values of the model's own parameters that a hypothesis implies, compared with the given ones and between hypotheses.
 
 A lag behind an output and a lag inside a loop may be one transfer function, with other values of the parameters. What the
-records do not tell apart then implies several values of a parameter, and none of them by itself is an estimate.
+records do not distinguish then implies several values of a parameter, and none of them by itself is an estimate.
 """
 
 from __future__ import annotations

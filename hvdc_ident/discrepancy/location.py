@@ -14,7 +14,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.linearize import find_operating_point, frequency_response, linearize
 from hvdc_ident.model import AnyModel
 
-MOST_OF = 0.8
+LARGE_SHARE = 0.8
 """Share of the gap that a time window, a band or a region has to hold."""
 SEGMENTS = 6
 
@@ -63,13 +63,13 @@ def _window(nominal: Nominal) -> dict[str, float] | None:
     if total <= 4.0 * np.sqrt(2.0 * since.size):
         return None
     sums = np.concatenate([[0.0], np.cumsum(np.maximum(per, 0.0))])
-    goal = MOST_OF * sums[-1]
+    goal = LARGE_SHARE * sums[-1]
     best, width = (0, 199), np.inf
     for i in range(200):
         j = int(np.searchsorted(sums, sums[i] + goal))
         if j <= 200 and edges[j] - edges[i] < width:
             best, width = (i, j), float(edges[j] - edges[i])
-    return {"from": float(edges[best[0]]), "to": float(edges[best[1]]), "share": MOST_OF}
+    return {"from": float(edges[best[0]]), "to": float(edges[best[1]]), "share": LARGE_SHARE}
 
 
 def _phases(nominal: Nominal) -> dict[str, float]:
@@ -113,7 +113,7 @@ def _band(nominal: Nominal) -> list[float] | None:
     f = powers[longest][0]
     whole = np.sum([np.interp(f, g, p) for g, p in powers], axis=0)
     sums = np.cumsum(whole) / whole.sum()
-    ends = np.searchsorted(sums, [0.5 * (1.0 - MOST_OF), 0.5 * (1.0 + MOST_OF)])
+    ends = np.searchsorted(sums, [0.5 * (1.0 - LARGE_SHARE), 0.5 * (1.0 + LARGE_SHARE)])
     return [float(v) for v in f[np.minimum(ends, f.size - 1)]]
 
 
@@ -160,8 +160,8 @@ def _smooth(v: Array) -> Array:
     return np.convolve(np.pad(v, 2, mode="edge"), np.ones(5) / 5.0, "valid")
 
 
-POINTS = 60
-MOST = 12
+MAX_FREQUENCIES = 60
+MAX_CHANNELS = 12
 """Channels that are drawn at most."""
 
 
@@ -176,7 +176,7 @@ def responses(model: AnyModel, first: Refit, augmented: AnyModel | None, last: R
         if len(moved) != 1 or e.drive or any(f["input"] == moved[0] for f in found):
             continue
         for output in e.outputs:
-            if len(found) < MOST:
+            if len(found) < MAX_CHANNELS:
                 found.append(_channel(model, first, augmented, last, e, moved[0], output))
     return tuple(found)
 
@@ -233,7 +233,7 @@ def recorded(e: Experiment, name: str, output: str, noise: float) -> tuple[Array
     inner = np.flatnonzero((omega > 0) & (omega < 0.8 * np.pi / step) & (np.abs(du) > 0.02 * np.abs(du).max()))
     if not inner.size:
         return np.empty(0), np.empty(0, dtype=complex)
-    picked = np.unique(inner[np.unique(np.round(np.geomspace(1, inner.size, POINTS)).astype(int) - 1)])
+    picked = np.unique(inner[np.unique(np.round(np.geomspace(1, inner.size, MAX_FREQUENCIES)).astype(int) - 1)])
     omega, du = omega[picked], du[picked]
     middles = 0.5 * (even[1:] + even[:-1])
     half = 0.5 * omega * step

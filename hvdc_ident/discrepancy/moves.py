@@ -2,7 +2,7 @@
 
 The report of a model that lacks something holds parameters for the misfit that is being diagnosed, what a study states of the
 others is known to a few per cent at best, and two recorders of one rate cannot be aligned better than to half a row. What is off
-there would be told as an effect (a late clock as a sampler at the set-points, say), so "these parameters are off their values" and
+there would be taken for an effect (a late clock as a sampler at the set-points, say), so "these parameters are off their values" and
 "the clocks are off" are compared with the effects, and asked again beside them. A record that is moved is simulated from where it
 began: what the plant does from then on, as taking its samples, does not move with the recorder's clock.
 """
@@ -16,7 +16,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Experiment, Trajectory
 from hvdc_ident.discrepancy.evidence import Ruler, evidence_between, is_noise
-from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, refit_again, run
+from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, refit_again, refitted
 from hvdc_ident.discrepancy.nominal import of_held_out
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.errors import SimulationError
@@ -26,11 +26,11 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.text import listed, quantity
 
-KNOWN = 0.02
+STATED_ERROR = 0.02
 """Share by which the stated value of a parameter that is no candidate may be off: data sheets and tests are no better."""
-SEEN = 1e-6
-"""Share of its squared derivative that the others must not make good, for a parameter to be told at all."""
-STEP = 1e-3
+LEAST_INDEPENDENT = 1e-6
+"""Share of its squared derivative that the others must not make good, for a parameter to be determined at all."""
+DIFFERENCE_STEP = 1e-3
 """Share of a value, or of its range where that is 0, by which it is moved for a derivative."""
 
 
@@ -42,7 +42,7 @@ def stated(model: AnyModel, candidates: Sequence[FitParameter]) -> tuple[FitPara
     if not isinstance(model, Model):
         return ()
     others = {n: p.value for n, p in model.parameters.items() if p.value and n not in {f.name for f in candidates}}
-    return tuple(FitParameter(n, v, v - KNOWN * abs(v), v + KNOWN * abs(v)) for n, v in others.items())
+    return tuple(FitParameter(n, v, v - STATED_ERROR * abs(v), v + STATED_ERROR * abs(v)) for n, v in others.items())
 
 
 def released(search: SearchContext, base: Refit, here: Refit) -> tuple[Refit, Refit]:
@@ -126,8 +126,8 @@ def _most_wanted(search: SearchContext, here: Refit, held: Sequence[FitParameter
     whole = np.column_stack([_derivative(here, f, nominal.residual) for f in held])
     columns = nominal.projected(whole)
     power = np.sum(columns**2, axis=0)
-    told = power > SEEN * np.sum(whole**2, axis=0)
-    falls = np.where(told, (columns.T @ nominal.residual) ** 2 / np.where(told, power, 1.0), 0.0)
+    determined = power > LEAST_INDEPENDENT * np.sum(whole**2, axis=0)
+    falls = np.where(determined, (columns.T @ nominal.residual) ** 2 / np.where(determined, power, 1.0), 0.0)
     k = int(np.argmax(falls))
     # In chi2 of the noise: of a misfit its own size is no measure of what may be left.
     return held[k] if falls[k] > search.options.named_bic else None
@@ -140,7 +140,7 @@ def _derivative(here: Refit, parameter: FitParameter, residual: Array) -> Array:
     """
     value = _value(here, parameter)
     extent = parameter.max - parameter.min
-    step = STEP * (abs(value) or (extent if np.isfinite(extent) else 1.0))
+    step = DIFFERENCE_STEP * (abs(value) or (extent if np.isfinite(extent) else 1.0))
     held = FrozenMap({**here.problem.held, parameter.name: value + step})
     try:
         moved = replace(here.problem, held=held).blocks(here.theta)
@@ -149,7 +149,7 @@ def _derivative(here: Refit, parameter: FitParameter, residual: Array) -> Array:
     return (np.concatenate([b.residual for b in moved]) - residual) / step
 
 
-OFF = 0.5
+MAX_CLOCK_ROWS = 0.5
 """Rows by which a record's time stamps are off at most, with recorders of one rate."""
 
 
@@ -165,7 +165,7 @@ def on_their_clocks(search: SearchContext, base: Refit, here: Refit) -> tuple[Re
     search.tell(0, 1, "with clocks that are off")
     now = clocks(search, here)
     late = {n: v + now.get(n, 0.0) for n, v in _late(here).items()}
-    reach = {e.name: OFF * float(np.median(np.diff(e.time))) for e in search.records}
+    reach = {e.name: MAX_CLOCK_ROWS * float(np.median(np.diff(e.time))) for e in search.records}
     if not late or any(abs(v) >= reach[n] for n, v in late.items()):
         return base, here
     moved = _refitted(base, here, tuple(_moved(e, late[e.name]) if e.name in late else e for e in search.records))
@@ -200,14 +200,14 @@ def clocks(search: SearchContext, here: Refit) -> dict[str, float]:
     return {e.name: float(e.time[-1] - now[e.name].time[-1]) for e in search.records}
 
 
-def told(off: Mapping[str, float]) -> str:
+def clock_sentence(off: Mapping[str, float]) -> str:
     """The clocks as a sentence."""
     each = [f"that of {n} is {quantity(abs(v), 's')} {'late' if v > 0 else 'early'}" for n, v in off.items()]
     return f"The clocks of the records are off by less than half a row: {listed(each)}."
 
 
 def _late(here: Refit) -> dict[str, float]:
-    """By how much each clock is late, s, as it suits the hypothesis; empty where that cannot be told.
+    """By how much each clock is late, s, as it suits the hypothesis; empty where that is unknown.
 
     Of the fitted records together with all unknowns, of each of the others with these unknowns.
     """
@@ -215,7 +215,7 @@ def _late(here: Refit) -> dict[str, float]:
     values = dict(zip(here.problem.names, here.theta, strict=True))
     begin = np.array([values.get(n, 0.0) for n in timed.names])
     try:
-        end = run(RefitJob(here.model, here.placed, timed, (begin,), here.noise))
+        end = refitted(RefitJob(here.model, here.placed, timed, (begin,), here.noise))
         if end.failure:
             return {}
         at = dict(zip(timed.names, end.theta, strict=True))
@@ -229,7 +229,7 @@ def _late(here: Refit) -> dict[str, float]:
 
 
 def _late_alone(others: Problem, known: np.ndarray, outputs: Collection[str]) -> dict[str, float]:
-    """By how much the clock of each record is late, s, to first order, with all other unknowns known; told by these outputs."""
+    """By how much the clock of each record is late, s, to first order, with all other unknowns known; from these outputs."""
     blocks = others.blocks(np.concatenate([known, np.zeros(len(others.experiments))]))
     found = {}
     for e in others.experiments:

@@ -1,4 +1,4 @@
-"""The nominal model at its own best: refitted over what the data can tell, for a gap before that is the calibration's."""
+"""The nominal model at its own best: refitted over what the data determine, for a gap before that is the calibration's."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, null_directions
 
-NEAR = 0.05
+ON_JUMP = 0.05
 """Share of the rows' interval: a row this near to a jump of an input lies on it."""
-ROWS, ALONE = 300, 20
+THINNED_ROWS, ROWS_KEPT_AFTER_BREAK = 300, 20
 """Rows of a thinned record, about, and those behind a break of an input that stay as they are: a search looks at thousands of runs,
 and what it ranks moves over many rows."""
 F = TypeVar("F", bound=np.floating)
@@ -207,15 +207,17 @@ def thinned(nominal: Nominal) -> Nominal:
 def _means(experiment: Experiment, blocks: Sequence[tuple[ResidualBlock, Array]]) -> Experiment:
     """Return an experiment whose rows are means over the compared rows of its outputs. blocks: with the model's run at their rows."""
     time, count = experiment.time, experiment.time.size
-    width = -(-count // ROWS)
+    width = -(-count // THINNED_ROWS)
     breaks = np.unique(np.concatenate([time[:1], *(s.breaks for s in experiment.inputs.values())]))
     first = np.searchsorted(time, breaks[breaks <= time[-1]])
-    if width == 1 or first.size * ALONE > ROWS:  # few rows; or an input that was recorded, with a corner at each
+    if (
+        width == 1 or first.size * ROWS_KEPT_AFTER_BREAK > THINNED_ROWS
+    ):  # few rows; or an input that was recorded, with a corner at each
         return experiment
     behind = np.arange(count) - first[np.searchsorted(first, np.arange(count), "right") - 1]
     begins = np.zeros(count, dtype=bool)
     begins[first] = True
-    begins |= (behind < ALONE) | ((behind - ALONE) % width == 0)
+    begins |= (behind < ROWS_KEPT_AFTER_BREAK) | ((behind - ROWS_KEPT_AFTER_BREAK) % width == 0)
     group = np.cumsum(begins) - 1
     edges = np.append(np.flatnonzero(begins), count)
     middle = (edges[:-1] + edges[1:] - 1) // 2
@@ -262,20 +264,20 @@ def nominal(
         problem = gated(problem, gate(report, diagnosis=True))
         begun = searched(report, [f.name for f in problem.free])
     # What is known of the noise goes into the records: a fit keeps weights of its own for deterministic outputs only.
-    told = tuple(
+    with_noise = tuple(
         off_jumps(e).with_(noise=FrozenMap({o: n for o in e.outputs if (n := _stated(e, o, noise[o])) is not None}))
         for e in problem.experiments
     )
     models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
     quantised = {o: q for o, n in noise.items() if (q := n.quantised) is not None}
-    problem = replace(problem, experiments=told, rho=FrozenMap(models), quantised_noise=FrozenMap(quantised))
+    problem = replace(problem, experiments=with_noise, rho=FrozenMap(models), quantised_noise=FrozenMap(quantised))
     optimum, result = pilot_fit(problem, starts=starts, seed=seed, begun=begun, executor=executor)
     notes = (
         [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []
     )
     if report is None:
         optimum, held_now = _told_apart(optimum)
-        notes += [f"Held at {v:g}, for these data do not tell it apart: {n}." for n, v in held_now.items()]
+        notes += [f"Held at {v:g}, for these data do not distinguish it: {n}." for n, v in held_now.items()]
     open_outputs = [o for o, n in noise.items() if n.std is None]
     if open_outputs:
         notes.append(f"{', '.join(open_outputs)}: no noise in the record; the misfit stands in for it.")
@@ -289,14 +291,14 @@ def nominal(
 def off_jumps(experiment: Experiment) -> Experiment:
     """The experiment without the measured rows that lie on a jump of an input.
 
-    Whether such a row shows the value before or after, or where a quick part of the plant then is, no recorder tells: one
+    Whether such a row shows the value before or after, or where a quick part of the plant then is, no recorder says: one
     row can weigh as much as all that a missing effect does to the others.
     """
     if experiment.measured is None:
         return experiment
     time = experiment.time
     steps = np.diff(time)
-    near = NEAR * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    near = ON_JUMP * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
     jumps = [t for s in experiment.inputs.values() for t in s.jumps.tolist()]
     on = np.zeros(time.size, dtype=bool)
     for t in jumps:
@@ -329,7 +331,7 @@ def _runs(problem: Problem) -> dict[str, Mapping[str, Array]]:
 
 
 def _told_apart(optimum: LocalAnalysis) -> tuple[LocalAnalysis, dict[str, float]]:
-    """The optimum without the parameters that these data do not tell apart from the others, held at their given values where it runs."""
+    """The optimum without the parameters that these data do not distinguish from the others, held at their given values where it runs."""
     k = len(optimum.names)
     dead = [n for n, c in zip(optimum.names, optimum.columns.T, strict=False) if not np.any(c)]
     null = null_directions(optimum.columns)[:, :k]
@@ -338,7 +340,7 @@ def _told_apart(optimum: LocalAnalysis) -> tuple[LocalAnalysis, dict[str, float]
     if not lost or len(lost) == k:
         return optimum, {}
     given = {f.name: f.given for f in optimum.problem.free if f.name in lost}
-    fewer = optimum.with_held(dict.fromkeys(lost, "not told apart"), given)
+    fewer = optimum.with_held(dict.fromkeys(lost, "not distinguished"), given)
     return fewer, {n: fewer.problem.held[n] for n in lost}
 
 

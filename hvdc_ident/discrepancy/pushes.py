@@ -1,7 +1,7 @@
 """Answers of a model to small pushes at its slots, along the run of an experiment: simulated, and counted per unit of the push.
 
 What any effect could add at a place is a push there. All places are had from one compilation: every slot reads its signal and
-the push by the weight of its place. Hats over time at a place tell what any effect there could explain, as far as the records
+the push by the weight of its place. Hats over time at a place show what any effect there could explain, as far as the records
 ask for them.
 """
 
@@ -27,9 +27,9 @@ from hvdc_ident.model import Model, fresh, rewritten
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate import simulate
 
-SMALL = 1e-3
+PUSH_SHARE = 1e-3
 """Of a signal's range, or a thousandth of its peak: how large a push is. Runs are exact to 1e-8 of a signal: the answer to 1e-4."""
-CORNERS = 16
+MAX_CORNERS = 16
 """Corners of a push that an integrator stops at, at most; one with more moves with the model, whose steps follow it."""
 
 
@@ -59,7 +59,7 @@ class Pushed:
         """Return (o, n, nc), what the outputs do in answer to pushes (n, nc) at a slot, to first order; nan where a run fails."""
         found = np.full((len(self.outputs), self.time.size, pushes.shape[1]), np.nan)
         u = self.values[place]
-        most = SMALL * max(float(np.ptp(u)), SMALL * float(np.abs(u).max(initial=0.0)), SMALL**2)
+        most = PUSH_SHARE * max(float(np.ptp(u)), PUSH_SHARE * float(np.abs(u).max(initial=0.0)), PUSH_SHARE**2)
         for c in range(pushes.shape[1]):
             size = float(np.abs(pushes[:, c]).max(initial=0.0))
             if size == 0.0:
@@ -120,7 +120,7 @@ def _with_push(model: Model, slots: tuple[str, ...]) -> tuple[Model, FrozenMap[s
 def _corners(time: Array, values: Array) -> Array:
     """The instants where a push bends, where these are few."""
     bends = np.abs(np.diff(values, 2, prepend=values[0], append=values[-1])) > 1e-9 * np.abs(values).max()
-    return time[bends] if np.count_nonzero(bends) <= CORNERS else np.empty(0)
+    return time[bends] if np.count_nonzero(bends) <= MAX_CORNERS else np.empty(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,13 +158,13 @@ def answered(nominal: Nominal, experiment: Experiment, path: Pushed, place: str,
     return Whitening.of(blocks, experiment, nominal)(path.answer(place, pushes))
 
 
-EVEN, QUICK = 16, 8
+EVEN_KNOTS, KNOTS_AFTER_BREAK = 16, 8
 """Knots of a push over a record, and over each part of it behind a break of an input, ever nearer to the break."""
-MOST = 120
+MAX_KNOTS = 120
 """Knots of all records together, about: with many breaks the parts behind them have fewer."""
-WEAK = 1e-4
+WEAKEST = 1e-4
 """Of the strongest direction: weaker ones leave no trace."""
-TRIED = np.geomspace(1e-4, 1e4, 60)
+INPUT_SIZES = np.geomspace(1e-4, 1e4, 60)
 """Sizes of what is added, in units of what the strongest direction shows, of which the likeliest is taken."""
 
 
@@ -185,7 +185,7 @@ class Inversion:
         """Return the inversion of one slot on the fitted experiments."""
         experiments, shown = nominal.problem.fitted_experiments, []
         for e in experiments:
-            over = _hats(e, MOST // len(experiments))
+            over = _hats(e, MAX_KNOTS // len(experiments))
             shown.append(np.nan_to_num(answered(nominal, e, paths[e.name], place, over)))
         taken = np.hstack([q.T @ s for q, s in zip(_split(nominal.basis, shown), shown, strict=True)])
         square = block_diag(*(s.T @ s for s in shown)) - taken.T @ taken
@@ -199,7 +199,7 @@ class Inversion:
         strength = np.abs(self.square).sum(axis=0).max(initial=0.0)
         if not 0.0 < strength < np.inf:  # nothing shows, or the answer runs away
             return 0.0, 0
-        weak = 2.0 * WEAK**2 * strength
+        weak = 2.0 * WEAKEST**2 * strength
         lower = np.linalg.cholesky(self.square + weak * np.eye(self.asked.size))
         half = solve_triangular(lower, np.column_stack([self.asked, np.eye(self.asked.size)]), lower=True)
         return float(half[:, 0] @ half[:, 0]), round(self.asked.size - weak * np.sum(half[:, 1:] ** 2))
@@ -208,7 +208,7 @@ class Inversion:
     def _spectrum(self) -> tuple[Array, Array]:
         square, directions = np.linalg.eigh(self.square)
         strength = np.sqrt(np.maximum(square[::-1], 0.0))
-        kept = strength > WEAK * strength[0]
+        kept = strength > WEAKEST * strength[0]
         return strength[kept], directions[:, ::-1][:, kept]
 
     @property
@@ -233,7 +233,7 @@ class Inversion:
         """
         squares = wanted**2
         best = np.zeros(wanted.shape[1])
-        for size in TRIED / self.strength[0]:
+        for size in INPUT_SIZES / self.strength[0]:
             spread = 1.0 + (size * self.strength) ** 2
             best = np.maximum(best, 0.5 * ((1.0 - 1.0 / spread) @ squares - np.sum(np.log(spread))))
         return best
@@ -262,9 +262,12 @@ def _hats(experiment: Experiment, most: int) -> Array:
     if breaks.size > most // 2:  # an input that never rests: no part of the record is behind a break
         breaks, even = breaks[:1], most
     else:
-        even = EVEN
-    quick = min(QUICK, max((most - even) // breaks.size, 1))
-    behind = [b + (np.append(breaks[breaks > b], end)[0] - b) * np.geomspace(2.0**-QUICK, 1.0, quick) for b in breaks]
+        even = EVEN_KNOTS
+    quick = min(KNOTS_AFTER_BREAK, max((most - even) // breaks.size, 1))
+    behind = [
+        b + (np.append(breaks[breaks > b], end)[0] - b) * np.geomspace(2.0**-KNOTS_AFTER_BREAK, 1.0, quick)
+        for b in breaks
+    ]
     knots = np.unique(np.concatenate([np.linspace(begin, end, even), breaks, *behind]))
     knots = t[np.unique(np.searchsorted(t, knots).clip(max=t.size - 1))]
     knots = np.unique(knots)

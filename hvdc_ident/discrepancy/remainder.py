@@ -21,7 +21,7 @@ from scipy.stats import chi2
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import left_by, unseen_rows
-from hvdc_ident.discrepancy.hypothesis import Refit, held_out_by_record, slot_signals, unseen
+from hvdc_ident.discrepancy.hypothesis import Refit, held_out_by_record, prediction_error, slot_signals
 from hvdc_ident.discrepancy.nominal import Nominal, draws, of_held_out
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.pushes import Inversion, Pushed, pushed
@@ -31,8 +31,8 @@ from hvdc_ident.fit.noise import freedom_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 
-ALIKE = 1e-5
-"""Of one less the cosine between two answers that are in proportion: runs tell them to a few parts in a thousand."""
+PROPORTIONAL = 1e-5
+"""Of one less the cosine between two answers that are in proportion: runs give them to a few parts in a thousand."""
 NOISE_SHARE, RANGE_SHARE = 0.1, 0.01
 """Of an output's noise, and of its range: an error below the larger is of no interest where the study says nothing else."""
 
@@ -94,7 +94,7 @@ def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float)
 
     floor: mean square of what noise alone leaves.
     """
-    was, now = unseen(first), unseen(last)
+    was, now = prediction_error(first), prediction_error(last)
     gap = first.chi2 - floor * first.rows
     share = float(np.clip((last.chi2 - floor * last.rows) / gap, 0.0, 1.0)) if gap > 0 else 0.0
     held, held_p = None, 1.0
@@ -116,7 +116,7 @@ def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
     others = of_held_out(last.problem)
     if not np.isfinite(square):
         return 0.0
-    if others is None:  # parts of the fitted records, which noise before the event has told of
+    if others is None:  # parts of the fitted records, whose noise is known from before the event
         rows = unseen_rows(last) * last.effective / last.rows
         freedom = freedom_of(last.noise, last.problem.outputs)
         return float(chi2.sf(square * rows, rows) if np.isinf(freedom) else fdtrc(rows, freedom, square))
@@ -128,7 +128,7 @@ def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
 
 
 def _least_draws(search: SearchContext) -> int:
-    """Records of noise from which a chance as small as the significance can be told."""
+    """Records of noise from which a chance as small as the significance can be measured."""
     return math.ceil(1.0 / search.options.significance)
 
 
@@ -183,7 +183,7 @@ def _apart(paths: Mapping[str, Pushed], places: Sequence[str], seed: int) -> lis
         answer = np.concatenate([path.answer(place, pushes[name]).ravel() for name, path in paths.items()])
         size = float(np.linalg.norm(answer))
         unit = answer / size if 0.0 < size < np.inf else np.zeros_like(answer)
-        if not any(1.0 - abs(float(unit @ other)) < ALIKE for other in kept.values()):
+        if not any(1.0 - abs(float(unit @ other)) < PROPORTIONAL for other in kept.values()):
             kept[place] = unit
     return list(kept)
 

@@ -16,7 +16,7 @@ from hvdc_ident.effects import effects
 from hvdc_ident.fit.noise import SURE
 
 BINS = 8
-AFTER = 10
+ROWS_AFTER_BREAK = 10
 """Rows after a break of an input in which a quick answer to it is looked for."""
 
 
@@ -49,7 +49,7 @@ def residual_tests(
     return tuple(_binned(n, g, nominal.residual, noise) for n, g in groups.items() if g.max(initial=-1) >= 0)
 
 
-def loud_after_breaks(nominal: Nominal) -> bool:
+def is_louder_after_breaks(nominal: Nominal) -> bool:
     """Return True where the residual is louder in the first rows after a break of an input than elsewhere, by more than chance.
 
     However loud the noise is, it knows nothing of the inputs; what answers within a few rows hardly shows in sums over more.
@@ -60,7 +60,7 @@ def loud_after_breaks(nominal: Nominal) -> bool:
         e = experiments[b.experiment]
         breaks = [t for signal in e.inputs.values() for t in signal.breaks.tolist() if t > e.time[0]]
         first = np.searchsorted(e.time[b.rows], breaks)
-        near.append(np.isin(np.arange(b.rows.size), np.add.outer(first, np.arange(AFTER))))
+        near.append(np.isin(np.arange(b.rows.size), np.add.outer(first, np.arange(ROWS_AFTER_BREAK))))
         squares.append(b.squares)
     at, power = np.concatenate(near), np.concatenate(squares)
     if not at.any() or at.all():
@@ -119,25 +119,25 @@ def _level_bins(nominal: Nominal, by_experiment: Mapping[str, Array]) -> NDArray
     return np.concatenate(found).astype(np.intp)
 
 
-TOLD = 1e-4
-"""Share of a slope that has to be left by all the parameters for the data to tell of a size in one experiment alone."""
+LEAST_INDEPENDENT = 1e-4
+"""Share of a slope that has to be left by all the parameters for the data to determine a size in one experiment alone."""
 
 
 @dataclass(frozen=True)
 class Constancy:
-    """Gain of one size per experiment. told: the fall of chi2; p: the chance of such a fall under noise."""
+    """Gain of one size per experiment. chi2_fall: that of the squared residuals; p: the chance of such a fall under noise."""
 
-    told: float
+    chi2_fall: float
     p: float
 
 
-NOTHING = Constancy(0.0, 1.0)
+UNTESTED = Constancy(0.0, 1.0)
 
 
 def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
     """F test, to first order, that the experiments ask for different sizes of an effect.
 
-    p = 1 where only one experiment tells of it, and for effects whose answer has steps in their size: those have
+    p = 1 where only one experiment shows it, and for effects whose answer has steps in their size: those have
     no slopes. left: the refit's residuals.
 
     Source: Chow, Econometrica 28 (1960), as a score test.
@@ -145,15 +145,15 @@ def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
     names = left.problem.names
     own = [names.index(n) for n in placed.names.values() if n in names]
     if effects()[placed.candidate.effect].needs_grid or not own:
-        return NOTHING
+        return UNTESTED
     more = _by_experiment(left, own)
     spare = refit.effective - left.basis.shape[1] - more.shape[1]
     if not more.shape[1] or spare < 1.0:
-        return NOTHING
+        return UNTESTED
     remains = left.projected(left.residual)
-    told = float(np.sum((more.T @ remains) ** 2))
-    share = told / max(float(remains @ remains) - told, np.finfo(float).tiny)
-    return Constancy(told, float(fdtrc(more.shape[1], spare, share * spare / more.shape[1])))
+    fall = float(np.sum((more.T @ remains) ** 2))
+    share = fall / max(float(remains @ remains) - fall, np.finfo(float).tiny)
+    return Constancy(fall, float(fdtrc(more.shape[1], spare, share * spare / more.shape[1])))
 
 
 def _by_experiment(left: Nominal, own: list[int]) -> Array:
@@ -162,15 +162,15 @@ def _by_experiment(left: Nominal, own: list[int]) -> Array:
     experiment = np.concatenate([np.full(b.residual.size, b.experiment) for b in left.blocks])
     each = np.hstack([np.where((experiment == e)[:, None], slopes, 0.0) for e in dict.fromkeys(experiment.tolist())])
     u, s, _ = np.linalg.svd(left.projected(unit_columns(each)), full_matrices=False)
-    return np.asarray(u[:, s > TOLD])
+    return np.asarray(u[:, s > LEAST_INDEPENDENT])
 
 
-TONES = 4
-FULL = 0.9
+MAX_TONES = 4
+LEAST_FILLED = 0.9
 """Share of the rows of an even grid that have to be there; those that are not, on a jump of an input say, count as 0."""
-OUT = 6.0
+TONE_DEVIATIONS = 6.0
 """Standard deviations by which the power at a frequency, over all records, must exceed that of white noise."""
-APART = 0.08
+TONE_DISTANCE = 0.08
 """Tones nearer to each other than this, in the logarithm, are one."""
 
 
@@ -188,7 +188,11 @@ def tones(nominal: Nominal) -> tuple[float, ...]:
         step = float(np.median(np.diff(t)))
         at = np.rint((t - t[0]) / step).astype(np.intp) if step > 0 else np.zeros(1, dtype=np.intp)
         count = int(at[-1]) + 1
-        if (np.diff(at) <= 0).any() or t.size < FULL * count or np.abs(t - t[0] - at * step).max() > 0.02 * step:
+        if (
+            (np.diff(at) <= 0).any()
+            or t.size < LEAST_FILLED * count
+            or np.abs(t - t[0] - at * step).max() > 0.02 * step
+        ):
             continue
         even = np.zeros(count)
         even[at] = b.residual - b.residual.mean()
@@ -203,9 +207,9 @@ def tones(nominal: Nominal) -> tuple[float, ...]:
     count = len(spectra)
     inner = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
     # Below two periods a record the residual of anything slow has power.
-    inner = inner[(inner > 8) & (power[inner] > count + OUT * np.sqrt(count))]
+    inner = inner[(inner > 8) & (power[inner] > count + TONE_DEVIATIONS * np.sqrt(count))]
     found: list[float] = []
     for k in inner[np.argsort(-power[inner])]:
-        if all(abs(np.log(frequency[k] / other)) > APART for other in found):
+        if all(abs(np.log(frequency[k] / other)) > TONE_DISTANCE for other in found):
             found.append(float(frequency[k]))
-    return tuple(found[:TONES])
+    return tuple(found[:MAX_TONES])

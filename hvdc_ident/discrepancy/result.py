@@ -22,7 +22,7 @@ Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameabl
 AUGMENTED = "augmented-model.toml"
 AS_LINES = ("augmented", "candidates", "effects", "ambiguity", "findings", "values_by_place", "stand_ins")
 """Fields that JSON writes in another form."""
-SHOWN = 10
+MAX_DRAWN = 10
 """Candidates in the figure, the best by BIC."""
 Table = Mapping[str, Mapping[str, float | None]]
 """By output and experiment, in the output's unit; None where the run fails."""
@@ -106,7 +106,7 @@ class Place:
 
 @dataclass(frozen=True)
 class ValueAt:
-    """The value of a parameter of the model if an effect is at a place: of one that the records do not tell from others."""
+    """The value of a parameter of the model if an effect is at a place: of one that the records do not distinguish from others."""
 
     value: float
     ci95: tuple[float | None, float | None] | None
@@ -217,9 +217,9 @@ class Diagnosis(Shown):
 
     verdict: named, no-evidence, not-excited, ambiguous or unnameable; text: why, in one or two sentences.
     effects: those put into the model. ambiguity: for each of them the candidates that are as good, the best first, where
-    there is more than one, or where that one is in doubt. doubt: what tells that something else stands behind the effects,
-    though nothing that was tried explains as much; empty where nothing does. separating_experiment: what would tell them
-    apart, or show what was not excited or is in doubt.
+    there is more than one, or where that one is in doubt. doubt: what shows that something else stands behind the effects,
+    though nothing that was tried explains as much; empty where nothing does. separating_experiment: what would distinguish
+    them, or show what was not excited or is in doubt.
     candidates: every candidate's line, the best first. location: where model and data differ.
     gap: before and after. remaining: what is left. beyond_noise: whether that is more than noise; the values and
     the intervals then hold only if nothing else is missing. parameters_*: by name; `parameters_refitted` are the
@@ -366,7 +366,7 @@ class Diagnosis(Shown):
         left.set_ylabel("residual in noise units")
         left.legend(fontsize="small")
         refitted = [c for c in self.candidates if c.delta_bic is not None and c.round == 1]
-        best = sorted(refitted, key=lambda c: -(c.delta_bic or 0.0))[:SHOWN][::-1]
+        best = sorted(refitted, key=lambda c: -(c.delta_bic or 0.0))[:MAX_DRAWN][::-1]
         if best:
             right.barh(range(len(best)), [c.delta_bic or 0.0 for c in best], color="#1f5fa8")
             labels = [f"{c.effect} at {', '.join(c.at)}" + (f" from {c.source}" if c.source else "") for c in best]

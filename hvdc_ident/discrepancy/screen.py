@@ -30,22 +30,22 @@ from hvdc_ident.fit.residual import unknown_initial_states, with_steady_start
 from hvdc_ident.model import AnyModel, Model, insertion_point
 from hvdc_ident.simulate import Method, ModelSimulator, Tolerance
 
-HASTE = Tolerance(rtol=1e-5, atol=1e-8, search=False, brief=True)
+SCREEN_TOLERANCE = Tolerance(rtol=1e-5, atol=1e-8, search=False, brief=True)
 """Of a first look. Its runs are exact to a hundredth of the noise; one that has no steady state at once begins elsewhere."""
-ANY, CHORD = (-np.inf, np.inf), (0.0, 1.0)
+ANY_FACTOR, UP_TO_ONE = (-np.inf, np.inf), (0.0, 1.0)
 """Factors on the size of an effect in proportion to it; of another, between nothing and the size that was run."""
-SEEN = 1.0
+EXCITED_CHI2 = 1.0
 """Sum of squares of an answer, in noise units, below which no experiment excites it."""
-LEFT = 1e-3
+LEAST_SHARE_LEFT = 1e-3
 """Share of the square of an answer that the parameters have to leave: runs of a search are exact to a few of its hundredths."""
-UNTRIED = "not tried: the budget ended"
+NOT_TRIED = "not tried: the budget ended"
 """Failure of a candidate that was not simulated, or not refitted."""
-PARCEL = 150
+BATCH_SIZE = 150
 """Candidates in one piece of work: some tenths of a second."""
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class Score:
     """One candidate at one size.
 
     candidate, probe: its places in the lists. fall: by how much chi2 falls, beside the model without effects at its
@@ -65,12 +65,12 @@ class Shot:
 class Screen:
     """Result of a screen of all candidates.
 
-    shots: those that run, the best first. size, left: by candidate and probe the square of the answer in noise units, and what
+    scores: those that run, the best first. size, left: by candidate and probe the square of the answer in noise units, and what
     of it the parameters leave. largest: (B,) the largest score of all in each record of noise. failures: by candidate why none
     of its sizes runs.
     """
 
-    shots: tuple[Shot, ...]
+    scores: tuple[Score, ...]
     size: Mapping[tuple[int, int], float]
     left: Mapping[tuple[int, int], float]
     largest: Array
@@ -80,22 +80,22 @@ class Screen:
         """Return the chance that noise alone makes chi2 fall as much anywhere."""
         return float((1 + np.count_nonzero(self.largest >= fall)) / (1 + self.largest.size))
 
-    def best(self) -> dict[int, Shot]:
-        """Return the best shot of each candidate, the best first."""
-        found: dict[int, Shot] = {}
-        for s in self.shots:
+    def best(self) -> dict[int, Score]:
+        """Return the best score of each candidate, the best first."""
+        found: dict[int, Score] = {}
+        for s in self.scores:
             found.setdefault(s.candidate, s)
         return found
 
     def usable(self, column: tuple[int, int]) -> bool:
         """Return True for a size that the experiments excite and the parameters cannot make good."""
-        return self.size[column] >= SEEN and self.left[column] > LEFT * self.size[column]
+        return self.size[column] >= EXCITED_CHI2 and self.left[column] > LEAST_SHARE_LEFT * self.size[column]
 
     def absorbed(self) -> list[int]:
         """Return the candidates that the experiments excite and the parameters make good altogether."""
         own: dict[int, list[bool]] = {}
         for column, size in self.size.items():
-            if size >= SEEN:
+            if size >= EXCITED_CHI2:
                 own.setdefault(column[0], []).append(self.usable(column))
         return [c for c, usable in own.items() if not any(usable)]
 
@@ -141,7 +141,7 @@ class Linearised:
 
 
 @dataclass(frozen=True, eq=False)
-class Bench:
+class ScreenSetup:
     """What candidates are compared on: the model without them, its optimum, and noise.
 
     patience, method: of runs of candidates. places, sources: where movable effects may sit, and what they may bring in: the same for
@@ -176,7 +176,7 @@ class Bench:
     @property
     def haste(self) -> Tolerance:
         """Tolerance of the runs of a first look."""
-        return replace(HASTE, max_steps=self.patience.max_steps, slides=self.patience.slides)
+        return replace(SCREEN_TOLERANCE, max_steps=self.patience.max_steps, slides=self.patience.slides)
 
     def movable(self, form: Form) -> Movable:
         """Return the model with an effect of this form, at one place, to be moved. It has to be one with equations."""
@@ -198,21 +198,21 @@ def _at_rest(problem: Problem, experiment: Experiment, theta: Array) -> Experime
 
 
 @dataclass(frozen=True, eq=False)
-class _Parcel:
+class _Batch:
     """Columns (candidate, probe) of one form, and the candidates. movable: the models that they run on, by whether their place
     is on a loop; none of a model that is closed inside."""
 
-    bench: Bench
+    setup: ScreenSetup
     movable: Mapping[bool, Movable]
     columns: Sequence[tuple[int, int]]
     candidates: Mapping[int, CandidateEffect]
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """Of a parcel."""
+class _BatchResult:
+    """Of a batch."""
 
-    shots: list[Shot]
+    scores: list[Score]
     size: dict[tuple[int, int], float]
     left: dict[tuple[int, int], float]
     largest: Array
@@ -220,7 +220,7 @@ class _Found:
 
 
 def screened(
-    bench: Bench,
+    setup: ScreenSetup,
     candidates: Sequence[CandidateEffect],
     *,
     executor: Executor | None = None,
@@ -228,46 +228,46 @@ def screened(
     columns: Iterable[tuple[int, int]] | None = None,
     spent: Callable[[], bool] = lambda: False,
 ) -> Screen:
-    """Return the screen of candidates; one at several places is told by its parts.
+    """Return the screen of candidates; one at several places is computed from its parts.
 
     columns: candidates and probes, by their places in the lists, instead of all that move. spent: whether the budget is over; what
     was not simulated by then has failed, but for the first piece of work.
     """
     every = ((k, n) for k, c in enumerate(candidates) if not c.still for n in range(len(c.probes)))
-    parcels = list(_parcels(bench, candidates, every if columns is None else columns))
-    shots: list[Shot] = []
+    batches = list(_batches(setup, candidates, every if columns is None else columns))
+    scores: list[Score] = []
     size: dict[tuple[int, int], float] = {}
     left: dict[tuple[int, int], float] = {}
     failures: dict[int, str] = {}
-    largest = np.zeros(bench.noise.shape[1])
-    for done, found in enumerate(mapped(executor, _shot, parcels), start=1):
-        shots += found.shots
+    largest = np.zeros(setup.noise.shape[1])
+    for done, found in enumerate(mapped(executor, _screened_batch, batches), start=1):
+        scores += found.scores
         size |= found.size
         left |= found.left
         failures |= found.failures
         largest = np.maximum(largest, found.largest)
-        tell(done, len(parcels))
+        tell(done, len(batches))
         if spent():
-            failures |= {k: UNTRIED for parcel in parcels[done:] for k, _ in parcel.columns}
+            failures |= {k: NOT_TRIED for batch in batches[done:] for k, _ in batch.columns}
             break
-    ran = {s.candidate for s in shots}
+    ran = {s.candidate for s in scores}
     return Screen(
-        ranked(shots, candidates), size, left, largest, {k: why for k, why in failures.items() if k not in ran}
+        ranked(scores, candidates), size, left, largest, {k: why for k, why in failures.items() if k not in ran}
     )
 
 
-def ranked(shots: Iterable[Shot], candidates: Sequence[CandidateEffect]) -> tuple[Shot, ...]:
-    """Return shots, the best first; of equal falls the simpler: fewer places first, as listed."""
+def ranked(scores: Iterable[Score], candidates: Sequence[CandidateEffect]) -> tuple[Score, ...]:
+    """Return scores, the best first; of equal falls the simpler: fewer places first, as listed."""
     return tuple(
-        sorted(shots, key=lambda s: (-round(s.fall, 6), len(candidates[s.candidate].at), s.candidate, s.probe))
+        sorted(scores, key=lambda s: (-round(s.fall, 6), len(candidates[s.candidate].at), s.candidate, s.probe))
     )
 
 
-def _parcels(
-    bench: Bench, candidates: Sequence[CandidateEffect], asked: Iterable[tuple[int, int]]
-) -> Iterator[_Parcel]:
+def _batches(
+    setup: ScreenSetup, candidates: Sequence[CandidateEffect], asked: Iterable[tuple[int, int]]
+) -> Iterator[_Batch]:
     """The columns by form; of a model that is closed inside each candidate by itself."""
-    model = bench.model
+    model = setup.model
     groups: dict[Form | int, list[tuple[int, int]]] = {}
     for k, n in asked:
         form = Form.of(model, candidates[k], candidates[k].probes[n].values) if isinstance(model, Model) else None
@@ -277,49 +277,49 @@ def _parcels(
         moved: dict[bool, Movable] = {}
         if isinstance(key, Form) and isinstance(model, Model):
             moved = {
-                x: bench.movable(replace(key, loop=x)) for x in {on_loop(model, candidates[k].at[0]) for k, _ in own}
+                x: setup.movable(replace(key, loop=x)) for x in {on_loop(model, candidates[k].at[0]) for k, _ in own}
             }
-        # Those at several places are told by the answers at single ones, and stay with them.
+        # Those at several places are computed from the answers at single ones, and stay with them.
         alone = sum(len(candidates[k].at) == 1 for k, _ in own)
-        cut = [own] if alone < len(own) else [own[n : n + PARCEL] for n in range(0, len(own), PARCEL)]
+        cut = [own] if alone < len(own) else [own[n : n + BATCH_SIZE] for n in range(0, len(own), BATCH_SIZE)]
         for part in cut:
-            yield _Parcel(bench, moved, part, {k: candidates[k] for k, _ in part})
+            yield _Batch(setup, moved, part, {k: candidates[k] for k, _ in part})
 
 
-def _shot(parcel: _Parcel) -> _Found:
-    """The columns of a parcel, simulated."""
-    bench, nominal, runner = parcel.bench, parcel.bench.nominal, _Runner(parcel)
-    was = bench.without.residual
+def _screened_batch(batch: _Batch) -> _BatchResult:
+    """The columns of a batch, simulated."""
+    setup, nominal, runner = batch.setup, batch.setup.nominal, _Runner(batch)
+    was = setup.without.residual
     chi2 = float(nominal.residual @ nominal.residual)
-    found = _Found([], {}, {}, np.zeros(bench.noise.shape[1]), {})
+    found = _BatchResult([], {}, {}, np.zeros(setup.noise.shape[1]), {})
     answers: dict[tuple[int, int], Array] = {}
     units: list[Array] = []
-    several = any(len(parcel.candidates[k].at) > 1 for k, _ in parcel.columns)
-    for column in parcel.columns:
-        if len(parcel.candidates[column[0]].at) > 1 and parcel.movable:
+    several = any(len(batch.candidates[k].at) > 1 for k, _ in batch.columns)
+    for column in batch.columns:
+        if len(batch.candidates[column[0]].at) > 1 and batch.movable:
             continue
         try:
             r = runner(column)
         except FAILURES as error:
             found.failures[column[0]] = str(error) or type(error).__name__
             continue
-        step, fell, factor = bench.without.stepped(r - was, runner.reach(column), held=bench.held)
-        found.shots.append(Shot(*column, chi2 - fell, bench.point + step, factor, bench.point))
+        step, fell, factor = setup.without.stepped(r - was, runner.reach(column), held=setup.held)
+        found.scores.append(Score(*column, chi2 - fell, setup.point + step, factor, setup.point))
         left = nominal.projected((was - r)[:, None])[:, 0]
         found.size[column], found.left[column] = float(np.sum((was - r) ** 2)), float(left @ left)
         if several:
             answers[column] = was - r
-        if found.size[column] >= SEEN and found.left[column] > LEFT * found.size[column]:
+        if found.size[column] >= EXCITED_CHI2 and found.left[column] > LEAST_SHARE_LEFT * found.size[column]:
             units.append((left / np.sqrt(found.left[column])).astype(np.float32))
         if len(units) == 64:
-            _raise(found.largest, units, bench.noise)
-    _raise(found.largest, units, bench.noise)
-    if several and parcel.movable:
-        _at_several(parcel, answers, found, chi2)
+            _raise_largest(found.largest, units, setup.noise)
+    _raise_largest(found.largest, units, setup.noise)
+    if several and batch.movable:
+        _at_several(batch, answers, found, chi2)
     return found
 
 
-def _raise(largest: Array, units: list[Array], noise: NDArray[np.float32]) -> None:
+def _raise_largest(largest: Array, units: list[Array], noise: NDArray[np.float32]) -> None:
     """Raise the largest scores in records of noise to those of some answers, (N,) of length 1 each, which are then forgotten."""
     if units:
         scores = np.max(np.abs(np.array(units) @ noise), axis=0).astype(float) ** 2
@@ -327,32 +327,32 @@ def _raise(largest: Array, units: list[Array], noise: NDArray[np.float32]) -> No
         units.clear()
 
 
-def _at_several(parcel: _Parcel, answers: Mapping[tuple[int, int], Array], found: _Found, chi2: float) -> None:
+def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: _BatchResult, chi2: float) -> None:
     """Add what an effect at several places does, to first order: the sum of what it does at each, in proportion to its size."""
-    bench, candidates = parcel.bench, parcel.candidates
-    nominal = bench.nominal
+    setup, candidates = batch.setup, batch.candidates
+    nominal = setup.nominal
     single: dict[tuple[str, str], list[tuple[float, tuple[int, int]]]] = {}
     for k, n in answers:
         c = candidates[k]
         single.setdefault((c.at[0], c.source), []).append((_distance(c, n), (k, n)))
-    for k, n in parcel.columns:
+    for k, n in batch.columns:
         c = candidates[k]
         if len(c.at) == 1:
             continue
         size, parts = _distance(c, n), []
         own = {s: single.get(s) for s in zip(c.at, c.sources or ("",) * len(c.at), strict=True)}
         # Where nothing moves the effect does nothing, and was not run.
-        moving = [near for (place, _), near in own.items() if near or place not in bench.still]
+        moving = [near for (place, _), near in own.items() if near or place not in setup.still]
         if not size or not moving or not all(moving):
             continue
         for nearby in filter(None, moving):
             near, column = min(nearby, key=lambda s: abs(np.log(s[0] / size)) if s[0] > 0 else np.inf)
             parts.append(answers[column] * (size / near if near else 1.0))
         answer = np.sum(parts, axis=0, dtype=float)
-        step, fell, factor = bench.without.stepped(-answer, CHORD)
+        step, fell, factor = setup.without.stepped(-answer, UP_TO_ONE)
         left = nominal.projected(answer[:, None])[:, 0]
         found.size[k, n], found.left[k, n] = float(answer @ answer), float(left @ left)
-        found.shots.append(Shot(k, n, chi2 - fell, bench.point + step, factor))
+        found.scores.append(Score(k, n, chi2 - fell, setup.point + step, factor))
 
 
 def _distance(candidate: CandidateEffect, probe: int) -> float:
@@ -363,39 +363,39 @@ def _distance(candidate: CandidateEffect, probe: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Runner:
-    """Runs of the columns of a parcel."""
+    """Runs of the columns of a batch."""
 
-    parcel: _Parcel
+    batch: _Batch
 
     def reach(self, column: tuple[int, int]) -> tuple[float, float]:
         """Factors on the size that a step may ask for."""
-        if not any(is_proportional(m.form) for m in self.parcel.movable.values()):
-            return CHORD
-        free = self.parcel.candidates[column[0]].probes[column[1]].free
-        return ANY if any(low < 0.0 for low, _ in free.values()) else (0.0, np.inf)
+        if not any(is_proportional(m.form) for m in self.batch.movable.values()):
+            return UP_TO_ONE
+        free = self.batch.candidates[column[0]].probes[column[1]].free
+        return ANY_FACTOR if any(low < 0.0 for low, _ in free.values()) else (0.0, np.inf)
 
     @cached_property
     def _problems(self) -> Mapping[bool, Problem]:
-        bench = self.parcel.bench
-        own, how = bench.nominal.problem, (bench.haste, bench.method)
-        return {x: replace(own, simulator=m.simulator(*how)) for x, m in self.parcel.movable.items()}
+        setup = self.batch.setup
+        own, how = setup.nominal.problem, (setup.haste, setup.method)
+        return {x: replace(own, simulator=m.simulator(*how)) for x, m in self.batch.movable.items()}
 
     @cached_property
     def _from_rest(self) -> Mapping[bool, Problem]:
         """The problems with runs that begin where the model without an effect rests."""
-        return {x: replace(p, experiments=self.parcel.bench.at_rest) for x, p in self._problems.items()}
+        return {x: replace(p, experiments=self.batch.setup.at_rest) for x, p in self._problems.items()}
 
     def __call__(self, column: tuple[int, int]) -> Array:
         """Return (N,) the whitened residual with a candidate in the size of a probe."""
-        bench, candidate = self.parcel.bench, self.parcel.candidates[column[0]]
-        own, theta, probe = bench.nominal.problem, bench.point, candidate.probes[column[1]]
-        if not self.parcel.movable or not isinstance(bench.model, Model):
-            larger = apply_effects(bench.model, [candidate.use(probe)])
-            return _residual(replace(own, simulator=ModelSimulator(larger, bench.patience)), theta, {})
-        loop = on_loop(bench.model, candidate.at[0])
-        moved = self.parcel.movable[loop]
+        setup, candidate = self.batch.setup, self.batch.candidates[column[0]]
+        own, theta, probe = setup.nominal.problem, setup.point, candidate.probes[column[1]]
+        if not self.batch.movable or not isinstance(setup.model, Model):
+            larger = apply_effects(setup.model, [candidate.use(probe)])
+            return _residual(replace(own, simulator=ModelSimulator(larger, setup.patience)), theta, {})
+        loop = on_loop(setup.model, candidate.at[0])
+        moved = self.batch.movable[loop]
         known = own.values(theta) if candidate.named else {}
-        named = {n: known.get(str(p), bench.model.parameters[str(p)].value) for n, p in candidate.named.items()}
+        named = {n: known.get(str(p), setup.model.parameters[str(p)].value) for n, p in candidate.named.items()}
         values = moved.placed(candidate) | moved.sized({**probe.values, **named})
         try:
             return _residual(self._problems[loop], theta, values)
@@ -409,7 +409,7 @@ def _residual(problem: Problem, theta: Array, values: Mapping[str, float]) -> Ar
 
 def _bounded(square: Array, asked: Array, least: Array, most: Array) -> Array:
     """Return the x between bounds at which x' square x + 2 asked' x is least; square: of columns of length 1."""
-    # What is made of the other columns is told by rounding alone.
+    # What is made of the other columns is rounding alone.
     half = np.linalg.cholesky(square + 1e-10 * np.eye(asked.size)).T
     target = -solve_triangular(half, asked, trans="T")
     step = solve_triangular(half, target)

@@ -21,69 +21,69 @@ from hvdc_ident.discrepancy.evidence import (
     CandidateFit,
     Pick,
     Ruler,
-    all_far,
+    all_far_from_noise,
     at_edge,
-    behinds,
     best_each,
     by_cost,
-    clear,
     cost_of,
+    deficits,
     evidence_between,
-    excess,
-    gained,
-    is_far,
+    exceeds_noise,
+    fall_beyond_loud_noise,
+    is_clear,
+    is_far_from_noise,
     is_noise,
     left_by,
-    like_noise,
     objections,
-    telling,
+    resembles_noise,
+    with_gain,
 )
-from hvdc_ident.discrepancy.forms import standing, tried
+from hvdc_ident.discrepancy.forms import best_form, refitted_forms
 from hvdc_ident.discrepancy.hypothesis import (
     FAILURES,
     Placed,
     Refit,
     RefitJob,
-    as_given,
-    in_place,
-    job_of,
+    built_in,
+    gains_moved_far,
+    joint_refit_job,
     judged,
-    moved,
-    moved_far,
     refit_again,
+    scaled_sizes,
     slot_signals,
+    with_given_gains,
 )
 from hvdc_ident.discrepancy.implied import TIED, implied, nearest, off_given
-from hvdc_ident.discrepancy.met import met
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.moves import clocks, held_again, on_their_clocks, released
 from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.residual_checks import tones
-from hvdc_ident.discrepancy.screen import Shot
-from hvdc_ident.discrepancy.stand import BEHIND, Race, Round, Stand, done, gains_of
+from hvdc_ident.discrepancy.rounds import LEFT_BEHIND, Race, Round, RoundModel, gains_of, refits_of
+from hvdc_ident.discrepancy.screen import Score
+from hvdc_ident.discrepancy.size_search import with_searched_sizes
 from hvdc_ident.effects import effects
 from hvdc_ident.model import AnyModel
 
-OF_EFFECT = 8
-"""Refits of one effect in a field, at least where so many come into question: places that cannot be told apart are neighbours."""
-THOROUGH = 4
+REFITS_PER_EFFECT = 8
+"""Refits of one effect in a field, at least where so many come into question: places that cannot be distinguished are neighbours."""
+THOROUGH_FACTOR = 4
 """Times as many of a thorough search."""
-TOGETHER = 6
+MAX_FAMILIES = 6
 """Effects at several places in a field: each takes a compilation of its own."""
-TURNS = 3
+MAX_FOLLOWED = 3
 """Times that a round goes on from the gains of its best refits."""
-LEVEL = 0.9
+LEADING_SHARE = 0.9
 """Share of the best fall of chi2 from which a refit leads on."""
-NEARLY = 0.1
+NEARLY_SIGNIFICANT = 0.1
 """Chance under noise of the best fall below which a closer look is taken before nothing is said to be there."""
-BEYOND = "none of it leaves noise, and what is found from the data alone does"
+ONLY_A_FORM = "none of it leaves noise, and what is found from the data alone does"
 
 
 def one_round(search: SearchContext, before: Refit, number: int, *, little: bool = False) -> Round:
     """Return a round on the model as it stands. Raises SimulationError where that model cannot be run.
 
-    little: whether so little is left that only an effect that explains it is worth adding: a few refits tell whether one may.
+    little: whether so little is left that only an effect that explains it is worth adding: a few refits show whether one may.
     """
     nominal = before.nominal()
     search.tell(0, 1, f"round {number}: the signals")
@@ -92,27 +92,27 @@ def one_round(search: SearchContext, before: Refit, number: int, *, little: bool
     found = candidates(before.model, signals, times, search.effects, search.places, tones(nominal))
     there = {(p.candidate.effect, p.candidate.at, p.candidate.source) for p in before.placed}
     found = tuple(c for c in found if (c.effect, c.at, c.source) not in there and c.probes)
-    stand = Stand.of(search, before, found, number)
+    round_model = RoundModel.of(search, before, found, number)
     text = f"round {number}: {len(found)} candidates"
-    screen = stand.screen(found, text)
+    screen = round_model.screen(found, text)
     opened = Round(before, signals, found, screen)
-    if not screen.shots:
+    if not screen.scores:
         return replace(opened, why="no candidate leaves a trace in these data")
-    p = screen.p(max(screen.shots[0].fall, 0.0))
+    p = screen.p(max(screen.scores[0].fall, 0.0))
     nothing = f"the best of all is what noise gives (p = {p:.2g})"
-    loud = excess(before) and not like_noise(before)
-    if p > NEARLY and not loud:
+    loud = exceeds_noise(before) and not resembles_noise(before)
+    if p > NEARLY_SIGNIFICANT and not loud:
         return replace(opened, why=nothing)
     if little or (p > search.options.significance and not loud):
-        first = stand.refitted(found, _field(search, found, screen.shots)[:SHORTLIST], f"round {number}")
+        first = round_model.refitted(found, _field(search, found, screen.scores)[:SHORTLIST], f"round {number}")
         gains = [Ruler.of(t.refit).between(before, t.refit) for t in first if not t.refit.failure]
         named = max(gains, default=0.0) > search.options.named_bic
-        if not (named and _significant(search, opened, first)) or (little and all_far(before, first)):
+        if not (named and _significant(search, opened, first)) or (little and all_far_from_noise(before, first)):
             return replace(opened, failed=tuple(t for t in first if t.refit.failure), why=nothing)
-    opened, trials = _explored(search, stand, opened, number)
+    opened, trials = _explored(search, round_model, opened, number)
     if not _significant(search, opened, trials):
         return replace(opened, failed=tuple(t for t in trials if t.refit.failure), why=nothing)
-    return closed(search, replace(opened, significant=True), trials, number)
+    return judged_round(search, replace(opened, significant=True), trials, number)
 
 
 def _significant(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> bool:
@@ -121,19 +121,25 @@ def _significant(search: SearchContext, opened: Round, trials: Sequence[Candidat
     return opened.screen.p(max(falls, default=0.0)) <= search.options.significance
 
 
-def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -> tuple[Round, list[CandidateFit]]:
+def _explored(
+    search: SearchContext, round_model: RoundModel, opened: Round, number: int
+) -> tuple[Round, list[CandidateFit]]:
     """Return the round with its refits."""
     found, text = opened.candidates, f"round {number}"
-    most = opened.screen.shots[0].fall
-    hopeful = [s for s in opened.screen.shots if s.fall >= Race().reach * most]  # where none explains the records, all are
-    opened, trials = _led_on(stand, opened, stand.refitted(found, _field(search, found, hopeful), text), number)
-    given = as_given(opened.before)
-    far = not search.spent and all_far(opened.before, trials, near=TOLERANCE)
+    most = opened.screen.scores[0].fall
+    hopeful = [
+        s for s in opened.screen.scores if s.fall >= Race().reach * most
+    ]  # where none explains the records, all are
+    opened, trials = _with_neighbours_of_leaders(
+        round_model, opened, round_model.refitted(found, _field(search, found, hopeful), text), number
+    )
+    given = with_given_gains(opened.before)
+    far = not search.spent and all_far_from_noise(opened.before, trials, near=TOLERANCE)
     if far:
         # Bends are missed between two sizes.
         opened = replace(opened, candidates=tuple(map(_denser, opened.candidates)))
-        # A form tells by a few refits whether the catalogue lacks something, before all of it is looked at more closely.
-        opened, trials = _outside(search, stand, opened, trials, number)
+        # A form shows by a few refits whether the catalogue lacks something, before all of it is looked at more closely.
+        opened, trials = _outside(search, round_model, opened, trials, number)
         if opened.form is not None:
             return opened, trials
     if far and not search.spent:
@@ -141,28 +147,30 @@ def _explored(search: SearchContext, stand: Stand, opened: Round, number: int) -
         # Gains that make up for an effect may leave no trace of it.
         for point in (None,) if given is None else (None, given):
             where = f"{text}: {'once more' if point is None else 'from the given values'}"
-            shots = _field(search, found, stand.screen(found, where, point=point).shots)
-            trials = best_each([*trials, *stand.refitted(found, shots, where, trials)])
-        opened, trials = _led_on(stand, opened, trials, number)
+            scores = _field(search, found, round_model.screen(found, where, point=point).scores)
+            trials = best_each([*trials, *round_model.refitted(found, scores, where, trials)])
+        opened, trials = _with_neighbours_of_leaders(round_model, opened, trials, number)
     elif given is not None and not search.spent:
         # Beside an effect the records may be explained by other values of the parameters too.
-        where, which = f"{text}: from the given values", [t.pick.candidate for t in by_cost(trials)[:OF_EFFECT]]
-        shots = [*stand.screen(opened.candidates, where, which, given).best().values()]
-        more = stand.refitted(opened.candidates, shots, where, trials)
-        opened, trials = _led_on(stand, opened, best_each([*trials, *more]), number)
+        where, which = f"{text}: from the given values", [t.pick.candidate for t in by_cost(trials)[:REFITS_PER_EFFECT]]
+        scores = [*round_model.screen(opened.candidates, where, which, given).best().values()]
+        more = round_model.refitted(opened.candidates, scores, where, trials)
+        opened, trials = _with_neighbours_of_leaders(round_model, opened, best_each([*trials, *more]), number)
     if not search.spent:
-        opened, trials = met(stand, opened, trials, number, far=all_far(opened.before, trials))
-    return _outside(search, stand, opened, trials, number)
+        opened, trials = with_searched_sizes(
+            round_model, opened, trials, number, far=all_far_from_noise(opened.before, trials)
+        )
+    return _outside(search, round_model, opened, trials, number)
 
 
-def _field(search: SearchContext, found: Sequence[CandidateEffect], shots: Sequence[Shot]) -> list[Shot]:
-    """Return the shots that are refitted: of each effect the best candidates."""
+def _field(search: SearchContext, found: Sequence[CandidateEffect], scores: Sequence[Score]) -> list[Score]:
+    """Return the scores that are refitted: of each effect the best candidates."""
     count: Counter[str] = Counter()
-    several, most = 0, OF_EFFECT * (THOROUGH if search.options.thorough else 1)
-    taken: dict[int, Shot] = {}
-    for s in shots:
+    several, most = 0, REFITS_PER_EFFECT * (THOROUGH_FACTOR if search.options.thorough else 1)
+    taken: dict[int, Score] = {}
+    for s in scores:
         c = found[s.candidate]
-        if s.candidate in taken or count[c.effect] >= most or (len(c.at) > 1 and several >= TOGETHER):
+        if s.candidate in taken or count[c.effect] >= most or (len(c.at) > 1 and several >= MAX_FAMILIES):
             continue
         count[c.effect] += 1
         several += len(c.at) > 1
@@ -170,35 +178,35 @@ def _field(search: SearchContext, found: Sequence[CandidateEffect], shots: Seque
     return [*taken.values()]
 
 
-def _led_on(
-    stand: Stand, opened: Round, trials: Sequence[CandidateFit], number: int
+def _with_neighbours_of_leaders(
+    round_model: RoundModel, opened: Round, trials: Sequence[CandidateFit], number: int
 ) -> tuple[Round, list[CandidateFit]]:
     """Return the trials with what is found from the gains of the best, again while something comes nearer."""
     trials, led = best_each(trials), dict(opened.led)
-    for _ in range(TURNS):
+    for _ in range(MAX_FOLLOWED):
         leaders = [t for t in _leaders(opened, trials) if cost_of(t) < led.get(t.pick.candidate, math.inf) - TIED]
-        if not leaders or stand.search.spent:
+        if not leaders or round_model.search.spent:
             break
         led |= {t.pick.candidate: cost_of(t) for t in leaders}
         least = cost_of(by_cost(trials)[0])
         more: list[CandidateFit] = []
         for t in leaders:
-            opened, shots = _beside(stand, opened, t, number)
-            shots = _promising(opened.before, shots, [*trials, *more])
-            more += stand.refitted(opened.candidates, shots, f"round {number}: neighbours", [*trials, *more])
+            opened, scores = _neighbours(round_model, opened, t, number)
+            scores = _promising(opened.before, scores, [*trials, *more])
+            more += round_model.refitted(opened.candidates, scores, f"round {number}: neighbours", [*trials, *more])
         trials = best_each([*trials, *more])
         if cost_of(by_cost(trials)[0]) > least - TIED:
             break
     return replace(opened, led=led), trials
 
 
-def _promising(before: Refit, shots: Sequence[Shot], trials: Sequence[CandidateFit]) -> list[Shot]:
-    """Return the shots that promise more than their candidates' refits have come to."""
+def _promising(before: Refit, scores: Sequence[Score], trials: Sequence[CandidateFit]) -> list[Score]:
+    """Return the scores that promise more than their candidates' refits have come to."""
     came_to: dict[int, float] = {}
     for t in trials:
-        if t.refit.failure in ("", BEHIND):
+        if t.refit.failure in ("", LEFT_BEHIND):
             came_to[t.pick.candidate] = min(t.refit.chi2, came_to.get(t.pick.candidate, math.inf))
-    return [s for s in shots if before.chi2 - s.fall < came_to.get(s.candidate, math.inf) - TIED]
+    return [s for s in scores if before.chi2 - s.fall < came_to.get(s.candidate, math.inf) - TIED]
 
 
 def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit]:
@@ -206,7 +214,7 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
     sound = by_cost(trials)
     if not sound:
         return []
-    least = LEVEL * (opened.before.chi2 - sound[0].refit.chi2)
+    least = LEADING_SHARE * (opened.before.chi2 - sound[0].refit.chi2)
     each: dict[str, CandidateFit] = {}
     for t in sound:
         if opened.before.chi2 - t.refit.chi2 >= least:
@@ -214,8 +222,8 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
     return list(each.values())[:BEAM]
 
 
-def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tuple[Round, list[Shot]]:
-    """Return the round and the shots of what is at the leader's places or is its effect, from the gains that the leader came to.
+def _neighbours(round_model: RoundModel, opened: Round, lead: CandidateFit, number: int) -> tuple[Round, list[Score]]:
+    """Return the round and the scores of what is at the leader's places or is its effect, from the gains that the leader came to.
 
     Its effect elsewhere, and at several places of which one is the leader's, is tried in the leader's size too, and another kind
     of delay there with a delay as long.
@@ -228,7 +236,7 @@ def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tup
     around = [k for k in same if set(found[k].at) > set(own.at)]
     parts = [k for k in same if len(found[k].at) == 1 and any(found[k].at[0] in found[f].at for f in around)]
     here = [k for k, c in enumerate(found) if set(c.at) <= set(own.at) and not c.still]
-    which = list(dict.fromkeys((*here, *like[: 2 * OF_EFFECT], *parts, *around)))
+    which = list(dict.fromkeys((*here, *like[: 2 * REFITS_PER_EFFECT], *parts, *around)))
     late = effects()[own.effect].delay_with(sizes)
     for k in which:
         if found[k].effect == own.effect:
@@ -236,16 +244,16 @@ def _beside(stand: Stand, opened: Round, lead: CandidateFit, number: int) -> tup
         elif late:
             found[k] = found[k].with_sizes(_delaying(found[k], late))
     theta = gains_of(opened.before, lead.refit)
-    screen = stand.screen(found, f"round {number}: beside {own.label}", which, theta)
+    screen = round_model.screen(found, f"round {number}: beside {own.label}", which, theta)
     best = opened.before.chi2 - lead.refit.chi2
     near = [
         s
-        for s in screen.shots
+        for s in screen.scores
         if s.candidate != lead.pick.candidate
         # Of an effect in proportion to its size the fall is exact in that, and at the leader's gains hardly moves with them.
         and s.fall >= (Race().near if in_proportion(found[s.candidate], s.probe) else Race().reach) * best
     ]
-    return replace(opened, candidates=tuple(found)), _field(stand.search, found, near)
+    return replace(opened, candidates=tuple(found)), _field(round_model.search, found, near)
 
 
 def _denser(candidate: CandidateEffect) -> CandidateEffect:
@@ -266,11 +274,11 @@ def _delaying(candidate: CandidateEffect, late: float) -> list[dict[str, float]]
     if not near:
         return []
     n = min(near, key=lambda k: near[k])
-    return [moved(candidate, n, late / (delays[n] or late))]
+    return [scaled_sizes(candidate, n, late / (delays[n] or late))]
 
 
 def _outside(
-    search: SearchContext, stand: Stand, opened: Round, trials: list[CandidateFit], number: int
+    search: SearchContext, round_model: RoundModel, opened: Round, trials: list[CandidateFit], number: int
 ) -> tuple[Round, list[CandidateFit]]:
     """Return the round with the refits of forms outside the catalogue, and the form that comes nearer than any effect, if one does.
 
@@ -280,31 +288,31 @@ def _outside(
     and leaves more than noise.
     """
     best = next(iter(by_cost(trials)), None)
-    if number > 1 or not search.options.fallback or search.spent or best is None or not _tells(opened, trials):
+    if number > 1 or not search.options.fallback or search.spent or best is None or not _explains_some(opened, trials):
         return opened, trials
     if is_noise(best.refit, search.seed):
         return opened, trials
     if opened.forms is None:
-        opened = replace(opened, forms=tried(search, opened))
-    form = standing(search, opened, opened.forms or (), best.refit)
+        opened = replace(opened, forms=refitted_forms(search, opened))
+    form = best_form(search, opened, opened.forms or (), best.refit)
     if form is None or search.spent:
         return opened, trials
     at = form.refit.placed[-1].candidate.at
     which = [k for k, c in enumerate(opened.candidates) if c.at == at and not c.still]
     text = "round 1: in the stead of a form"
-    screen = stand.screen(opened.candidates, text, which, gains_of(opened.before, form.refit))
-    shots = list(screen.best().values())[:FIELD]
-    trials = best_each([*trials, *stand.refitted(opened.candidates, shots, text, trials)])
-    return replace(opened, form=form if all_far(opened.before, trials) else None), trials
+    screen = round_model.screen(opened.candidates, text, which, gains_of(opened.before, form.refit))
+    scores = list(screen.best().values())[:FIELD]
+    trials = best_each([*trials, *round_model.refitted(opened.candidates, scores, text, trials)])
+    return replace(opened, form=form if all_far_from_noise(opened.before, trials) else None), trials
 
 
-def _tells(opened: Round, trials: Sequence[CandidateFit]) -> bool:
+def _explains_some(opened: Round, trials: Sequence[CandidateFit]) -> bool:
     """Return True where a refit takes away a share of what is beyond noise: where none does, the noise is louder than stated."""
-    least = opened.before.chi2 - telling(opened.before)
+    least = opened.before.chi2 - fall_beyond_loud_noise(opened.before)
     return any(not t.refit.failure and t.refit.chi2 < least for t in trials)
 
 
-def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit], number: int) -> Round:
+def judged_round(search: SearchContext, opened: Round, trials: Sequence[CandidateFit], number: int) -> Round:
     """The round with its refits ranked and its winner, put into the model; or what speaks against the best.
 
     Ranked by what the fitted and the held-out data say together. Of those that are as good the likeliest wins: an effect's
@@ -318,20 +326,20 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
         return replace(opened, failed=failed, why="no candidate could be refitted")
     before, found = opened.before, opened.candidates
     ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
-    ranked = sorted((gained(t, before, ruler) for t in sound), key=lambda t: -t.told)
+    ranked = sorted((with_gain(t, before, ruler) for t in sound), key=lambda t: -t.total_gain)
     if opened.form is not None:
-        return replace(opened, trials=tuple(ranked), failed=failed, ruler=ruler, why=BEYOND)
-    level = [t for t, behind in zip(ranked, behinds(ranked), strict=True) if behind <= search.options.set_bic]
-    refused = {id(t): against(search, before, t, opened, first=number == 1) for t in level}
+        return replace(opened, trials=tuple(ranked), failed=failed, ruler=ruler, why=ONLY_A_FORM)
+    level = [t for t, behind in zip(ranked, deficits(ranked), strict=True) if behind <= search.options.set_bic]
+    refused = {id(t): objection(search, before, t, opened, first=number == 1) for t in level}
     many = Counter(c.effect for c in found)
-    unlikely = {id(t): 2.0 * np.log(many[found[t.pick.candidate].effect]) - t.told for t in level}
+    unlikely = {id(t): 2.0 * np.log(many[found[t.pick.candidate].effect]) - t.total_gain for t in level}
     likeliest = sorted((t for t in level if not refused[id(t)]), key=lambda t: unlikely[id(t)])
     winner = next(iter(likeliest), None)
     if winner is not None:
         tied = [t for t in likeliest if unlikely[id(t)] <= unlikely[id(winner)] + TIED]
         winner = nearest(winner, tied, lambda t: implied(t.refit), lambda t: off_given(t.refit))
         winner = _well_named(before.model, found, winner, tied)
-        placed = in_place(before, winner.refit)
+        placed = built_in(before, winner.refit)
         if placed.failure:
             return replace(
                 opened,
@@ -340,7 +348,7 @@ def closed(search: SearchContext, opened: Round, trials: Sequence[CandidateFit],
                 ruler=ruler,
                 why=f"{found[winner.pick.candidate].label}: {placed.failure}",
             )
-        new = gained(replace(winner, refit=placed), before, ruler)
+        new = with_gain(replace(winner, refit=placed), before, ruler)
         ranked, winner = [new if t is winner else t for t in ranked], new
     why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
     return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
@@ -359,8 +367,8 @@ def _well_named(
     return next(iter(there), winner)
 
 
-def against(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:
-    """Objection to naming a trial's effect, in words; empty where there is none. opened: the round that tells what noise does."""
+def objection(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:
+    """Objection to naming a trial's effect, in words; empty where there is none. opened: the round that knows what noise does."""
     p = opened.screen.p(before.chi2 - trial.refit.chi2)
     return objections(before, trial, p, search.options, search.tolerance, first=first)
 
@@ -378,26 +386,26 @@ class SearchOutcome:
     notes: tuple[str, ...] = ()
 
 
-def from_either_side(search: SearchContext, first: Refit) -> SearchOutcome:
+def two_start_search(search: SearchContext, first: Refit) -> SearchOutcome:
     """The search from the refitted gains; where that leaves more than anybody asks about, from the given ones if it then ends nearer.
 
     Gains that have moved far to make up for what is missing may leave no room for it: beside them a lag of its true size is
-    unstable, and no score tells of it. first: the nominal model, refitted.
+    unstable, and no score shows it. first: the nominal model, refitted.
     """
-    outcome = forward(search, first)
-    theta = as_given(first)
+    outcome = forward_search(search, first)
+    theta = with_given_gains(first)
     last = outcome.refit
     if (
         theta is None
-        or not moved_far(first)
-        or not is_far(first, last)
+        or not gains_moved_far(first)
+        or not is_far_from_noise(first, last)
         or is_small(search, first, last)
         or search.spent
     ):
         return outcome
     search.tell(0, 1, "once more, from the given values")
     try:
-        again = forward(search, judged(replace(first, theta=theta)))
+        again = forward_search(search, judged(replace(first, theta=theta)))
     except FAILURES as error:
         return replace(outcome, notes=(*outcome.notes, f"from the given values nothing was looked for: {error}"))
     ruler = Ruler.of(min(last, again.refit, key=lambda r: r.chi2))
@@ -405,7 +413,7 @@ def from_either_side(search: SearchContext, first: Refit) -> SearchOutcome:
     return again if nearer else outcome
 
 
-def forward(search: SearchContext, first: Refit) -> SearchOutcome:
+def forward_search(search: SearchContext, first: Refit) -> SearchOutcome:
     """The effects that are added one after the other, each with all others refitted, until nothing is worth adding.
 
     Beside each of them, and beside none, parameters that were held are set free where the records speak against their values.
@@ -419,19 +427,19 @@ def forward(search: SearchContext, first: Refit) -> SearchOutcome:
                 return SearchOutcome(found.winner.refit, (found,), (found,))
     base, here = (first, first) if is_noise(first, search.seed) else released(search, first, first)
     if here is first:
-        return _onwards(search, first, first, [found] if found else [])
+        return _added_one_by_one(search, first, first, [found] if found else [])
     # Parameters may stand for a missing effect: then the effect has as much evidence, and they are asked again beside it.
     # Where it has no more, a candidate that was held is the likelier cause, and a stated value the less likely one.
     moved = set(here.problem.names) - set(first.problem.names)
     level = search.options.set_bic if moved & {f.name for f in search.stated} else -search.options.set_bic
     found = found or one_round(search, first, 1)
     if found.winner is not None and _behind(search, found.winner.refit, here) <= level:
-        return _onwards(search, first, first, [found])
-    with_parameters = _onwards(search, base, here, [])
+        return _added_one_by_one(search, first, first, [found])
+    with_parameters = _added_one_by_one(search, base, here, [])
     # A parameter may stand for one of several effects: that is seen when the others are there too.
     if found.winner is None or not with_parameters.kept or search.spent:
         return with_parameters
-    with_effects = _onwards(search, first, first, [found])
+    with_effects = _added_one_by_one(search, first, first, [found])
     more = len(with_effects.kept) > len(with_parameters.kept)
     behind = _behind(search, with_effects.refit, with_parameters.refit)
     return with_effects if behind <= (-search.options.named_bic if more else level) else with_parameters
@@ -444,7 +452,7 @@ def _behind(search: SearchContext, one: Refit, other: Refit) -> float:
     return evidence_between(one, other, ruler, many - few)
 
 
-def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round]) -> SearchOutcome:
+def _added_one_by_one(search: SearchContext, base: Refit, here: Refit, rounds: list[Round]) -> SearchOutcome:
     """The search from the nominal model `here`; rounds: its first, where that is done."""
     nominal = here
     kept: list[Round] = []
@@ -471,7 +479,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
                 and len(kept) + 1 < search.options.most
                 and not (search.spent or is_noise(here, search.seed))
             )
-            both = _masked(search, here, found, len(rounds) + 1) if hopeful else None
+            both = _masked_pair(search, here, found, len(rounds) + 1) if hopeful else None
             if both is None:
                 break
             rounds[-1] = both[0]
@@ -483,7 +491,7 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
                 base, here = released(search, base, here)
             break
         # Nobody asks about so little of the gap: an effect is added to it only if it explains that.
-        if little and is_far(here, found.winner.refit):
+        if little and is_far_from_noise(here, found.winner.refit):
             break
         kept.append(found)
         base, here = held_again(search, base, found.winner.refit)
@@ -495,13 +503,13 @@ def _onwards(search: SearchContext, base: Refit, here: Refit, rounds: list[Round
         little = left_by(here) <= TOLERANCE * left_by(nominal)
         # An effect that stands for another one may be why something is left.
         if 1 < len(kept) < search.options.most and not (little or search.spent):
-            here, kept, more = settled(search, base, here, kept, len(rounds))
+            here, kept, more = backward_elimination(search, base, here, kept, len(rounds))
             notes, asked_again = notes + more, here
             if is_noise(here, search.seed):
                 break
     # Where a parameter was set free beside an effect, its rivals were refitted without that.
     if kept and not search.spent and asked_again is not here and (len(kept) > 1 or _closed_to(base, kept[0])):
-        here, kept, more = settled(search, base, here, kept, len(rounds))
+        here, kept, more = backward_elimination(search, base, here, kept, len(rounds))
         notes += more
     return SearchOutcome(here, tuple(rounds), tuple(kept), notes)
 
@@ -512,7 +520,7 @@ def _closed_to(base: Refit, found: Round) -> bool:
     return bool(freed) or base.problem.experiments[0].time is not found.before.problem.experiments[0].time
 
 
-def _masked(search: SearchContext, before: Refit, found: Round, number: int) -> tuple[Round, Round] | None:
+def _masked_pair(search: SearchContext, before: Refit, found: Round, number: int) -> tuple[Round, Round] | None:
     """Two rounds whose effects pass together though the first does not alone, for one masks the other; None where none do.
 
     The best hypotheses, of different effects or places, are each searched one step further.
@@ -525,8 +533,8 @@ def _masked(search: SearchContext, before: Refit, found: Round, number: int) -> 
             continue
         if further.winner is None or further.ruler is None:
             continue
-        whole = gained(further.winner, before, further.ruler)
-        if not against(search, before, whole, further, first=True):
+        whole = with_gain(further.winner, before, further.ruler)
+        if not objection(search, before, whole, further, first=True):
             passed.append((replace(found, winner=trial, why=""), further))
     return max(passed, key=lambda pair: -pair[1].winner.refit.chi2 if pair[1].winner else -np.inf, default=None)
 
@@ -539,7 +547,7 @@ def _different(found: Round) -> list[CandidateFit]:
     return list(each.values())
 
 
-def settled(
+def backward_elimination(
     search: SearchContext, first: Refit, here: Refit, kept: Sequence[Round], number: int
 ) -> tuple[Refit, list[Round], tuple[str, ...]]:
     """The refit, by effect the round that judges its rivals, and what could not be done, after looking for each again and
@@ -549,7 +557,7 @@ def settled(
     Where all of them together are far from noise none is what is missing, and none is looked for again.
     """
     kept, notes = list(kept), []
-    near = not is_far(first, here)
+    near = not is_far_from_noise(first, here)
     k = 0
     while k < len(kept):
         search.tell(k, len(kept), f"again with the others: {here.placed[k].candidate.label}")
@@ -562,14 +570,14 @@ def settled(
         assert ruler is not None
         gain = ruler.gain(without.chi2, here.chi2, here.count - without.count)
         # An effect that was clearly there before the others came may be nothing beside them.
-        if gain <= search.options.named_bic or at_edge(here, k) or not clear(here, k):
+        if gain <= search.options.named_bic or at_edge(here, k) or not is_clear(here, k):
             here = without
             del kept[k]
             continue
         searched = _beside_these(kept[k], others, last=k == len(kept) - 1) and not _closed_to(first, kept[k])
         if near and not searched:
             try:
-                again, winner = _looked_again(
+                again, winner = _searched_again(
                     search, first, here, kept[k], k, without, number + k + 1 if len(kept) > 1 else 1
                 )
                 kept[k] = again
@@ -586,7 +594,7 @@ def _beside_these(own: Round, others: Sequence[Placed], last: bool) -> bool:
     return last and len(own.trials) > 1 and before == [p.candidate.label for p in others]
 
 
-def _looked_again(
+def _searched_again(
     search: SearchContext, first: Refit, here: Refit, found: Round, k: int, without: Refit, number: int
 ) -> tuple[Round, CandidateFit]:
     """The round that looks for the effect in place k beside the others, and its winner: one that was not best alone may be.
@@ -595,7 +603,7 @@ def _looked_again(
     """
     again = one_round(search, without, number)
     own = here.placed[k].candidate
-    again, mine = _with(again, own)
+    again, mine = _with_candidate(again, own)
     sound = [t for t in again.trials if t.pick.candidate != mine]
     tried = {own.label, *(again.candidates[t.pick.candidate].label for t in sound)}
     refits: list[tuple[Pick, RefitJob]] = []
@@ -603,24 +611,24 @@ def _looked_again(
         placed = trial.refit.placed[-1]
         among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
         with suppress(*FAILURES):  # it cannot sit there beside the others: no rival
-            job = job_of(first, here, among, {k: trial.refit.sizes(placed)})
+            job = joint_refit_job(first, here, among, {k: trial.refit.sizes(placed)})
             candidate = job.placed[k].candidate
             # Places behind an effect that is left out are one place without it.
             if candidate.label not in tried:
                 tried.add(candidate.label)
-                again, number_of = _with(again, candidate)
+                again, number_of = _with_candidate(again, candidate)
                 refits.append((Pick(number_of, 0, 1.0, 0.0), job))
     texts = [f"again with the others: {again.candidates[p.candidate].label}" for p, _ in refits]
-    ended = done(search, [j for _, j in refits], texts)
+    ended = refits_of(search, [j for _, j in refits], texts)
     sound += [CandidateFit(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
     mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
     sound.append(mine_again[0] if mine_again else CandidateFit(_pick(again, mine), _last(here, k), 0.0))
-    ranked = closed(search, again, [*sound, *again.failed], number)
+    ranked = judged_round(search, again, [*sound, *again.failed], number)
     winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
     return replace(ranked, winner=winner), winner
 
 
-def _with(found: Round, candidate: CandidateEffect) -> tuple[Round, int]:
+def _with_candidate(found: Round, candidate: CandidateEffect) -> tuple[Round, int]:
     """The round with the candidate among its own, and where it stands there."""
     for k, c in enumerate(found.candidates):
         if c.label == candidate.label:
@@ -630,17 +638,17 @@ def _with(found: Round, candidate: CandidateEffect) -> tuple[Round, int]:
 
 def _pick(found: Round, candidate: int) -> Pick:
     """The size of a candidate that the screen likes best, or its first."""
-    shot = found.screen.best().get(candidate)
-    return Pick(candidate, 0, 1.0, 0.0) if shot is None else Pick(candidate, shot.probe, shot.factor, shot.fall)
+    score = found.screen.best().get(candidate)
+    return Pick(candidate, 0, 1.0, 0.0) if score is None else Pick(candidate, score.probe, score.factor, score.fall)
 
 
 def _last(refit: Refit, k: int) -> Refit:
-    """The refit with the effect in place k told last, as that of a round is."""
+    """The refit with the effect in place k moved to the end, as that of a round is."""
     return _ordered(refit, [*(j for j in range(len(refit.placed)) if j != k), k])
 
 
 def _in_place(refit: Refit, k: int) -> Refit:
-    """The refit with the effect that is told last back in place k."""
+    """The refit with the effect that is last back in place k."""
     order = list(range(len(refit.placed) - 1))
     order.insert(k, len(refit.placed) - 1)
     return _ordered(refit, order)

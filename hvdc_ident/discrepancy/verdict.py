@@ -11,31 +11,31 @@ import numpy as np
 
 from hvdc_ident.data import FEWEST_QUIET, Array, event_time, quiet_rows
 from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, formula_rivals, likely, rivals
-from hvdc_ident.discrepancy.evidence import louder_than_noise, material_gap, worst
+from hvdc_ident.discrepancy.evidence import largest_rmse, louder_than_noise, material_gap
 from hvdc_ident.discrepancy.explain import moved_parameters
 from hvdc_ident.discrepancy.findings import finding, values_by_place
-from hvdc_ident.discrepancy.forms import instead_of
-from hvdc_ident.discrepancy.hypothesis import Refit, signal, unseen
+from hvdc_ident.discrepancy.forms import alternatives
+from hvdc_ident.discrepancy.hypothesis import Refit, prediction_error, signal
 from hvdc_ident.discrepancy.implied import implied
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
 from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict, as_line
+from hvdc_ident.discrepancy.rounds import FoundForm
 from hvdc_ident.discrepancy.search import SearchOutcome
-from hvdc_ident.discrepancy.stand import FoundForm
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.text import figures, listed, percentage, value_by_place
 
-DOMINANT = 0.5
+LEAST_EXPLAINED = 0.5
 """Share of the gap that what is named has to explain."""
 OUTSIDE = ("term", "filter")
 """Forms that no name of the catalogue stands for."""
-TOLD = 3
+MAX_LISTED_PLACES = 3
 """Places of an effect that a sentence lists."""
-STRONG = 0.1
+STRONG_SHARE = 0.1
 """Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
 that has no name: less is what a wrong idea of the noise makes."""
 
@@ -44,9 +44,9 @@ that has no name: less is what a wrong idea of the noise makes."""
 class Conclusion:
     """The verdict, why, and the tests of what is left.
 
-    sets: by effect that was put in, it and what cannot be told from it. experiment: what would show more where nothing was
+    sets: by effect that was put in, it and what cannot be distinguished from it. experiment: what would show more where nothing was
     excited, or what the doubt is about. instead: the refit of a formula outside the catalogue that explains more than what
-    would have been named. doubt: what tells that something else stands behind what was put in, though nothing else that
+    would have been named. doubt: what shows that something else stands behind what was put in, though nothing else that
     was tried explains as much. caveat: what the records do not show of a form that is named.
     """
 
@@ -74,7 +74,7 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
         floor = max(floor, last.chi2 / last.rows)
     remainder = remainder_of(search, first, last, floor)
     labels = ", ".join(p.candidate.label for p in last.placed)
-    if remainder.share > 1.0 - DOMINANT:
+    if remainder.share > 1.0 - LEAST_EXPLAINED:
         text = f"Something is missing; the best of the catalogue ({labels}) explains only {percentage(1 - remainder.share)} of the gap."
         return Conclusion("unnameable", text, tests, remainder=remainder)
     sets = tuple(rivals(r, options, search.tries) for r in outcome.kept)
@@ -96,7 +96,7 @@ def _weighed(
     remainder, each = found.remainder, [classes(g) for g in found.sets]
     sure = all(c[0].probability >= CERTAIN for c in each)
     names = "; and ".join(_class_text(c) for c in each)
-    rest = _rest(remainder, significance)
+    rest = _remainder_text(remainder, significance)
     if rest and remainder.largest > REFUTED:
         if sure or _all_of_one_kind(found.sets):
             text = f"Missing: something like {names}. It is not all of it: {rest}."
@@ -105,20 +105,20 @@ def _weighed(
                 verdict="ambiguous",
                 text=text,
                 doubt=rest,
-                experiment={"text": remains(_names(found), rest).advice},
+                experiment={"text": doubt_of_remainder(_names(found), rest).advice},
             )
         text = f"Something is missing, and no form of the catalogue has its shape: with {labels} {rest}."
         return replace(found, verdict="unnameable", text=text, sets=())
-    against = doubt(outcome.refit, left, explained)
+    against = doubt_of_size(outcome.refit, left, explained)
     if against is None and rest and not remainder.below_tolerance:
-        against = remains(_names(found), rest)
+        against = doubt_of_remainder(_names(found), rest)
     if against is not None and sure:
         return _in_doubt(found, labels, against)
     if sure and any(c[0].differs for c in each):
         return replace(
-            found, verdict="ambiguous", text=f"Missing: {names}; the records do not tell these places apart."
+            found, verdict="ambiguous", text=f"Missing: {names}; the records do not distinguish these places."
         )
-    unseen_of_it = one_way(outcome.refit) if sure else None
+    unseen_of_it = doubt_of_direction(outcome.refit) if sure else None
     if unseen_of_it is not None:
         found = replace(found, caveat=unseen_of_it.why, experiment={"text": unseen_of_it.advice})
     return replace(found, verdict="named" if sure else "ambiguous", text=f"Missing: {names}.")
@@ -133,7 +133,7 @@ def leaves_more_than_noise(judgement: Conclusion, last: Refit, *, adequate: bool
     colour than was supposed is no misfit.
     """
     left = judgement.remainder if judgement.verdict in ("named", "ambiguous") else None
-    shown = bool(judgement.doubt) or (left is not None and bool(_rest(left, significance)))
+    shown = bool(judgement.doubt) or (left is not None and bool(_remainder_text(left, significance)))
     return shown or (not adequate and max(_power_by_output(last.nominal()).values(), default=0.0) > MATTERS)
 
 
@@ -156,7 +156,7 @@ def findings_of(
     """Return the findings: of each effect that was put in its likely classes, then the held parameters whose values are off.
 
     placed: the effects that were put in, with their sentences. Beside them the values of those parameters of the model that depend
-    on which of the likely effects and places is the true one, by place. with_intervals: whether sentences tell the intervals of sizes.
+    on which of the likely effects and places is the true one, by place. with_intervals: whether sentences have the intervals of sizes.
     """
     share = None if judgement.remainder is None else 1.0 - judgement.remainder.share
     found: list[Finding] = []
@@ -196,7 +196,7 @@ def headline(
     )
 
 
-def _rest(remainder: Remainder, significance: float) -> str:
+def _remainder_text(remainder: Remainder, significance: float) -> str:
     """Return the remainder in words; empty where it may be noise, at this level."""
     parts = []
     if remainder.p <= significance and remainder.share > TOLERANCE:
@@ -217,13 +217,13 @@ def _names(found: Conclusion) -> list[str]:
 
 def _class_text(each: Sequence[EffectClass]) -> str:
     """The classes of one effect in words, those that hold 95 % together."""
-    told = []
+    texts = []
     for c in likely(each):
         at = list(dict.fromkeys([c.best.at, *(r.at for r, _ in c.members)]))
-        where = ", or at ".join(listed(places) for places in at[:TOLD])
-        more = f", or at one of {len(at) - TOLD} more places" if len(at) > TOLD else ""
-        told.append(f"{' or '.join(c.kinds)} ({percentage(c.probability)}) at {where}{more}")
-    return "; or ".join(told)
+        where = ", or at ".join(listed(places) for places in at[:MAX_LISTED_PLACES])
+        more = f", or at one of {len(at) - MAX_LISTED_PLACES} more places" if len(at) > MAX_LISTED_PLACES else ""
+        texts.append(f"{' or '.join(c.kinds)} ({percentage(c.probability)}) at {where}{more}")
+    return "; or ".join(texts)
 
 
 def tests_of(search: SearchContext, last: Refit) -> tuple[Binned, ...]:
@@ -243,9 +243,9 @@ def _with_formulas(
         if not search.options.fallback or search.spent or classes(group)[0].probability < CERTAIN:
             wider.append(group)
             continue
-        formulas = instead_of(search, found)
+        formulas = alternatives(search, found)
         behind, near = formula_rivals(found, formulas, search.options)
-        best = max((t for t, _ in formulas), key=lambda t: t.told, default=None)
+        best = max((t for t, _ in formulas), key=lambda t: t.total_gain, default=None)
         if best is not None and np.isinf(behind):
             return (), FoundForm(found.before, best.refit, best.gain)
         wide = (*(replace(r, delta_bic=r.delta_bic + behind) for r in group), *near)
@@ -264,7 +264,7 @@ def _in_doubt(found: Conclusion, labels: str, against: Doubt) -> Conclusion:
 
 
 def _all_of_one_kind(sets: tuple[tuple[Rival, ...], ...]) -> bool:
-    """Return True where all that explain most of a gap are of one kind: it is told then, though none of them is to be believed."""
+    """Return True where all that explain most of a gap are of one kind: it is named then, though none of them is to be believed."""
     return max(len(g) for g in sets) > 1 and all(_one_kind(g) for g in sets)
 
 
@@ -298,17 +298,17 @@ def noise_left(left: Nominal) -> float:
 
 def keeps_tolerance(search: SearchContext, last: Refit) -> bool:
     """Return True where a tolerance is stated and a model keeps it in every signal that has one."""
-    largest = worst(last)
+    largest = largest_rmse(last)
     return bool(search.tolerance) and all(largest.get(o, np.inf) <= band for o, band in search.tolerance.items())
 
 
 def leaves_a_gap(search: SearchContext, last: Refit) -> bool:
     """Return True where a model leaves more than the tolerance, or where none is stated clearly more than the noise."""
     share, tolerance = search.options.holdout_share, search.tolerance
-    beyond_tolerance = worst(last), dict.fromkeys(tolerance, 0.0)
+    beyond_tolerance = largest_rmse(last), dict.fromkeys(tolerance, 0.0)
     if not tolerance and louder_than_noise(last, share):
         return True
-    return material_gap(unseen(last), 1.0, share, tolerance, beyond_tolerance)
+    return material_gap(prediction_error(last), 1.0, share, tolerance, beyond_tolerance)
 
 
 def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Conclusion:
@@ -317,8 +317,8 @@ def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: 
     if found.form is not None:
         text = f"Something is missing, and nothing of the catalogue can be named: {found.why}."
         return Conclusion("unnameable", text, tests, instead=found.form)
-    refused = any(b.p <= options.significance and b.excess > STRONG * last.rows for b in tests)
-    strong = found.significant and found.screen.shots[0].fall > STRONG * last.rows
+    refused = any(b.p <= options.significance and b.excess > STRONG_SHARE * last.rows for b in tests)
+    strong = found.significant and found.screen.scores[0].fall > STRONG_SHARE * last.rows
     if (strong or refused) and leaves_a_gap(search, last):
         why = found.why or "the residuals are not noise"
         return Conclusion(
@@ -355,20 +355,20 @@ class Doubt:
     advice: str
 
 
-def doubt(last: Refit, left: Nominal, explained: float) -> Doubt | None:
+def doubt_of_size(last: Refit, left: Nominal, explained: float) -> Doubt | None:
     """Doubt because the experiments ask for different sizes of an effect in the refit `last`; None where they do not.
 
     left: its residuals; explained: by how much chi2 fell, beside which a disagreement is nothing.
     """
     for placed in last.placed:
         found, label = constancy(last, left, placed), placed.candidate.label
-        if found.p < VARYING_P and found.told > TOLERANCE * explained:
+        if found.p < VARYING_P and found.chi2_fall > TOLERANCE * explained:
             why = f"the experiments ask for different sizes of {label} (p = {found.p:.1g})"
             return Doubt(why, f"The same input in several sizes, in which {label} answers.")
     return None
 
 
-def remains(names: Sequence[str], left: str) -> Doubt:
+def doubt_of_remainder(names: Sequence[str], left: str) -> Doubt:
     """Doubt because more than noise is left: the true effect leaves nothing, one in its place does.
 
     A relay looks like a coupling with a backlash, or like a quantiser. names: the effects that were put in; left: where the
@@ -379,7 +379,7 @@ def remains(names: Sequence[str], left: str) -> Doubt:
     return Doubt(left, apart + ". ".join(f"{n}: {effects()[n].excited_by}" for n in each))
 
 
-def one_way(last: Refit) -> Doubt | None:
+def doubt_of_direction(last: Refit) -> Doubt | None:
     """Doubt because a play was passed in one direction only: whatever shifts a signal once it has moved does the same.
 
     It takes away no name, for nothing that shifts a signal so is among the hypotheses: it is said beside the name.

@@ -10,7 +10,7 @@ from cases import FREE, SIGMA, TRUE, model
 
 from hvdc_ident import Experiment, Model, simulate
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, job, judged
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, judged, refit_job
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
@@ -44,4 +44,4 @@ def beside(
     """The refit of a model with one more effect, from a size; what has no bounds stays."""
     probe = Probe(effect, FrozenMap(values), FrozenMap(bounds))
     candidate = CandidateEffect(effect, (at,), (probe,), source=source)
-    return job(before, candidate, 0, 1.0, before.theta)
+    return refit_job(before, candidate, 0, 1.0, before.theta)

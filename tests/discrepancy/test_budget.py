@@ -29,15 +29,15 @@ def rough() -> tuple[Experiment, ...]:
 
 
 def test_more_is_refitted_where_a_thorough_search_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "OF_EFFECT", 1)
+    monkeypatch.setattr(search, "REFITS_PER_EFFECT", 1)
     begun: list[str] = []
-    plain = hypothesis.job
+    plain = hypothesis.refit_job
 
     def counted(before: Refit, candidate: CandidateEffect, *given: Any) -> RefitJob:
         begun.append(candidate.label)
         return plain(before, candidate, *given)
 
-    monkeypatch.setattr("hvdc_ident.discrepancy.stand.job", counted)
+    monkeypatch.setattr("hvdc_ident.discrepancy.rounds.refit_job", counted)
     count, done = dict[bool, int](), dict[bool, Diagnosis]()
     for thorough in (False, True):
         options = DiagnosisOptions(bootstraps=100, thorough=thorough, fallback=False)
@@ -50,7 +50,7 @@ def test_more_is_refitted_where_a_thorough_search_is_asked_for(monkeypatch: pyte
 
 
 def test_a_budget_ends_the_search_and_what_was_not_tried_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(search, "OF_EFFECT", 1)
+    monkeypatch.setattr(search, "REFITS_PER_EFFECT", 1)
     options = DiagnosisOptions(bootstraps=100, budget=1e-6)
     found = diagnose(model(), rough(), FREE, effects=NAMES, options=options)
     assert any("The budget ended before" in note for note in found.notes)

@@ -79,7 +79,7 @@ def test_records_are_put_back_on_their_clocks_where_that_is_no_worse() -> None:
 def test_records_stay_where_the_hypothesis_does_not_run_on_moved_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     first = plain(experiments(late=LATE))
     search, done = search_of(first), on_their_clocks(search_of(first), first, first)
-    monkeypatch.setattr(hypothesis, "job_of", raising)
+    monkeypatch.setattr(hypothesis, "joint_refit_job", raising)
     assert on_their_clocks(search, first, first) == (first, first)
     assert as_recorded(search, *done) == done
 

@@ -12,9 +12,9 @@ from scipy.stats import kstest
 
 from hvdc_ident import InputSignal
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.discrepancy.hypothesis import Refit, run
+from hvdc_ident.discrepancy.hypothesis import Refit, refitted
 from hvdc_ident.discrepancy.residual_checks import constancy
-from hvdc_ident.discrepancy.verdict import Doubt, _turned, doubt, one_way
+from hvdc_ident.discrepancy.verdict import Doubt, _turned, doubt_of_direction, doubt_of_size
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 
@@ -25,14 +25,14 @@ def chance(refit: Refit) -> float:
 
 
 def lagged(before: Refit) -> Refit:
-    return run(beside(before, "lag", "wm", {"T": 0.02}, {"T": (1e-3, 0.3)}))
+    return refitted(beside(before, "lag", "wm", {"T": 0.02}, {"T": (1e-3, 0.3)}))
 
 
 def lossy() -> Refit:
     """A drag of third order, told as a loss by the speed."""
     before = plain(experiments(drag=lambda w: TRUE["b"] * w + 0.1 * (w - 1.0) ** 3))
     sizes = dict.fromkeys("abc", 0.01)
-    return run(beside(before, "loss", "drag", sizes, dict.fromkeys("abc", (-3.0, 3.0)), source="w"))
+    return refitted(beside(before, "loss", "drag", sizes, dict.fromkeys("abc", (-3.0, 3.0)), source="w"))
 
 
 def test_of_what_is_there_every_chance_is_as_likely() -> None:
@@ -48,7 +48,7 @@ def test_a_form_in_anothers_stead_has_a_size_in_each_experiment() -> None:
 
 def test_what_is_told_by_one_experiment_alone_or_jumps_with_its_size_is_not_asked() -> None:
     before = plain(experiments())
-    stepped = run(beside(before, "quantisation", "wm", {"step": 0.01}, {"step": (1e-3, 0.1)}))
+    stepped = refitted(beside(before, "quantisation", "wm", {"step": 0.01}, {"step": (1e-3, 0.1)}))
     assert chance(stepped) == 1.0
     alone = plain([e for e in experiments(lag=0.03) if e.name != "fit-2"])
     assert chance(lagged(alone)) == 1.0
@@ -56,7 +56,7 @@ def test_what_is_told_by_one_experiment_alone_or_jumps_with_its_size_is_not_aske
 
 def doubted(refit: Refit, explained: float = 1.0) -> Doubt | None:
     """Return the doubt about the refit's effect, or None."""
-    return doubt(refit, refit.nominal(), explained)
+    return doubt_of_size(refit, refit.nominal(), explained)
 
 
 def test_a_name_is_in_doubt_where_experiments_ask_for_different_sizes() -> None:
@@ -85,10 +85,10 @@ def test_of_a_play_that_is_passed_in_one_direction_it_is_said() -> None:
             held.append(replace(e, inputs=FrozenMap({"ref": InputSignal.corners(corners(1.0, steps))})))
         there = apply_effects(model(), [{"effect": "backlash", "at": ["ref"], "parameters": {"width": 0.2}}])
         first = plain(answered(there, held, seed=0))
-        refits[name] = run(beside(first, "backlash", "ref", {"width": 0.18}, {"width": (1e-3, 1.0)}))
-    against = one_way(refits["up"])
+        refits[name] = refitted(beside(first, "backlash", "ref", {"width": 0.18}, {"width": (1e-3, 1.0)}))
+    against = doubt_of_direction(refits["up"])
     assert against is not None and "turn by more than 0.2" in against.why and "ramps both ways" in against.advice
-    assert one_way(refits["both"]) is None
+    assert doubt_of_direction(refits["both"]) is None
 
 
 def test_a_play_that_each_record_passes_one_way_may_be_a_dead_band_and_the_record_that_would_tell_is_named() -> None:

@@ -16,7 +16,7 @@ from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy import findings as told_as
 from hvdc_ident.discrepancy.classes import classes
 from hvdc_ident.discrepancy.explain import at_given, off_given, sentence
-from hvdc_ident.discrepancy.hypothesis import run
+from hvdc_ident.discrepancy.hypothesis import refitted
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
@@ -116,8 +116,8 @@ def test_the_json_of_findings(lagged: Diagnosis) -> None:
 
 def test_what_is_left_of_the_right_effect_is_noise_and_of_a_wrong_one_is_not() -> None:
     first = plain(experiments(lag=0.03))
-    right = remainder_of(SEARCH, first, run(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-3, 0.3)})), 1.0)
-    wrong = remainder_of(SEARCH, first, run(beside(first, "gain", "wm", {"k": 1.01}, {"k": (0.5, 2.0)})), 1.0)
+    right = remainder_of(SEARCH, first, refitted(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-3, 0.3)})), 1.0)
+    wrong = remainder_of(SEARCH, first, refitted(beside(first, "gain", "wm", {"k": 1.01}, {"k": (0.5, 2.0)})), 1.0)
     assert right.p > 0.01 and right.share < 0.02
     assert wrong.p <= 0.01 and wrong.share > 0.1 and wrong.log_evidence > 20.0
 
@@ -275,7 +275,7 @@ def test_a_finding_tells_places_and_sources_apart() -> None:
     ]
     assert sentence(best, best.parameters) == "Each of eq1 and eq2 takes 0.1 of the change of its own of Q1f and Q2f"
     assert told_as._apart(best, places[:1]) == ""
-    apart = "; the records do not tell this place from Uref1 and Uref2, nor Q1f and Q2f from iq1 and iq2"
+    apart = "; the records do not distinguish this place from Uref1 and Uref2, nor Q1f and Q2f from iq1 and iq2"
     assert told_as._apart(best, places) == apart
 
 

@@ -19,12 +19,12 @@ from hvdc_ident import Experiment, InputSignal, Model, Trajectory, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.classes import formula_rivals
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, alike
-from hvdc_ident.discrepancy.forms import expression, instead_of, standing, tried, with_values
-from hvdc_ident.discrepancy.hypothesis import run
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, same_answers
+from hvdc_ident.discrepancy.forms import alternatives, best_form, expression, refitted_forms, with_values
+from hvdc_ident.discrepancy.hypothesis import refitted
 from hvdc_ident.discrepancy.options import SearchContext
+from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.discrepancy.search import one_round
-from hvdc_ident.discrepancy.stand import Round
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
@@ -184,11 +184,11 @@ def test_a_form_stands_only_where_it_beats_what_the_catalogue_has() -> None:
     first = plain(metered("w", drifting))
     search = SearchContext(("lag", "gain"), None, FrozenMap(), DiagnosisOptions(bootstraps=100, fallback=False), seed=0)
     found = one_round(search, first, 1)
-    forms = tried(search, found)
-    alone = standing(search, found, forms)
+    forms = refitted_forms(search, found)
+    alone = best_form(search, found, forms)
     assert alone is not None and expression(alone.refit) == "g*time*w"
-    assert standing(search, found, forms, best=found.trials[0].refit) is not None
-    assert standing(search, found, forms, best=alone.refit) is None
+    assert best_form(search, found, forms, best=found.trials[0].refit) is not None
+    assert best_form(search, found, forms, best=alone.refit) is None
 
 
 def polynomials(told: str) -> list[list[float]]:
@@ -311,9 +311,9 @@ def shown(changed: Model, still: str) -> tuple[Experiment, ...]:
 
 def test_formulas_near_the_winner_are_rivals_with_their_priors() -> None:
     before = plain(shown(model(), still="ref"))
-    refit = run(beside(before, "product", "outputs.w", {"g": 0.0, "k": 0.01}, {"k": (-1.0, 1.0)}, source="load"))
+    refit = refitted(beside(before, "product", "outputs.w", {"g": 0.0, "k": 0.01}, {"k": (-1.0, 1.0)}, source="load"))
     coupling = beside(before, "coupling", "outputs.w", {"k": 0.01}, {"k": (-1.0, 1.0)}, source="load")
-    winner = CandidateFit(Pick(0, 0, 1.0, 1.0), run(coupling), 100.0)
+    winner = CandidateFit(Pick(0, 0, 1.0, 1.0), refitted(coupling), 100.0)
     found = cast(Round, SimpleNamespace(winner=winner, ruler=Ruler(1800, 1800.0, 1.0)))
     near, far, ahead = (CandidateFit(winner.pick, refit, gain) for gain in (97.0, 92.0, 107.0))
     behind, rivals = formula_rivals(found, [(far, 0.5), (near, 0.25)], DiagnosisOptions())
@@ -328,7 +328,7 @@ def test_a_form_outside_the_catalogue_is_as_likely_as_an_effect() -> None:
     there = apply_effects(model(), [{"effect": "saturation", "at": ["drag"], "parameters": {"level": 0.25}}])
     search = SearchContext(("saturation",), ("drag", "torque"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     found = one_round(search, plain(answered(there, experiments(), seed=0)), 1)
-    priors = {t.refit.placed[-1].candidate.effect: prior for t, prior in instead_of(search, found)}
+    priors = {t.refit.placed[-1].candidate.effect: prior for t, prior in alternatives(search, found)}
     assert priors["polynomial"] == 0.5 and all(prior <= 0.5 for prior in priors.values())
 
 
@@ -360,10 +360,10 @@ def test_a_bend_of_a_signal_that_hardly_moves_is_its_own_tangent(change: float, 
     moved = FrozenMap({"ref": InputSignal.corners(levels), "load": InputSignal.constant(0.3)})
     cubed = apply_effects(model(), [{"effect": "polynomial", "at": ["ref"], "parameters": {"c": 0.1}}])
     before = plain(answered(cubed, [replace(e, inputs=moved) for e in experiments()], seed=5))
-    cube = run(beside(before, "polynomial", "ref", {"b": 0.0, "c": 0.1}, {"c": (-3.0, 3.0)}))
-    linear = run(beside(before, "conductance", "err", {"g": -0.3}, {"g": (-3.0, 3.0)}, source="ref"))
+    cube = refitted(beside(before, "polynomial", "ref", {"b": 0.0, "c": 0.1}, {"c": (-3.0, 3.0)}))
+    linear = refitted(beside(before, "conductance", "err", {"g": -0.3}, {"g": (-3.0, 3.0)}, source="ref"))
     assert cube.sizes(cube.placed[-1])["c"] == pytest.approx(0.1, rel=0.5 if same else 0.1)
-    assert alike(linear, cube, before) == same
+    assert same_answers(linear, cube, before) == same
 
 
 def test_a_formula_with_its_values_is_written_in_four_digits() -> None:

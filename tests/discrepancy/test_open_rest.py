@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.hypothesis import run
+from hvdc_ident.discrepancy.hypothesis import refitted
 from hvdc_ident.immutable import FrozenMap
 
 WIDTH = 0.08
@@ -75,10 +75,10 @@ def test_the_start_is_free_where_the_band_leaves_the_rest_open_and_nowhere_else(
     # The torque acts through no integrator that it could hold, and a bend passes small changes on.
     assert not beside(first, "deadband", "load", {"width": 0.05}, bounds).problem.free_initial_states
     assert not beside(first, "saturation", "err", {"level": 1.0}, {"level": (0.1, 9.0)}).problem.free_initial_states
-    found = run(job)
+    found = refitted(job)
     assert found.values["deadband_err_width"] == pytest.approx(WIDTH, rel=0.02)
     assert found.chi2 / found.rows == pytest.approx(1.0, abs=0.1) and found.holdout == pytest.approx(1.0, abs=0.1)
-    at_rest = run(replace(job, problem=replace(job.problem, free_initial_states=False)))
+    at_rest = refitted(replace(job, problem=replace(job.problem, free_initial_states=False)))
     assert at_rest.chi2 > 2.0 * found.chi2
 
 

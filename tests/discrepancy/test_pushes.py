@@ -15,7 +15,7 @@ from scipy.stats import norm
 from hvdc_ident import Experiment, InputSignal, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals
-from hvdc_ident.discrepancy.pushes import TRIED, Inversion, Pushed, Whitening, _hats, pushed
+from hvdc_ident.discrepancy.pushes import INPUT_SIZES, Inversion, Pushed, Whitening, _hats, pushed
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
@@ -163,7 +163,7 @@ def test_the_evidence_of_a_latent_input_is_that_of_a_gaussian_with_its_prior(
     latent = Inversion.of(lagged.nominal(), runs, "wm")
     told = float(latent.log_evidence(latent.wanted[:, None])[0])
     likely = []
-    for size in TRIED / latent.strength[0]:
+    for size in INPUT_SIZES / latent.strength[0]:
         spread = np.sqrt(1.0 + (size * latent.strength) ** 2)
         likely.append(norm.logpdf(latent.wanted, scale=spread).sum() - norm.logpdf(latent.wanted).sum())
     assert told == pytest.approx(max(likely), rel=1e-9) and told > 100.0

@@ -12,10 +12,10 @@ from refits import beside, plain
 
 from hvdc_ident.discrepancy import diagnose, hypothesis
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, run
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, refitted
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
+from hvdc_ident.discrepancy.rounds import Race
 from hvdc_ident.discrepancy.screen import _Runner
-from hvdc_ident.discrepancy.stand import Race
 from hvdc_ident.errors import ComputationError, InputError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
@@ -38,7 +38,7 @@ def test_where_none_is_better_than_nothing_yet_all_come_to_their_ends(
     before: Refit,
 ) -> None:
     jobs = [job(before, "lag", "wm", 0.2), job(before, "lag", "drag", 0.2)]
-    alone = [run(j) for j in jobs]
+    alone = [refitted(j) for j in jobs]
     for found, expected in zip(Race(laps=(4,)).run(SEARCH, before, jobs, ["a", "b"]), alone, strict=True):
         assert found.ended
         assert found.chi2 == pytest.approx(expected.chi2, rel=1e-4), "a walk ends where a step gains a millionth"
@@ -48,7 +48,7 @@ def test_where_none_is_better_than_nothing_yet_all_come_to_their_ends(
 def test_nothing_goes_on_that_is_out_of_reach_of_what_is_known(before: Refit) -> None:
     (left,) = Race(laps=(2,), least=0).run(SEARCH, before, [job(before, "lag", "wm", 0.2)], ["a"], best=-1e9)
     assert not left.ended
-    assert left.chi2 > run(job(before, "lag", "wm", 0.2)).chi2
+    assert left.chi2 > refitted(job(before, "lag", "wm", 0.2)).chi2
 
 
 def test_a_start_given_twice_is_run_once(before: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -60,9 +60,9 @@ def test_a_start_given_twice_is_run_once(before: Refit, monkeypatch: pytest.Monk
         return plain(self, *given, **named)
 
     monkeypatch.setattr(ModelSimulator, "simulate", counted)
-    one = run(job(before, "lag", "wm", 0.05))
+    one = refitted(job(before, "lag", "wm", 0.05))
     runs = len(count)
-    two = run(job(before, "lag", "wm", 0.05, begins=2))
+    two = refitted(job(before, "lag", "wm", 0.05, begins=2))
     assert len(count) == 2 * runs
     assert np.array_equal(one.theta, two.theta)
 
@@ -94,7 +94,7 @@ def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on
 ) -> None:
     """Wherever it raises: where its refit is made, at its first run, or where its result is judged."""
     sound, broken = job(before, "lag", "wm", 0.05), job(before, "lag", "drag", 0.05)
-    alone = run(sound)
+    alone = refitted(sound)
     for place in ("_best_walk", "judged", "_walk"):
         plain = getattr(hypothesis, place)
 
@@ -113,14 +113,14 @@ def test_a_candidate_that_raises_has_failed_with_the_reason_and_the_others_go_on
 
 def test_a_diagnosis_outlives_a_candidate_that_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     """The delay raises where its refit is made; the lag that is missing is named all the same."""
-    plain = hypothesis.job
+    plain = hypothesis.refit_job
 
     def fails(before: Refit, candidate: CandidateEffect, *given: object) -> object:
         if candidate.effect == "delay":
             raise ValueError("no such delay")
         return plain(before, candidate, *given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("hvdc_ident.discrepancy.stand.job", fails)
+    monkeypatch.setattr("hvdc_ident.discrepancy.rounds.refit_job", fails)
     found = diagnose(model(), experiments(lag=0.03), FREE, effects=["lag", "delay"], places=["wm"])
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text
     statuses = {c.effect: c.status for c in found.candidates if c.round == 1}
@@ -133,7 +133,7 @@ def test_a_candidate_that_cannot_be_screened_is_told_and_the_others_are_looked_a
     plain = _Runner.__call__
 
     def fails(of: _Runner, column: tuple[int, int]) -> object:
-        candidate = of.parcel.candidates[column[0]]
+        candidate = of.batch.candidates[column[0]]
         if (candidate.effect, candidate.at) == ("quantisation", ("err",)):
             raise np.linalg.LinAlgError("SVD did not converge")
         return plain(of, column)

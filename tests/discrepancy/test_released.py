@@ -8,7 +8,7 @@ from refits import beside
 
 from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, judged, run
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, judged, refitted
 from hvdc_ident.discrepancy.moves import _with_free, held_again, released
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import SearchContext
@@ -91,7 +91,7 @@ def test_a_parameter_that_would_have_to_be_further_off_than_it_may_stays_held() 
 
 def test_a_parameter_that_stood_for_an_effect_is_held_again_beside_it() -> None:
     search, first = held_at(0.3, experiments(lag=0.03))
-    base, here = _with_free(first, search.held[0]), run(lagged(_with_free(first, search.held[0])))
+    base, here = _with_free(first, search.held[0]), refitted(lagged(_with_free(first, search.held[0])))
     assert "b" in here.problem.names and here.values["b"] == pytest.approx(0.3, rel=0.05)
     base, here = held_again(search, base, here)
     assert "b" not in base.problem.names and "b" not in here.problem.names
@@ -101,7 +101,7 @@ def test_a_parameter_that_stood_for_an_effect_is_held_again_beside_it() -> None:
 def test_a_parameter_that_is_off_beside_an_effect_stays_free() -> None:
     search, first = held_at(0.42, experiments(lag=0.03, drag=lambda w: FRICTION * w))
     wider = _with_free(first, search.held[0])
-    base, here = held_again(search, wider, run(lagged(wider)))
+    base, here = held_again(search, wider, refitted(lagged(wider)))
     assert base is wider and here.values["b"] == pytest.approx(FRICTION, rel=0.01)
 
 

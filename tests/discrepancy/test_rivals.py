@@ -18,18 +18,18 @@ from hvdc_ident.discrepancy.evidence import (
     CandidateFit,
     Pick,
     as_recorded,
-    behinds,
-    excess,
-    like_noise,
-    misses,
+    deficits,
+    exceeds_noise,
     objections,
+    predicts_worse,
+    resembles_noise,
 )
-from hvdc_ident.discrepancy.hypothesis import Refit, run
+from hvdc_ident.discrepancy.hypothesis import Refit, refitted
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder
 from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.search import SearchOutcome, against, one_round
-from hvdc_ident.discrepancy.stand import Round
+from hvdc_ident.discrepancy.rounds import Round
+from hvdc_ident.discrepancy.search import SearchOutcome, objection, one_round
 from hvdc_ident.discrepancy.verdict import Conclusion, _weighed
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
@@ -45,16 +45,16 @@ def test_what_held_out_data_refute_sets_no_mark_for_the_others(before: Refit) ->
         return CandidateFit(Pick(0, 0, 1.0, 1.0), before, gain, told)
 
     # Best on all data; a little ahead on the fitted ones; far ahead there and refuted by the others.
-    assert behinds([trial(100.0, 200.0), trial(104.0, 190.0), trial(150.0, 20.0)]) == [0.0, 0.0, 180.0]
-    assert behinds([trial(100.0, 200.0), trial(92.0, 195.0)]) == [0.0, 5.0]
+    assert deficits([trial(100.0, 200.0), trial(104.0, 190.0), trial(150.0, 20.0)]) == [0.0, 0.0, 180.0]
+    assert deficits([trial(100.0, 200.0), trial(92.0, 195.0)]) == [0.0, 5.0]
 
 
 @pytest.mark.parametrize(("lag", "loud", "expected"), [(0.0, 1.0, True), (0.0, 1.12, True), (0.03, 1.0, False)])
 def test_somewhat_louder_noise_is_noise_and_a_shape_is_not(lag: float, loud: float, expected: bool) -> None:
     told = FrozenMap({n: s / loud for n, s in SIGMA.items()})
     refit = plain([replace(e, noise=told) for e in experiments(lag=lag)])
-    assert excess(refit) == (lag > 0.0 or loud > 1.0), "by its size alone it would not be"
-    assert like_noise(refit) == expected
+    assert exceeds_noise(refit) == (lag > 0.0 or loud > 1.0), "by its size alone it would not be"
+    assert resembles_noise(refit) == expected
 
 
 @pytest.mark.parametrize(("lag", "loud", "expected"), [(0.0, 1.12, True), (0.001, 1.0, False)])
@@ -63,8 +63,8 @@ def test_held_out_records_may_be_somewhat_louder_and_may_have_no_shape(lag: floa
     told = FrozenMap({n: s / loud for n, s in SIGMA.items()})
     held = [replace(o, noise=told) for o in other if o.role == "holdout"]
     refit = plain([*(e for e in own if e.role == "fit"), *held])
-    assert misses(refit), "by its size alone it would not be noise"
-    assert like_noise(refit) == expected
+    assert predicts_worse(refit), "by its size alone it would not be noise"
+    assert resembles_noise(refit) == expected
 
 
 def clipped(level: float) -> tuple[Experiment, ...]:
@@ -90,7 +90,7 @@ def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it()
     held = next(e for e in records if e.role == "holdout")
     assert held.measured is not None and np.abs(held.measured.values[:, 1]).max() < 0.9
     before = plain(records)
-    refit = run(beside(before, "limit", "outputs.torque", {"level": 1.45}, {"level": (0.5, 3.0)}))
+    refit = refitted(beside(before, "limit", "outputs.torque", {"level": 1.45}, {"level": (0.5, 3.0)}))
     assert before.holdout is not None
     worse = {by: replace(refit, holdout=before.holdout + by) for by in (0.002, 0.05)}
     told = {
@@ -106,7 +106,7 @@ def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it()
 def test_somewhat_louder_noise_is_not_looked_at_more_closely() -> None:
     told = FrozenMap({n: s / 1.1 for n, s in SIGMA.items()})
     records = [replace(e, noise=told) for e in experiments(seed=2)]
-    assert excess(plain(records)), "by its size alone it would be"
+    assert exceeds_noise(plain(records)), "by its size alone it would be"
     looks: list[str] = []
     found = diagnose(model(), records, FREE, progress=lambda _done, _total, text: looks.append(text))
     assert found.verdict == "no-evidence"
@@ -115,7 +115,7 @@ def test_somewhat_louder_noise_is_not_looked_at_more_closely() -> None:
 
 def test_a_slow_gap_in_slow_noise_matters_as_it_is_recorded() -> None:
     before = plain(experiments(offset=0.008, noise="ar"))
-    refit = run(beside(before, "offset", "drag", {"c": -0.008}, {"c": (-0.1, 0.1)}))
+    refit = refitted(beside(before, "offset", "drag", {"c": -0.008}, {"c": (-0.1, 0.1)}))
     assert before.holdout is not None and refit.holdout is not None
     assert 0.0 < before.holdout - refit.holdout < DiagnosisOptions().holdout_share, (
         "whitened there is hardly anything to see"
@@ -128,12 +128,12 @@ def test_a_slow_gap_in_slow_noise_matters_as_it_is_recorded() -> None:
 
 def test_where_the_model_does_not_run_at_a_size_it_begins_at_another_and_at_the_best(before: Refit) -> None:
     job = beside(before, "limit", "torque", {"level": 1e-4}, {"level": (1e-5, 10.0)})  # cannot carry the drag
-    assert run(job).failure
+    assert refitted(job).failure
     others = tuple(np.concatenate([before.theta, [level]]) for level in (2e-4, 1.0, 2.0))
-    found = run(replace(job, begins=(*job.begins, *others)))
+    found = refitted(replace(job, begins=(*job.begins, *others)))
     assert not found.failure
     assert found.chi2 <= 1.001 * before.chi2
-    best = min((run(replace(job, begins=(b,))) for b in others[1:]), key=lambda r: r.chi2)
+    best = min((refitted(replace(job, begins=(b,))) for b in others[1:]), key=lambda r: r.chi2)
     assert found.chi2 <= 1.001 * best.chi2
 
 
@@ -258,7 +258,7 @@ def tried(records: Sequence[Experiment], jobs: Sequence[tuple[str, str, dict[str
     places, names = tuple({at for _, at, _, _ in jobs}), tuple({effect for effect, _, _, _ in jobs})
     search = SearchContext(names, places, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     refits = [
-        run(beside(first, effect, at, sizes, dict.fromkeys(sizes, (-2.0, 2.0)), source))
+        refitted(beside(first, effect, at, sizes, dict.fromkeys(sizes, (-2.0, 2.0)), source))
         for effect, at, sizes, source in jobs
     ]
     assert not any(r.failure for r in refits)
@@ -300,9 +300,9 @@ def test_a_refit_that_takes_away_what_noise_gives_is_no_evidence() -> None:
     found = one_round(search, plain(experiments(lag=0.03)), 1)
     assert found.winner is not None
     poor = replace(found.winner, pick=replace(found.winner.pick, fall=1e-3))
-    assert against(search, found.before, poor, found, first=True) == ""
+    assert objection(search, found.before, poor, found, first=True) == ""
     little = replace(poor, refit=replace(poor.refit, chi2=found.before.chi2 - 2.0))
-    assert "its score is what noise gives" in against(search, found.before, little, found, first=True)
+    assert "its score is what noise gives" in objection(search, found.before, little, found, first=True)
 
 
 def test_of_effects_that_explain_as_much_the_one_with_the_fewest_places_wins(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -311,7 +311,7 @@ def test_of_effects_that_explain_as_much_the_one_with_the_fewest_places_wins(mon
     kinds = [c.effect for c in found.candidates]
     assert kinds.count("offset") == 1 < kinds.count("conductance")
     as_good = [CandidateFit(Pick(k, 0, 1.0, 500.0), found.trials[0].refit, 0.0) for k in range(len(kinds))]
-    monkeypatch.setattr(searching, "against", lambda *_args, **_first: "")
+    monkeypatch.setattr(searching, "objection", lambda *_args, **_first: "")
     for trials in (as_good, as_good[::-1]):
-        winner = searching.closed(search, found, trials, 1).winner
+        winner = searching.judged_round(search, found, trials, 1).winner
         assert winner is not None and kinds[winner.pick.candidate] == "offset"

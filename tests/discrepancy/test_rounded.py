@@ -9,7 +9,7 @@ import pytest
 from cases import FREE, SIGMA, experiments, model
 
 from hvdc_ident import Experiment, Trajectory
-from hvdc_ident.discrepancy.hypothesis import METHOD
+from hvdc_ident.discrepancy.hypothesis import OPTIMISER
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.fit import FitParameter, Problem
@@ -42,7 +42,7 @@ def _chi2(problem: Problem, uses: dict[str, tuple[EffectUse, str, tuple[float, f
         free.append(FitParameter(own, start, low, high))
         theta.append(start)
     whole = replace(problem, simulator=ModelSimulator(subject), free=tuple(free))
-    end = METHOD.run(whole, np.array(theta))
+    end = OPTIMISER.run(whole, np.array(theta))
     assert end.status == "converged", end.message
     return sum(b.chi2 for b in whole.blocks(end.theta))
 

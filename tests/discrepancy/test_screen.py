@@ -15,11 +15,11 @@ from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions
 from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
-from hvdc_ident.discrepancy.hypothesis import Refit, as_given, slot_signals
+from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals, with_given_gains
 from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.screen import ANY, CHORD, Linearised, screened
-from hvdc_ident.discrepancy.stand import Stand
+from hvdc_ident.discrepancy.rounds import RoundModel
+from hvdc_ident.discrepancy.screen import ANY_FACTOR, UP_TO_ONE, Linearised, screened
 from hvdc_ident.effects import apply_effects, effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator, Tolerance
@@ -29,16 +29,16 @@ def test_what_runs_away_is_none_of_it() -> None:
     """An unstable candidate's answer is 1e30 times the residual: none of it explains anything."""
     residual, jacobian, low, high = problems(3)
     away = 1e30 * np.exp(np.linspace(0.0, 5.0, 40))
-    step, left, factor = Linearised(residual, jacobian, low, high).stepped(away, CHORD)
+    step, left, factor = Linearised(residual, jacobian, low, high).stepped(away, UP_TO_ONE)
     without = lsq_linear(jacobian, -residual, (low, high), tol=1e-14)
     assert left <= 2.0 * without.cost * (1.0 + 1e-9) and abs(factor) * 1e30 < 10.0 * np.abs(residual).max()
     assert left > 0.5 * without.cost and np.all(step >= low) and np.all(step <= high)
 
 
-def stand(before: Refit, found: tuple[CandidateEffect, ...], bootstraps: int = 200) -> Stand:
+def round_model(before: Refit, found: tuple[CandidateEffect, ...], bootstraps: int = 200) -> RoundModel:
     """Return what the candidates of a first round are compared on."""
     search = SearchContext("all", None, FrozenMap(), DiagnosisOptions(bootstraps=bootstraps), seed=0)
-    return Stand.of(search, before, found, 1)
+    return RoundModel.of(search, before, found, 1)
 
 
 def listed(before: Refit, names: tuple[str, ...], places: tuple[str, ...] | None = None) -> tuple[CandidateEffect, ...]:
@@ -61,14 +61,14 @@ def problems(seed: int) -> tuple[Array, Array, Array, Array]:
 def test_a_step_without_bounds_is_that_of_least_squares(seed: int) -> None:
     residual, jacobian, low, high = problems(seed)
     slope = np.random.default_rng(1000 + seed).standard_normal(40)
-    step, left, factor = Linearised(residual, jacobian, 1e9 * low - 1e9, 1e9 * high + 1e9).stepped(slope, ANY)
+    step, left, factor = Linearised(residual, jacobian, 1e9 * low - 1e9, 1e9 * high + 1e9).stepped(slope, ANY_FACTOR)
     columns = np.column_stack([jacobian, slope])
     best = np.linalg.lstsq(columns, -residual)[0]
     assert np.append(step, factor) == pytest.approx(best, rel=1e-6)
     assert left == pytest.approx(float(np.sum((residual + columns @ best) ** 2)), rel=1e-9)
 
 
-@pytest.mark.parametrize("reach", [ANY, CHORD, (1.0, 1.0 + 1e-9)])
+@pytest.mark.parametrize("reach", [ANY_FACTOR, UP_TO_ONE, (1.0, 1.0 + 1e-9)])
 def test_a_step_within_bounds_is_the_best_there_is(reach: tuple[float, float]) -> None:
     """The bounds of most of these problems are reached. An effect that is held is one whose factor hardly may differ from 1."""
     reached = 0
@@ -95,8 +95,8 @@ def lagged() -> Refit:
 
 def test_a_hidden_lag_is_best_at_its_place(lagged: Refit) -> None:
     found = listed(lagged, ("lag", "gain", "limit", "offset"), ("wm", "err", "torque", "drag"))
-    told = stand(lagged, found).screen(found, "screen")
-    best = told.shots[0]
+    told = round_model(lagged, found).screen(found, "screen")
+    best = told.scores[0]
     assert found[best.candidate].label == "lag at wm"
     assert found[best.candidate].probes[best.probe].values["T"] == pytest.approx(0.03, rel=0.7)
     falls = {found[k].label: s.fall for k, s in told.best().items()}
@@ -111,9 +111,9 @@ def test_gains_that_hide_an_effect_are_left_for_those_given() -> None:
     """A lag of half the loop's period: the gains fall to a fifth, and with them others answer more like the records."""
     first = plain(experiments(lag=0.1))
     found = listed(first, ("lag", "gain", "limit", "offset", "delay", "second-order", "deadband"))
-    given = as_given(first)
+    given = with_given_gains(first)
     assert given is not None
-    ranks = [found[k].label for k in stand(first, found).screen(found, "given", point=given).best()]
+    ranks = [found[k].label for k in round_model(first, found).screen(found, "given", point=given).best()]
     assert ranks.index("lag at wm") < 5
 
 
@@ -121,15 +121,15 @@ def test_the_largest_score_under_noise_is_that_of_a_direct_computation(lagged: R
     """Of one size of one effect, whose score under white noise is chi2 with one degree of freedom."""
     (lag,) = listed(lagged, ("lag",), ("wm",))
     only = replace(lag, probes=lag.probes[:1])
-    bench = stand(lagged, (lag,), bootstraps=3000).bench
-    told = screened(bench, [only])
-    nominal = bench.nominal
+    setup = round_model(lagged, (lag,), bootstraps=3000).setup
+    told = screened(setup, [only])
+    nominal = setup.nominal
     placed = apply_effects(model(), [only.use(only.probes[0])])
     exact = ModelSimulator(placed, Tolerance(rtol=1e-9, atol=1e-11))
     there = replace(nominal.problem, simulator=exact).blocks(nominal.theta, derivatives=False)
     answer = nominal.residual - np.concatenate([b.residual for b in there])
     left = nominal.projected(answer[:, None])[:, 0]
-    direct = (left @ bench.noise) ** 2 / (left @ left)
+    direct = (left @ setup.noise) ** 2 / (left @ left)
     assert told.largest == pytest.approx(direct, rel=0.03, abs=3e-3)  # runs of a first look are exact to 1e-5
     assert told.size[0, 0] == pytest.approx(float(answer @ answer), rel=1e-3)
     assert told.left[0, 0] == pytest.approx(float(left @ left), rel=1e-3)
@@ -140,9 +140,9 @@ def test_the_largest_score_under_noise_is_that_of_a_direct_computation(lagged: R
 
 def test_of_many_candidates_the_largest_score_is_that_of_any(lagged: Refit) -> None:
     found = listed(lagged, ("lag", "gain"), ("wm", "err", "drag"))
-    bench = stand(lagged, found).bench
-    alone = [screened(bench, [c]).largest for c in found]
-    assert screened(bench, found).largest == pytest.approx(np.max(alone, axis=0), rel=0.01)
+    setup = round_model(lagged, found).setup
+    alone = [screened(setup, [c]).largest for c in found]
+    assert screened(setup, found).largest == pytest.approx(np.max(alone, axis=0), rel=0.01)
 
 
 def course(effect: str, values: dict[str, float]) -> Array:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hvdc_ident.discrepancy.hypothesis import press
+from hvdc_ident.discrepancy.hypothesis import cross_validated
 from hvdc_ident.fit.residual import ResidualBlock
 
 
@@ -44,7 +44,7 @@ def test_parts_of_a_record_are_scored_by_their_density_given_the_others(event: b
     residual = fitted(design, 3)
     parts = np.split(np.arange(rows), 4)
     # A linear model is the same about any point, and a prior about the estimate does not move it.
-    assert press([block(residual, -design)]) == pytest.approx(expected(parts, design, residual), rel=1e-9)
+    assert cross_validated([block(residual, -design)]) == pytest.approx(expected(parts, design, residual), rel=1e-9)
 
 
 def test_experiments_are_left_out_whole_and_what_no_part_tells_changes_nothing() -> None:
@@ -52,6 +52,9 @@ def test_experiments_are_left_out_whole_and_what_no_part_tells_changes_nothing()
     residual = fitted(design, 1)
     cuts = [np.arange(12), np.arange(12, 30)]
     alone = [block(residual[c], -design[c], str(k)) for k, c in enumerate(cuts)]
-    blind = [block(residual[c], -np.column_stack([design, design[:, 0], np.zeros(30)])[c], str(k)) for k, c in enumerate(cuts)]
-    assert press(alone) == pytest.approx(expected(cuts, design, residual), rel=1e-9)
-    assert press(blind) == pytest.approx(press(alone), rel=1e-6)
+    blind = [
+        block(residual[c], -np.column_stack([design, design[:, 0], np.zeros(30)])[c], str(k))
+        for k, c in enumerate(cuts)
+    ]
+    assert cross_validated(alone) == pytest.approx(expected(cuts, design, residual), rel=1e-9)
+    assert cross_validated(blind) == pytest.approx(cross_validated(alone), rel=1e-6)

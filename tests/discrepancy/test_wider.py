@@ -16,11 +16,11 @@ from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import clear
-from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, as_given, job, run
+from hvdc_ident.discrepancy.evidence import is_clear
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, refit_job, refitted, with_given_gains
 from hvdc_ident.discrepancy.movable import Form, movable
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.residual_checks import loud_after_breaks
+from hvdc_ident.discrepancy.residual_checks import is_louder_after_breaks
 from hvdc_ident.discrepancy.search import one_round
 from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
@@ -70,7 +70,7 @@ def searched(before: Refit, effects: tuple[str, ...], places: tuple[str, ...]) -
 def test_a_period_is_met_that_no_slope_leads_to() -> None:
     first = plain(records(sampled))
     job = beginning(first, "sample-hold", "wm", {"Ts": 0.039, "compute": 0.0})
-    stuck, refit = run(job), searched(first, ("sample-hold",), ("wm",))[0]
+    stuck, refit = refitted(job), searched(first, ("sample-hold",), ("wm",))[0]
     assert abs(stuck.values[job.placed[0].names["Ts"]] / PERIOD - 1.0) > 0.1
     assert refit.sizes(refit.placed[-1])["Ts"] == pytest.approx(PERIOD, rel=2e-3)
     assert refit.chi2 == pytest.approx(refit.rows, rel=0.1)
@@ -89,7 +89,7 @@ def test_a_level_that_stands_right_may_be_another_number_of_steps_from_nothing()
     job = beside(first, "quantisation", "outputs.w", {"step": 1.0 / 99.0}, {"step": (1e-3, 0.1)})
     refit = searched(first, ("quantisation",), ("outputs.w",))[0]
     assert refit.sizes(refit.placed[-1])["step"] == pytest.approx(0.01, rel=1e-4)
-    assert refit.chi2 < 0.2 * run(job).chi2
+    assert refit.chi2 < 0.2 * refitted(job).chi2
 
 
 def test_places_and_sizes_of_one_form_share_a_model() -> None:
@@ -98,40 +98,40 @@ def test_places_and_sizes_of_one_form_share_a_model() -> None:
     sizes = [Probe("lag", FrozenMap({"T": t}), FrozenMap({"T": (1e-3, 0.3)})) for t in (0.01, 0.05)]
     lags = {p: CandidateEffect("lag", (p,), tuple(sizes)) for p in ("wm", "drag")}
     moving = movable(model(), Form("lag", ("T",)), tuple(lags), ())
-    jobs = {(p, k): job(before, c, k, 1.0, before.theta, moving) for p, c in lags.items() for k in (0, 1)}
+    jobs = {(p, k): refit_job(before, c, k, 1.0, before.theta, moving) for p, c in lags.items() for k in (0, 1)}
     assert {id(j.model) for j in jobs.values()} == {id(moving.model)}
     for (place, size), moved in jobs.items():
-        end, put_in = run(moved), run(job(before, lags[place], size, 1.0, before.theta))
+        end, put_in = refitted(moved), refitted(refit_job(before, lags[place], size, 1.0, before.theta))
         assert end.chi2 == pytest.approx(put_in.chi2, rel=1e-6)
-    assert run(jobs["wm", 0]).chi2 == pytest.approx(run(jobs["wm", 1]).chi2, rel=1e-6)
+    assert refitted(jobs["wm", 0]).chi2 == pytest.approx(refitted(jobs["wm", 1]).chi2, rel=1e-6)
 
 
 def test_what_answers_within_a_few_rows_is_louder_after_breaks() -> None:
     still = [plain(experiments(seed=seed)).nominal() for seed in range(5)]
-    assert not any(loud_after_breaks(n) for n in still)
+    assert not any(is_louder_after_breaks(n) for n in still)
     there = apply_effects(model(), [{"effect": "lag", "at": ["ref"], "parameters": {"T": 0.004}}])
     quick = plain(answered(there, experiments(), seed=0)).nominal()
-    assert loud_after_breaks(quick)
+    assert is_louder_after_breaks(quick)
     # However loud everything is: only where it is loud counts.
     louder = [
         replace(n, noise=FrozenMap({o: replace(s, std=0.3 * (s.std or 0.0)) for o, s in n.noise.items()}))
         for n in still
     ]
-    assert not any(loud_after_breaks(n) for n in louder)
+    assert not any(is_louder_after_breaks(n) for n in louder)
 
 
 def test_gains_that_moved_are_given_back_as_another_start() -> None:
     before = plain(experiments(lag=0.03))
     moved = replace(before, theta=np.array([0.7, 11.0]))
-    given = as_given(moved)
+    given = with_given_gains(moved)
     assert given is not None and given.tolist() == [f.start for f in FREE]
     there = replace(before, theta=np.array([f.start for f in FREE]))
-    assert as_given(there) is None
+    assert with_given_gains(there) is None
 
 
 def test_parameters_that_are_vague_one_by_one_are_clear_together() -> None:
     before = plain(experiments(lag=0.03))
-    refit = run(beginning(before, "lead-lag", "wm", {"T1": 0.02, "T2": 0.05}))
+    refit = refitted(beginning(before, "lead-lag", "wm", {"T1": 0.02, "T2": 0.05}))
     names = [refit.placed[0].names[n] for n in ("T1", "T2")]
     at = [refit.problem.names.index(n) for n in names]
     jacobian = np.vstack([b.jacobian for b in refit.problem.blocks(refit.theta)])
@@ -139,7 +139,7 @@ def test_parameters_that_are_vague_one_by_one_are_clear_together() -> None:
     way = np.array([1.0, -1.0])
     expected = abs(float(way @ refit.theta[at])) / float(np.sqrt(way @ covariance @ way))
     assert refit.apart[0] == pytest.approx(expected, rel=0.2)  # autocorrelation, where there is some, widens it
-    assert clear(refit, 0)
+    assert is_clear(refit, 0)
 
 
 def ramped(inputs: dict[str, InputSignal]) -> Array:
@@ -183,7 +183,7 @@ def test_a_kind_of_delay_is_refitted_beside_one_that_is_right_to_first_order() -
     ends = searched(first, ("delay", "window-mean", "lag"), ("ref",))
     assert ends[0].placed[-1].candidate.effect == "window-mean" and len(ends) == 2
     assert ends[0].sizes(ends[0].placed[-1])["T"] == pytest.approx(WINDOW, rel=0.02)
-    late = run(beside(first, "delay", "ref", {"T": WINDOW / 2}, {"T": (1e-3, 0.3)}))
+    late = refitted(beside(first, "delay", "ref", {"T": WINDOW / 2}, {"T": (1e-3, 0.3)}))
     assert ends[0].chi2 < late.chi2
 
 
@@ -205,11 +205,11 @@ def test_of_parameters_that_only_a_combination_is_told_of_that_is_judged() -> No
     assert loaded.measured is not None
     shifted = replace(loaded.measured, values=np.add(loaded.measured.values, [0.02, 0.0]))
     first = plain([loaded.with_(measured=shifted)])
-    one = run(beside(first, "offset", "outputs.w", {"c": 0.01}, {"c": (-0.1, 0.1)}))
+    one = refitted(beside(first, "offset", "outputs.w", {"c": 0.01}, {"c": (-0.1, 0.1)}))
     parts = dict.fromkeys("abc", 0.005)
-    three = run(beside(first, "loss", "outputs.w", parts, dict.fromkeys("abc", (-0.1, 0.1)), source="ref"))
+    three = refitted(beside(first, "loss", "outputs.w", parts, dict.fromkeys("abc", (-0.1, 0.1)), source="ref"))
     assert sum(three.sizes(three.placed[0]).values()) == pytest.approx(-one.sizes(one.placed[0])["c"], rel=1e-3)
-    assert clear(one, 0) and one.apart[0] > 20
+    assert is_clear(one, 0) and one.apart[0] > 20
     assert three.apart[0] == pytest.approx(one.apart[0], rel=0.05)
 
 
@@ -218,7 +218,7 @@ def test_a_size_that_has_to_be_met_is_met_at_its_place_among_several() -> None:
     period = PERIOD * 1.0001  # no sample falls on a break of the inputs
     there = apply_effects(model(), [{"effect": "sample-hold", "at": ["wm"], "parameters": {"Ts": period}}])
     first = plain(answered(there, experiments(), seed=0))
-    near = run(beginning(first, "sample-hold", "err", {"Ts": period, "compute": 0.0}))
+    near = refitted(beginning(first, "sample-hold", "err", {"Ts": period, "compute": 0.0}))
     best = searched(first, ("sample-hold",), ("wm", "err", "ref"))[0]
     assert best.placed[-1].candidate.at == ("wm",)
     assert best.chi2 < 1.2 * best.rows < near.chi2
@@ -229,7 +229,7 @@ def test_a_size_of_levels_is_met_that_no_slope_leads_to() -> None:
     """Where a gain moves rows go over an edge, and no slope tells of it: begun a little off, a refit is stuck at once."""
     there = apply_effects(model(), [{"effect": "quantisation", "at": ["wm"], "parameters": {"step": 0.03}}])
     first = plain(answered(there, experiments(), seed=0))
-    stuck = run(beside(first, "quantisation", "wm", {"step": 0.0302}, {"step": (1e-3, 0.3)}))
+    stuck = refitted(beside(first, "quantisation", "wm", {"step": 0.0302}, {"step": (1e-3, 0.3)}))
     assert stuck.chi2 > 5.0 * stuck.rows
     free = searched(first, ("quantisation",), ("wm",))[0]
     assert free.chi2 < 1.2 * free.rows
@@ -242,7 +242,7 @@ def test_a_level_that_a_signal_never_reaches_is_left_for_one_that_it_does() -> N
     level, bounds = 0.9, (0.1, 6.0)
     first = plain(experiments(meter=lambda torque: np.clip(torque, -level, level)))
     job = beside(first, "limit", "outputs.torque", {"level": 3.0}, {"level": bounds})
-    stuck, found = run(job), searched(first, ("limit",), ("outputs.torque",))[0]
+    stuck, found = refitted(job), searched(first, ("limit",), ("outputs.torque",))[0]
     assert stuck.values[job.placed[-1].names["level"]] == pytest.approx(3.0)
     assert stuck.chi2 == pytest.approx(first.chi2, rel=1e-6)
     assert found.sizes(found.placed[-1])["level"] == pytest.approx(level, rel=2e-3)

@@ -14,7 +14,7 @@ from hvdc_ident import simulate as package
 from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.discrepancy import DiagnosisOptions
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import Refit, job, judged, run
+from hvdc_ident.discrepancy.hypothesis import Refit, judged, refit_job, refitted
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.search import one_round
@@ -397,11 +397,11 @@ def test_levels_are_met_that_a_loop_slides_between(large):
     case = holding(large, Hidden("quantisation", "Iline", {"step": 0.0638}), "rich", 0, 1e-3)
     before = refitted_plain(case)
     probe = Probe("quantisation", FrozenMap({"step": 0.08}), FrozenMap({"step": (1e-3, 0.5)}))
-    begun = job(before, CandidateEffect("quantisation", ("Iline",), (probe,)), 0, 1.0, before.theta)
+    begun = refit_job(before, CandidateEffect("quantisation", ("Iline",), (probe,)), 0, 1.0, before.theta)
     search = SearchContext(("quantisation",), ("Iline",), FrozenMap(), DiagnosisOptions(), 0)
     found = min((t.refit for t in one_round(search, before, 1).trials), key=lambda r: r.chi2)
     assert found.sizes(found.placed[-1])["step"] == pytest.approx(0.0638, rel=1e-3)
-    assert found.chi2 < 0.05 * run(begun).chi2
+    assert found.chi2 < 0.05 * refitted(begun).chi2
 
 
 def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere(large):

@@ -13,19 +13,19 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, excess
-from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, RefitResult, failed_at, find, job
+from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, exceeds_noise
+from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, RefitResult, failed_at, refit_job, refit_result
 from hvdc_ident.discrepancy.movable import Form, Movable
 from hvdc_ident.discrepancy.nominal import thinned
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.pushes import Pushed, pushed
-from hvdc_ident.discrepancy.screen import UNTRIED, Bench, Screen, Shot, screened
+from hvdc_ident.discrepancy.screen import NOT_TRIED, Score, Screen, ScreenSetup, screened
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit import Problem
 from hvdc_ident.model import Model
 
-BATCH = 6
+REFITS_PER_BATCH = 6
 """Refits in one piece of work, of one model where they share it: a model takes longer to send than some steps of a refit."""
 
 
@@ -51,7 +51,7 @@ class Race:
         begin anywhere begins at rest.
         """
         first = [replace(j, evaluations=self.laps[0], judged=False, problem=_from_rest(j, before)) for j in jobs]
-        refits = done(search, first, texts)
+        refits = refits_of(search, first, texts)
         left = [j.evaluations - self.laps[0] for j in jobs]
         for lap in self.laps[1:]:
             running = self._within(self.reach, before.chi2, best, refits, least=self.least)
@@ -60,7 +60,7 @@ class Race:
         near = self._within(self.near, before.chi2, best, refits, least=0)
         ends = [f"{t}, to the end" for t in texts]
         refits = _on(search, jobs, refits, near, [max(n, 1) for n in left], ends, judged=True)
-        return [r if r.rows or r.failure else replace(r, failure=BEHIND) for r in refits]
+        return [r if r.rows or r.failure else replace(r, failure=LEFT_BEHIND) for r in refits]
 
     def _within(self, share: float, before: float, best: float, refits: Sequence[Refit], least: int) -> list[int]:
         """Those that come to this share of what the best gains, and the first `least` of all."""
@@ -76,7 +76,7 @@ def _from_rest(job: RefitJob, before: Refit) -> Problem:
     return replace(job.problem, free_initial_states=before.problem.free_initial_states)
 
 
-BEHIND = "left behind: others explain far more"
+LEFT_BEHIND = "left behind: others explain far more"
 """Why a refit was not carried to its end."""
 
 
@@ -97,18 +97,18 @@ def _on(
         if judged or not refits[k].ended
     ]
     asked = [k for k in which if judged or not refits[k].ended]
-    further = done(search, again, [texts[k] for k in asked])
+    further = refits_of(search, again, [texts[k] for k in asked])
     better = {k: r for k, r in zip(asked, further, strict=True) if judged or not r.failure}
     return [better.get(k, r) for k, r in enumerate(refits)]
 
 
-def done(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) -> list[Refit]:
+def refits_of(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) -> list[Refit]:
     """The jobs' refits, in their order, wherever they are done; once the budget is over none but the first are begun."""
     if jobs:
         search.tell(0, len(jobs), texts[0])
     batches: list[list[RefitJob]] = []
     for j in jobs:
-        if batches and len(batches[-1]) < BATCH and batches[-1][-1].model is j.model:
+        if batches and len(batches[-1]) < REFITS_PER_BATCH and batches[-1][-1].model is j.model:
             batches[-1].append(j)
         else:
             batches.append([j])
@@ -117,7 +117,7 @@ def done(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) 
     for n, batch in enumerate(batches):
         if n and search.spent:
             rest = [j for b in batches[n:] for j in b]
-            refits += [Refit(j.model, j.placed, j.problem, j.noise, j.begins[0], failure=UNTRIED) for j in rest]
+            refits += [Refit(j.model, j.placed, j.problem, j.noise, j.begins[0], failure=NOT_TRIED) for j in rest]
             break
         refits += [found.refit(j) for found, j in zip(next(outcomes), batch, strict=True)]
         search.tell(len(refits), len(jobs), texts[len(refits) - 1])
@@ -125,7 +125,7 @@ def done(search: SearchContext, jobs: Sequence[RefitJob], texts: Sequence[str]) 
 
 
 def _all(jobs: Sequence[RefitJob]) -> list[RefitResult]:
-    return [find(j) for j in jobs]
+    return [refit_result(j) for j in jobs]
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,15 +169,15 @@ class Round:
 
 
 @dataclass(frozen=True, eq=False)
-class Stand:
+class RoundModel:
     """The model of a round, and what its candidates are compared on."""
 
     search: SearchContext
     before: Refit
-    bench: Bench
+    setup: ScreenSetup
 
     @classmethod
-    def of(cls, search: SearchContext, before: Refit, found: Sequence[CandidateEffect], number: int) -> Stand:
+    def of(cls, search: SearchContext, before: Refit, found: Sequence[CandidateEffect], number: int) -> RoundModel:
         """Return the stand for some candidates on a model; number: of the round, for its noise."""
         nominal = before.nominal()
         fewer = thinned(nominal)
@@ -186,7 +186,11 @@ class Stand:
         slots = before.model.insertion_points
         ends = tuple(p for p in slots if p in places), tuple(s for s in slots if s in sources)
         still = frozenset(c.at[0] for c in found if c.still and len(c.at) == 1)
-        return cls(search, before, Bench(before.model, fewer, before.patience, before.method, *ends, before.theta, noise, still))
+        return cls(
+            search,
+            before,
+            ScreenSetup(before.model, fewer, before.patience, before.method, *ends, before.theta, noise, still),
+        )
 
     def screen(
         self,
@@ -203,50 +207,50 @@ class Stand:
         """
         asked = [k for k in (range(len(found)) if which is None else which) if not found[k].still]
         columns = [(k, n) for k in asked for n in _simplest(found[k])]
-        bench = replace(self.bench, held=True) if held else self.bench  # it keeps what it has worked out
+        setup = replace(self.setup, held=True) if held else self.setup  # it keeps what it has worked out
         if point is not None:
-            bench = replace(bench, point=point, noise=bench.noise[:, :0])
+            setup = replace(setup, point=point, noise=setup.noise[:, :0])
         tell = self.search.tell
         return screened(
-            bench, found, executor=self.search.executor, tell=lambda n, of: tell(n, of, text), columns=columns,
+            setup, found, executor=self.search.executor, tell=lambda n, of: tell(n, of, text), columns=columns,
             spent=lambda: self.search.spent,
         )  # fmt: skip
 
     def movable(self, candidate: CandidateEffect, probe: int) -> Movable | None:
         """Return the model with the candidate's effect to be moved; None where it is put in: at several places, or in a closed model."""
-        model = self.bench.model
+        model = self.setup.model
         if not isinstance(model, Model) or len(candidate.at) > 1:
             return None
-        return self.bench.movable(Form.of(model, candidate, candidate.probes[probe].values))
+        return self.setup.movable(Form.of(model, candidate, candidate.probes[probe].values))
 
     def refitted(
-        self, found: Sequence[CandidateEffect], shots: Sequence[Shot], text: str, earlier: Sequence[CandidateFit] = ()
+        self, found: Sequence[CandidateEffect], scores: Sequence[Score], text: str, earlier: Sequence[CandidateFit] = ()
     ) -> list[CandidateFit]:
-        """Return the shots refitted, in a race with each other and with those refitted earlier; and their larger forms where none
+        """Return the scores refitted, in a race with each other and with those refitted earlier; and their larger forms where none
         leaves noise: beside equations of one size that do, more sizes gain nothing but their price."""
-        trials = self._raced(found, shots, text, earlier)
-        if any(not t.refit.failure and not excess(t.refit) for t in (*earlier, *trials)):
+        trials = self._raced(found, scores, text, earlier)
+        if any(not t.refit.failure and not exceeds_noise(t.refit) for t in (*earlier, *trials)):
             return trials
         wider = {
             (t.pick.candidate, n): t
             for t in trials
-            if t.refit.failure in ("", BEHIND)
-            for n in larger(found[t.pick.candidate], t.pick.probe)
+            if t.refit.failure in ("", LEFT_BEHIND)
+            for n in larger_forms(found[t.pick.candidate], t.pick.probe)
         }
-        more = [Shot(k, n, t.pick.fall, gains_of(self.before, t.refit)) for (k, n), t in wider.items()]
+        more = [Score(k, n, t.pick.fall, gains_of(self.before, t.refit)) for (k, n), t in wider.items()]
         return [*trials, *(self._raced(found, more, text, [*earlier, *trials]) if more else ())]
 
     def _raced(
-        self, found: Sequence[CandidateEffect], shots: Sequence[Shot], text: str, earlier: Sequence[CandidateFit]
+        self, found: Sequence[CandidateEffect], scores: Sequence[Score], text: str, earlier: Sequence[CandidateFit]
     ) -> list[CandidateFit]:
         jobs: list[RefitJob] = []
         of: list[Pick] = []
         trials: list[CandidateFit] = []
-        for s in sorted(shots, key=lambda s: (found[s.candidate].effect, s.candidate)):  # those of one model together
+        for s in sorted(scores, key=lambda s: (found[s.candidate].effect, s.candidate)):  # those of one model together
             pick = Pick(s.candidate, s.probe, s.factor, s.fall)
             c = found[s.candidate]
             try:
-                jobs.append(job(self.before, c, s.probe, s.factor, s.theta, self.movable(c, s.probe), s.ran))
+                jobs.append(refit_job(self.before, c, s.probe, s.factor, s.theta, self.movable(c, s.probe), s.ran))
                 of.append(pick)
             except FAILURES as error:
                 why = str(error) or type(error).__name__
@@ -267,7 +271,7 @@ def _simplest(candidate: CandidateEffect) -> list[int]:
     return [n for n, f in enumerate(forms) if f in least]
 
 
-def larger(candidate: CandidateEffect, probe: int) -> list[int]:
+def larger_forms(candidate: CandidateEffect, probe: int) -> list[int]:
     """Return the probes in whose equations those of one probe are a part."""
     forms = _forms(candidate)
     return [n for n, f in enumerate(forms) if f > forms[probe]]

@@ -16,26 +16,26 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.evidence import CandidateFit, best_each, by_cost
-from hvdc_ident.discrepancy.hypothesis import Refit, as_given
+from hvdc_ident.discrepancy.hypothesis import Refit, with_given_gains
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
-from hvdc_ident.discrepancy.screen import Shot
-from hvdc_ident.discrepancy.stand import Race, Round, Stand, gains_of
+from hvdc_ident.discrepancy.rounds import Race, Round, RoundModel, gains_of
+from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.effects import SignalScales, effects, size_grid
 
-PLACES = 4
+QUANTISER_PLACES = 4
 """Places at which a quantiser is tried in all its sizes, some thousand."""
-STRIDE = 3
+COARSE_STRIDE = 3
 """Of levels, which stand a tenth of one apart in the grid, the first look takes every third; then those between the best."""
-CLOSER = 4
+REFINEMENT = 4
 """Times closer that the sizes stand at each further look."""
-TURNS = 4
-"""Further looks: after the last the sizes stand CLOSER ** TURNS times closer than in the grid, a part in 100 000 of the size."""
-ABOUT = 0.3
+N_REFINEMENTS = 4
+"""Further looks: after the last the sizes stand REFINEMENT ** N_REFINEMENTS times closer than in the grid, a part in 100 000 of the size."""
+SIMILAR_DELAY = 0.3
 """Difference of the logarithms of two delays within which one may stand for the other."""
 
 
-def met(
-    stand: Stand, opened: Round, trials: list[CandidateFit], number: int, *, far: bool
+def with_searched_sizes(
+    round_model: RoundModel, opened: Round, trials: list[CandidateFit], number: int, *, far: bool
 ) -> tuple[Round, list[CandidateFit]]:
     """Return the round and its trials with effects whose size has to be met. far: whether nothing explains the records so far.
 
@@ -47,33 +47,39 @@ def met(
         return opened, trials
     text = f"round {number}: sizes to be met"
     mostly = [gains_of(opened.before, t.refit) for t in by_cost(trials)[:1] if t.refit.chi2 < 0.5 * opened.before.chi2]
-    given = as_given(opened.before)
+    given = with_given_gains(opened.before)
     late = {k: g for k, g in grids.items() if effects()[opened.candidates[k].effect].equivalent_delay is not None}
     levels = {k: g for k, g in grids.items() if k not in late}
     # A sampler that is missing biases the gains as a delay does; levels hardly do.
-    best = _looked_at(stand, opened, late, text, [None, *mostly, *([] if given is None else [given])], most=SHORTLIST)
-    rough = _looked_at(
-        stand, opened, {k: g[::STRIDE] for k, g in levels.items()}, text, [None, *mostly], most=SHORTLIST
+    best = _best_sizes(
+        round_model, opened, late, text, [None, *mostly, *([] if given is None else [given])], most=SHORTLIST
+    )
+    rough = _best_sizes(
+        round_model, opened, {k: g[::COARSE_STRIDE] for k, g in levels.items()}, text, [None, *mostly], most=SHORTLIST
     )
     beside = {k: _beside(grids[k], [size for size, _ in own]) for k, own in rough.items()}
-    best |= _looked_at(stand, opened, beside, text, [None, *mostly])
-    opened, trials = _refitted(stand, opened, trials, best, text)
-    for turn in range(1, TURNS + 1):
+    best |= _best_sizes(round_model, opened, beside, text, [None, *mostly])
+    opened, trials = _refitted(round_model, opened, trials, best, text)
+    for turn in range(1, N_REFINEMENTS + 1):
         for t in [t for t in by_cost(trials) if t.pick.candidate in grids][:BEAM]:
-            if stand.search.spent:
+            if round_model.search.spent:
                 break
             k, size = t.pick.candidate, _size(t.refit)
-            away = np.delete(np.arange(-CLOSER, CLOSER + 1), CLOSER) * _spacing(grids[k], size) / CLOSER**turn
-            near = _looked_at(stand, opened, {k: size + away}, text, [gains_of(opened.before, t.refit)])
-            opened, trials = _refitted(stand, opened, trials, near, text)
+            away = (
+                np.delete(np.arange(-REFINEMENT, REFINEMENT + 1), REFINEMENT)
+                * _spacing(grids[k], size)
+                / REFINEMENT**turn
+            )
+            near = _best_sizes(round_model, opened, {k: size + away}, text, [gains_of(opened.before, t.refit)])
+            opened, trials = _refitted(round_model, opened, trials, near, text)
     return opened, trials
 
 
 def _grids(opened: Round, trials: Sequence[CandidateFit], *, far: bool) -> dict[int, Array]:
     """Return by candidate the sizes to be looked at, (m,), rising."""
     found, entries = opened.candidates, effects()
-    told = [t for t in by_cost(trials) if t.refit.chi2 < opened.before.chi2][: None if far else BEAM]
-    late = {found[t.pick.candidate].at: d for t in reversed(told) if (d := _late(t.refit)) is not None}
+    better = [t for t in by_cost(trials) if t.refit.chi2 < opened.before.chi2][: None if far else BEAM]
+    late = {found[t.pick.candidate].at: d for t in reversed(better) if (d := _late(t.refit)) is not None}
     delays = any(entries[c.effect].equivalent_delay is not None and not entries[c.effect].needs_grid for c in found)
     times = [e.time for e in opened.before.problem.fitted_experiments]
     count: Counter[str] = Counter()
@@ -89,7 +95,7 @@ def _grids(opened: Round, trials: Sequence[CandidateFit], *, far: bool) -> dict[
         if entry.equivalent_delay is not None and delays:
             own = [entry.delay_with({**probe.values, _named(c): float(s)}) or 0.0 for s in sizes]
             sizes = sizes[[_alike(d, late.get(c.at, 0.0)) for d in own]]
-        elif not (far and count[c.effect] <= PLACES):
+        elif not (far and count[c.effect] <= QUANTISER_PLACES):
             continue
         else:
             sizes = sizes[sizes * _answer_per_size(opened, k) >= _least_answer(opened, trials)]
@@ -126,7 +132,7 @@ def _late(refit: Refit) -> float | None:
 
 
 def _alike(one: float, other: float) -> bool:
-    return one > 0.0 and other > 0.0 and abs(math.log(one / other)) < ABOUT
+    return one > 0.0 and other > 0.0 and abs(math.log(one / other)) < SIMILAR_DELAY
 
 
 def _named(candidate: CandidateEffect) -> str:
@@ -142,14 +148,17 @@ def _size(refit: Refit) -> float:
 def _spacing(grid: Array, size: float) -> float:
     """Return how far apart the sizes of a grid stand where one lies."""
     if grid.size < 2:
-        return size / CLOSER
+        return size / REFINEMENT
     at = min(max(int(np.searchsorted(grid, size)), 1), grid.size - 1)
     return float(grid[at] - grid[at - 1])
 
 
 def _beside(grid: Array, sizes: Sequence[float]) -> Array:
     """Return the sizes of a grid next to some of them."""
-    at = [np.arange(max(k - STRIDE + 1, 0), min(k + STRIDE, grid.size)) for k in np.searchsorted(grid, sizes)]
+    at = [
+        np.arange(max(k - COARSE_STRIDE + 1, 0), min(k + COARSE_STRIDE, grid.size))
+        for k in np.searchsorted(grid, sizes)
+    ]
     return grid[np.unique(np.concatenate(at))]
 
 
@@ -161,21 +170,21 @@ def _at(candidate: CandidateEffect, sizes: Sequence[float]) -> CandidateEffect:
     )
 
 
-def _looked_at(
-    stand: Stand,
+def _best_sizes(
+    round_model: RoundModel,
     opened: Round,
     sizes: Mapping[int, Array],
     text: str,
     points: Sequence[Array | None],
     most: int = BEAM,
-) -> dict[int, list[tuple[float, Shot]]]:
+) -> dict[int, list[tuple[float, Score]]]:
     """Return by candidate the best of some sizes, none of them neighbours, with what the screen says of them."""
     if not sizes:
         return {}
     found = [_at(c, sizes[k].tolist()) if k in sizes else c for k, c in enumerate(opened.candidates)]
-    shots = [s for point in points for s in stand.screen(found, text, list(sizes), point, held=True).shots]
-    best: dict[int, list[Shot]] = {}
-    for s in sorted(shots, key=lambda s: -s.fall):
+    scores = [s for point in points for s in round_model.screen(found, text, list(sizes), point, held=True).scores]
+    best: dict[int, list[Score]] = {}
+    for s in sorted(scores, key=lambda s: -s.fall):
         own = best.setdefault(s.candidate, [])
         if len(own) < most and all(abs(s.probe - other.probe) > 1 for other in own):
             own.append(s)
@@ -183,17 +192,17 @@ def _looked_at(
 
 
 def _refitted(
-    stand: Stand,
+    round_model: RoundModel,
     opened: Round,
     trials: Sequence[CandidateFit],
-    best: Mapping[int, Sequence[tuple[float, Shot]]],
+    best: Mapping[int, Sequence[tuple[float, Score]]],
     text: str,
 ) -> tuple[Round, list[CandidateFit]]:
     """Return the round, whose candidates have these sizes too, and the trials with the refits begun there."""
-    found, shots = list(opened.candidates), []
+    found, scores = list(opened.candidates), []
     for k, own in best.items():
         more = _at(found[k], [size for size, _ in own]).probes
-        shots += [replace(s, probe=len(found[k].probes) + n, factor=1.0) for n, (_, s) in enumerate(own)]
+        scores += [replace(s, probe=len(found[k].probes) + n, factor=1.0) for n, (_, s) in enumerate(own)]
         found[k] = replace(found[k], probes=(*found[k].probes, *more))
     opened = replace(opened, candidates=tuple(found))
-    return opened, best_each([*trials, *stand.refitted(found, shots, text, trials)])
+    return opened, best_each([*trials, *round_model.refitted(found, scores, text, trials)])
