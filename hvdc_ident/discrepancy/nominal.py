@@ -246,7 +246,7 @@ def nominal(
     held: Mapping[str, float],
     report: Mapping[str, Any] | None,
     *,
-    starts: int,
+    starts: int | None,
     seed: int,
     executor: Executor | None,
 ) -> tuple[Nominal, tuple[str, ...]]:
@@ -271,7 +271,7 @@ def nominal(
     models = {o: n.model for o, n in noise.items() if n.model and o in problem.outputs}
     quantised = {o: q for o, n in noise.items() if (q := n.quantised) is not None}
     problem = replace(problem, experiments=with_noise, rho=FrozenMap(models), quantised_noise=FrozenMap(quantised))
-    optimum, result = pilot_fit(problem, starts=starts, seed=seed, begun=begun, executor=executor)
+    optimum, result = pilot_fit(problem, starts=starts, seed=seed, begun=begun, executor=executor, misfit_expected=True)
     notes = (
         [f"Nominal fit: {result.status}, {result.message}."] if result.status in ("two-optima", "not-converged") else []
     )

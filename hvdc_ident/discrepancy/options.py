@@ -35,7 +35,7 @@ class DiagnosisOptions:
     set_bic: rivals within it join the ambiguity set.
     most: effects, at most.
     holdout_share: the held-out gap has to shrink by more than this share of the noise.
-    starts: runs of the nominal multistart.
+    starts: runs of the nominal multistart; None: 8, and more where only one of them came to the lowest cost.
     fallback: search for a form outside the catalogue.
     thorough: refit four times as many candidates of each effect.
     budget: seconds after which nothing further is looked for; None: no limit.
@@ -49,7 +49,7 @@ class DiagnosisOptions:
     set_bic: float = 6.0
     most: int = 3
     holdout_share: float = 0.1
-    starts: int = 2
+    starts: int | None = None
     fallback: bool = True
     thorough: bool = False
     budget: float | None = None
@@ -62,7 +62,7 @@ class DiagnosisOptions:
                 expected=f"at least {1 / self.significance:.0f} bootstraps",
                 got=f"{self.bootstraps}",
             )
-        if min(self.most, self.starts) < 1:
+        if min(self.most, self.starts or 1) < 1:
             raise StudyError("a number of effects or starts is below 1", where="options of a diagnosis")
 
 

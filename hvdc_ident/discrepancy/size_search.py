@@ -29,7 +29,7 @@ COARSE_STRIDE = 3
 REFINEMENT = 4
 """Times closer that the sizes stand at each further look."""
 N_REFINEMENTS = 4
-"""Further looks: after the last the sizes stand REFINEMENT ** N_REFINEMENTS times closer than in the grid, a part in 100 000 of the size."""
+"""Further looks: after the last the sizes stand REFINEMENT ** N_REFINEMENTS times closer than in the grid, 1e-5 of the size."""
 SIMILAR_DELAY = 0.3
 """Difference of the logarithms of two delays within which one may stand for the other."""
 

@@ -59,12 +59,14 @@ def fit(
     progress: Progress | None = None,
     assess: bool = True,
     begun: Sequence[StartOutcome] = (),
+    misfit_expected: bool = False,
 ) -> FitResult:
     """Return the best optimum of a multistart with its covariance, tests of its residuals and the outcome of every start.
 
     starts: runs in all (left out: 8, and more where they leave a doubt, see `search`); the first from the given start, the
     others from a seeded Latin hypercube over the bounds, nuisances from their own start. begun: a search that is taken up
-    from where its runs ended, in place of new starts.
+    from where its runs ended, in place of new starts. misfit_expected: whether the model is known to lack something, so that a misfit
+    calls for no further starts.
     optimiser: one of the catalogue, by name or with options; the ends of all but the default are refined by least squares.
     whiten: "no", "pre-event" (AR model of the noise before the event) or "residual" (of the first fit's residuals).
     assess: whether goodness and validation are wanted too.
@@ -73,7 +75,7 @@ def fit(
     not-converged; failed (no start could be simulated to an end). A run that fails raises nothing: it is in `starts`.
     """
     first = prewhitened(problem, whiten)
-    found = search(first, optimiser, starts, seed, executor, progress, begun)
+    found = search(first, optimiser, starts, seed, executor, progress, begun, misfit_expected=misfit_expected)
     points, runs = found.points, found.runs
     if all(r.status == "failed" or r.cost is None for r in runs):
         return _failed(first, points, runs, f"no start reached an end: {runs[0].message}")

@@ -102,14 +102,17 @@ def search(
     executor: Executor | None,
     progress: Progress | None,
     begun: Sequence[StartOutcome] = (),
+    *,
+    misfit_expected: bool = False,
 ) -> Search:
     """Return the runs from the given start and from others that are spread over the bounds.
 
     starts: how many; None: 8, and as many again, up to 64, as long as they leave a doubt: the lowest cost was reached once, or
     it is more than the known noise, and others ended higher. Further runs are made while all together have taken fewer
     simulations than `SIMULATIONS`. begun: the outcomes of a search for these unknowns, or more of them, that is to be taken up:
-    each of its ends is gone on from, in place of new starts. The lowest run is continued where it used up its evaluations: along
-    a narrow valley it takes more. An optimiser with options of its own keeps the evaluations it was given.
+    each of its ends is gone on from, in place of new starts. misfit_expected: whether the model is known to lack something: its
+    misfit is no doubt then. The lowest run is continued where it used up its evaluations: along a narrow valley it takes more. An
+    optimiser with options of its own keeps the evaluations it was given.
     """
     method = named(optimiser) if isinstance(optimiser, str) else optimiser or TrustRegion()
     if not isinstance(method, TrustRegion):
@@ -124,7 +127,7 @@ def search(
             runs = _runs(problem, method, points, count, len(found.runs), executor, progress)
             found = Search((*found.points, *points), (*found.runs, *runs))
             count, number = min(2 * count, most), number + 1
-            if len(found.points) >= count or not _worth_more(problem, found):
+            if len(found.points) >= count or not _worth_more(problem, found, misfit_expected=misfit_expected):
                 break
     return _continued(problem, method, found)
 
@@ -160,7 +163,7 @@ def _runs(
     return runs
 
 
-def _worth_more(problem: Problem, found: Search) -> bool:
+def _worth_more(problem: Problem, found: Search, *, misfit_expected: bool) -> bool:
     """Return whether further starts are called for, and the simulations allow them."""
     ends = found.ends
     differences = len(problem.unknowns) if approximate(problem.simulator) else 0
@@ -176,7 +179,7 @@ def _worth_more(problem: Problem, found: Search) -> bool:
             # What could be simulated cannot be again: the fit's result says so, and no start would do better.
             return False
     higher = higher_ends(problem, ends, slack)
-    return bool(higher) and (len(higher) == len(ends) - 1 or (known and unit > MATTERS))
+    return bool(higher) and (len(higher) == len(ends) - 1 or (known and unit > MATTERS and not misfit_expected))
 
 
 def slack_of(cost: float, unit: float = 1.0, effective_share: float = 1.0) -> float:

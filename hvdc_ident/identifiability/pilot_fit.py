@@ -155,12 +155,17 @@ def pilot_fit(
     begun: Sequence[StartOutcome] = (),
     executor: Executor | None = None,
     progress: Progress | None = None,
+    misfit_expected: bool = False,
 ) -> tuple[LocalAnalysis, FitResult]:
     """Return the best optimum of a multistart over the whole set of unknowns, with the weights of the misfit where needed.
 
-    starts, seed, begun: as in `fit`. Raises SimulationError, with the experiment's name, where no start could be simulated.
+    starts, seed, begun, misfit_expected: as in `fit`. Raises SimulationError, with the experiment's name, where no start could be
+    simulated.
     """
-    result = fit(problem, starts=starts, seed=seed, executor=executor, progress=progress, assess=False, begun=begun)
+    result = fit(
+        problem, starts=starts, seed=seed, executor=executor, progress=progress, assess=False, begun=begun,
+        misfit_expected=misfit_expected,
+    )  # fmt: skip
     if result.status == "failed":
         raise _failure(problem, result.message)
     weights = {

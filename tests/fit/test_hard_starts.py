@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -182,6 +183,19 @@ def test_where_one_start_alone_reached_the_lowest_cost_more_follow_by_themselves
     eight = fit(problem, starts=8, assess=False)
     assert [s.start for s in found.starts[:8]] == [s.start for s in eight.starts]  # the others come on top
     assert len(eight.starts) == 8 < len(found.starts) <= 64
+
+
+def test_a_misfit_calls_for_further_starts_unless_it_is_expected():
+    """Of eight starts over three bands of the frequency more than one finds the lowest; no model without an offset comes to the noise."""
+    record = wave_record()
+    lifted = record.with_(measured=replace(record.measured, values=record.measured.values + 0.3))
+    problem = replace(
+        wave_problem(), experiments=(lifted,), free=(FitParameter("f", 7.1, 6.5, 7.5), FitParameter("a", 1.0, 0.2, 3.0))
+    )
+    asked, expected = fit(problem, assess=False), fit(problem, assess=False, misfit_expected=True)
+    lowest = min(s.cost for s in expected.starts)
+    assert 1 < sum(s.cost < 1.01 * lowest for s in expected.starts) < len(expected.starts) == 8
+    assert len(asked.starts) == 64 and asked.values["f"] == pytest.approx(expected.values["f"], rel=1e-6)
 
 
 def test_a_search_is_taken_up_from_where_its_runs_ended():
