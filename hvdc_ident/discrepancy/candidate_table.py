@@ -6,7 +6,6 @@ import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.evidence import CandidateFit
-from hvdc_ident.discrepancy.hypothesis import prediction_error
 from hvdc_ident.discrepancy.result import Line
 from hvdc_ident.discrepancy.rounds import LEFT_BEHIND, Round
 from hvdc_ident.discrepancy.screen import Score
@@ -46,6 +45,6 @@ def _line(
     if trial is not None and trial.refit.failure != LEFT_BEHIND:
         status = f"failed: {trial.refit.failure}" if trial.refit.failure else "refitted"
         if not trial.refit.failure:
-            delta, hold = trial.gain, prediction_error(trial.refit)
+            delta, hold = trial.gain, trial.refit.unseen
             values = FrozenMap(trial.refit.sizes(trial.refit.placed[-1]))
     return Line(c.effect, c.at, fall, r.screen.p(fall), status, values, delta, hold, c.source, number)

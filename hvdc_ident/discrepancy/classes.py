@@ -21,7 +21,7 @@ from hvdc_ident.discrepancy.evidence import (
     same_answers,
 )
 from hvdc_ident.discrepancy.forms import expression
-from hvdc_ident.discrepancy.hypothesis import Refit, prediction_error
+from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.implied import TIED, apart, implied, nearest, off_given
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
@@ -329,4 +329,4 @@ def compared(first: Refit, outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
 def _hypothesis(names: tuple[str, ...], refit: Refit, evidence: float, probability: float) -> Hypothesis:
     sizes = tuple(FrozenMap(refit.sizes(p)) for p in refit.placed)
     values = FrozenMap({n: size.value for n, size in implied(refit).items()})
-    return Hypothesis(names, evidence, prediction_error(refit), probability, sizes, values)
+    return Hypothesis(names, evidence, refit.unseen, probability, sizes, values)

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.discrepancy.hypothesis import Refit, held_out, held_out_by_record, prediction_error
+from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.implied import TIED, off_given
 from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
+from hvdc_ident.discrepancy.prediction import held_out, root_mean_square_by_record
 from hvdc_ident.discrepancy.residual_checks import is_louder_after_breaks, residual_tests
 from hvdc_ident.effects import effects
 from hvdc_ident.fit.noise import SURE, freedom_of
@@ -169,7 +170,7 @@ def objections(
         return f"it gains {trial.gain:.3g} in BIC, {options.named_bic:g} would be needed"
     if at_edge(refit, last) or not is_clear(refit, last):
         return "its size cannot be distinguished from none"
-    was, now = prediction_error(before), prediction_error(refit)
+    was, now = before.predicted, refit.predicted
     if was is None or now is None:
         return "nothing can be left out to judge it by"
     # Records that an effect does not move are better or worse by the noise they hold.
@@ -203,7 +204,7 @@ def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> fl
     more: parameters that the second has more.
     """
     fitted = ruler.gain(before.chi2, after.chi2, more)
-    was, now = prediction_error(before), prediction_error(after)
+    was, now = before.predicted, after.predicted
     if was is None or now is None or not np.isfinite(was) or not np.isfinite(now):
         return fitted
     share = ruler.effective / ruler.rows / ruler.scale
@@ -228,7 +229,7 @@ def same_answers(one: Refit, other: Refit, before: Refit) -> bool:
 
 def worst_held_out_record(before: Refit, after: Refit) -> str:
     """Return in words which held-out record an effect makes worse most, with what is left there; empty where none is held out."""
-    was, now = held_out_by_record(before), held_out_by_record(after)
+    was, now = (root_mean_square_by_record(r.problem, r.theta) for r in (before, after))
     worse = {name: value for name, value in now.items() if name in was and value > was[name]}
     if not worse:
         return ""
@@ -317,7 +318,7 @@ def by_cost(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
 
 def cost_of(trial: CandidateFit) -> float:
     """Chi2 of a refit on all data plus the price of its parameters, before the scale of BIC is known."""
-    refit, held = trial.refit, prediction_error(trial.refit)
+    refit, held = trial.refit, trial.refit.predicted
     return refit.chi2 + PARAMETER_PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
 
 
@@ -328,7 +329,7 @@ def exceeds_noise(refit: Refit) -> bool:
 
 def predicts_worse(refit: Refit) -> bool:
     """Return True where a model leaves more of unseen data than of those it was fitted to, by more than chance."""
-    seen, now = max(refit.chi2 / refit.rows, 1.0), prediction_error(refit)
+    seen, now = max(refit.chi2 / refit.rows, 1.0), refit.predicted
     return now is not None and now**2 > seen * (1.0 + SURE * _power_error(refit))
 
 
@@ -339,7 +340,7 @@ def _power_error(refit: Refit) -> float:
 
 def left_by(refit: Refit) -> float:
     """Misfit beyond noise per row, of the fitted data or of the others."""
-    return max(refit.chi2 / refit.rows, (prediction_error(refit) or 0.0) ** 2) - 1.0
+    return max(refit.chi2 / refit.rows, (refit.predicted or 0.0) ** 2) - 1.0
 
 
 def all_far_from_noise(before: Refit, trials: Sequence[CandidateFit], near: float = SMALL_REMAINDER) -> bool:
@@ -362,7 +363,7 @@ def resembles_noise(refit: Refit) -> bool:
 
     Of the held-out data too, where more is left of them: their noise may be louder than that of the others.
     """
-    seen, now = max(refit.chi2 / refit.rows, 1.0), prediction_error(refit)
+    seen, now = max(refit.chi2 / refit.rows, 1.0), refit.predicted
     if (
         seen > MAX_NOISE_POWER
         or refit.correlation > MAX_LAG1_AUTOCORRELATION

@@ -10,7 +10,8 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import Placed, Refit, held_out, prediction_error, uncertainty_of
+from hvdc_ident.discrepancy.hypothesis import Placed, Refit, uncertainty_of
+from hvdc_ident.discrepancy.prediction import held_out
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, StandIn, Table
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
@@ -108,10 +109,10 @@ def gap(given: Refit, refitted: Refit, augmented: Refit) -> Gap:
     """RMSE by output and experiment of the model with the given gains, refitted, and with the effects."""
     tables = [_tables(r.problem, r.theta) for r in (given, refitted, augmented)]
     pooled: dict[str, Mapping[str, float | None]] = {
-        name: {"fit": _pooled(r.problem, r.theta), "holdout": prediction_error(r) if name != "nominal" else _held(r)}
+        name: {"fit": _pooled(r.problem, r.theta), "holdout": r.unseen if name != "nominal" else _held(r)}
         for name, r in (("nominal", given), ("refitted", refitted), ("augmented", augmented))
     }
-    was, now = prediction_error(refitted), prediction_error(augmented)
+    was, now = refitted.unseen, augmented.unseen
     shrink = None if was is None or now is None or not was > 0 or not np.isfinite(was) else 1.0 - now / was
     floor = {o: n.std for o, n in refitted.noise.items() if n.std is not None}
     held = "experiments" if refitted.holdout is not None else "parts of the fitted experiments, predicted from the rest"

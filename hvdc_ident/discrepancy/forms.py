@@ -25,7 +25,7 @@ from hvdc_ident.discrepancy.evidence import (
     with_gain,
 )
 from hvdc_ident.discrepancy.explain import sentence
-from hvdc_ident.discrepancy.hypothesis import Refit, built_in, prediction_error, uncertainty_of
+from hvdc_ident.discrepancy.hypothesis import Refit, built_in, uncertainty_of
 from hvdc_ident.discrepancy.movable import equations, in_proportion
 from hvdc_ident.discrepancy.options import REFUTED, SearchContext
 from hvdc_ident.discrepancy.pushes import answered, hats
@@ -134,7 +134,7 @@ def _gain(search: SearchContext, before: Refit, refit: Refit, best: Refit | None
     """Return what a form gains, in BIC; None where it does not stand."""
     ruler = Ruler.of(refit)
     gain = ruler.between(before, refit)
-    was, now = prediction_error(before), prediction_error(refit)
+    was, now = before.predicted, refit.predicted
     if was is None or now is None or gain <= search.options.named_bic or was - now <= search.options.holdout_share:
         return None
     if best is None:

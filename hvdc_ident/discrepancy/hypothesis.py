@@ -15,7 +15,8 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.movable import Movable, in_proportion
-from hvdc_ident.discrepancy.nominal import Nominal, of_held_out, orthonormal
+from hvdc_ident.discrepancy.nominal import Nominal, orthonormal
+from hvdc_ident.discrepancy.prediction import held_out, predictive_score, root_mean_square
 from hvdc_ident.effects import EffectUse, Probe, apply_effects, distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import FitParameter, Problem
@@ -152,10 +153,11 @@ class Refit:
     """Result of a refit. failure: why it has no result, empty where it has one.
 
     chi2: sum of squared residuals (`ResidualBlock.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
-    holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. cross_validated:
-    the root mean score of parts of the fitted ones predicted from the rest. std: standard deviation of each free parameter, of the
-    effects and of the model, by its name in the model. apart: of each effect, by how many standard deviations its parameters
-    together are off doing nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
+    holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. predicted: root
+    mean score of their prediction, or without them of parts of the fitted ones predicted from the rest (`prediction`). std: standard
+    deviation of each free parameter, of the effects and of the model, by its name in the model. apart: of each effect, by how many
+    standard deviations its parameters together are off doing nothing. ended: whether it came to its end, and was not only left where
+    its evaluations were used up.
     """
 
     model: AnyModel
@@ -167,7 +169,7 @@ class Refit:
     rows: int = 0
     correlation: float = 0.0
     holdout: float | None = None
-    cross_validated: float | None = None
+    predicted: float | None = None
     std: FrozenMap[float | None] = field(default_factory=FrozenMap)
     apart: tuple[float, ...] = ()
     failure: str = ""
@@ -177,6 +179,11 @@ class Refit:
     def values(self) -> dict[str, float]:
         """All estimated and held parameters."""
         return self.problem.values(self.theta)
+
+    @property
+    def unseen(self) -> float | None:
+        """Root mean square of the held-out residuals, in noise units; without held-out experiments the score of parts left out."""
+        return self.predicted if self.holdout is None else self.holdout
 
     @property
     def count(self) -> int:
@@ -254,7 +261,7 @@ class RefitResult:
     rows: int
     correlation: float
     holdout: float | None
-    cross_validated: float | None
+    predicted: float | None
     std: FrozenMap[float | None]
     apart: tuple[float, ...]
     failure: str
@@ -352,9 +359,10 @@ def judged(refit: Refit) -> Refit:
     wider = float(np.sqrt(max(1.0, chi2 / max(rows - len(names), 1))))
     std = {f.name: None if (s := known.std(f.name)) is None else wider * s for f in refit.problem.free}
     apart = tuple(_apart_from_nothing(refit, p, known, blocks) / wider for p in refit.placed)
+    others = held_out(refit.problem, refit.theta)
     return replace(
-        refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=holdout(refit.problem, refit.theta),
-        cross_validated=cross_validated(blocks), std=FrozenMap(std), apart=apart,
+        refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=root_mean_square(others),
+        predicted=predictive_score(blocks, others), std=FrozenMap(std), apart=apart,
     )  # fmt: skip
 
 
@@ -413,87 +421,6 @@ def _correlation(blocks: Sequence[ResidualBlock]) -> float:
     return found if found > 2.0 / np.sqrt(rows) else 0.0
 
 
-def holdout(problem: Problem, theta: Array) -> float | None:
-    """Root mean square of the held-out residuals in noise units, whitened; infinite where a held-out run fails."""
-    blocks = held_out(problem, theta)
-    if blocks is None:
-        return None
-    if not blocks:
-        return float("inf")
-    power = sum(b.chi2 + b.taken for b in blocks)
-    return float(np.sqrt(power / sum(b.residual.size for b in blocks)))
-
-
-def held_out_by_record(refit: Refit) -> dict[str, float]:
-    """Root mean square of each held-out record's residuals, in noise units; empty where there are none, or one cannot be run."""
-    squares: dict[str, list[tuple[float, int]]] = {}
-    for b in held_out(refit.problem, refit.theta) or ():
-        squares.setdefault(b.experiment, []).append((b.chi2 + b.taken, b.residual.size))
-    return {name: float(np.sqrt(sum(s for s, _ in own) / sum(n for _, n in own))) for name, own in squares.items()}
-
-
-def held_out(problem: Problem, theta: Array) -> tuple[ResidualBlock, ...] | None:
-    """The residuals of the held-out experiments; None where there are none, () where one cannot be run."""
-    others = of_held_out(problem)
-    if others is None:
-        return None
-    # An output that was never fitted has no weight of its own; its records then judge nothing. The derivatives are not
-    # needed, but with them the machine code is that of the fit: compiling another takes longer than running these.
-    try:
-        blocks = others.blocks(theta[: len(problem.free)])
-    except SimulationError:
-        return ()
-    return tuple(b for b in blocks if b.output in problem.outputs)
-
-
-def cross_validated(blocks: Sequence[ResidualBlock], parts: int = 4) -> float | None:
-    """Return the root mean score of each part of the residuals predicted from the others, in noise units; None where nothing can be
-    left out.
-
-    Parts: experiments; of a single one, stretches of its rows. The score of a part is -2 log p of its rows under the model fitted
-    to the others (to first order, Gaussian), less that of noise alone: e' S^-1 e + log det S with the prediction error e and its
-    covariance S = I + J C J'. C is that of the unknowns by the other parts and a prior that is worth one row of all data (unit
-    information, Kass and Wasserman 1995, of which BIC is the logarithm), for one part may be the only one that determines an unknown.
-    """
-    pieces = _parts(blocks, parts)
-    rows = sum(r.size for r, _ in pieces)
-    if not rows:
-        return None
-    matrix = np.asarray(sum(j.T @ j for _, j in pieces))
-    d = np.sqrt(np.where(np.diag(matrix) > 0, np.diag(matrix), 1.0))
-    information, directions = np.linalg.eigh(matrix / np.outer(d, d))
-    known = information > 1e-9 * max(information[-1], 1e-300) if information.size else information > 0
-    scaled = (
-        directions[:, known] / np.sqrt(information[known]) / d[:, None]
-    )  # in these coordinates all data have information I
-    whole = 1.0 + 1.0 / rows
-    score = 0.0
-    for r, j in pieces:
-        slopes = j @ scaled
-        gradient, rest = slopes.T @ r, whole * np.eye(slopes.shape[1]) - slopes.T @ slopes
-        error = r + slopes @ np.linalg.solve(rest, gradient)
-        pulled = slopes.T @ error
-        spread = slopes.shape[1] * np.log(whole) - np.linalg.slogdet(rest)[1]
-        score += float(error @ error - pulled @ pulled / whole + spread)
-    spare = sum(b.spare * b.residual.size for b in blocks)
-    return float(np.sqrt((score + spare) / rows))
-
-
-def _parts(blocks: Sequence[ResidualBlock], parts: int) -> list[tuple[Array, Array]]:
-    """Return the residuals and their Jacobian of each experiment; of a single one, of stretches of its rows."""
-    names = list(dict.fromkeys(b.experiment for b in blocks))
-    if len(names) > 1:
-        cuts = [[(b, slice(None)) for b in blocks if b.experiment == n] for n in names]
-    else:
-        ends = [(k / parts, (k + 1) / parts) for k in range(parts)]
-        cuts = [
-            [(b, slice(int(low * b.residual.size), int(high * b.residual.size))) for b in blocks] for low, high in ends
-        ]
-    return [
-        (np.concatenate([b.residual[c] for b, c in cut]), np.vstack([b.jacobian[c] for b, c in cut])) for cut in cuts
-    ]
-
-
 def signal(refit: Refit, place: str) -> dict[str, Array]:
     """The signal at a place of the model as refitted, by fitted experiment. Raises SimulationError where it cannot be run.
 
@@ -510,14 +437,9 @@ def signal(refit: Refit, place: str) -> dict[str, Array]:
 
 def _input(experiment: Experiment, name: str, at_rest: float) -> Array:
     """An input at the experiment's rows, (n,); at_rest: what it is where the experiment does not move it."""
-    scaled_sizes = experiment.inputs.get(name)
-    course = np.full(experiment.time.size, at_rest) if scaled_sizes is None else scaled_sizes(experiment.time)
+    moved = experiment.inputs.get(name)
+    course = np.full(experiment.time.size, at_rest) if moved is None else moved(experiment.time)
     return np.asarray(course + experiment.offsets.get(name, 0.0))
-
-
-def prediction_error(refit: Refit) -> float | None:
-    """The held-out residual in noise units; without held-out experiments that of parts left out."""
-    return refit.holdout if refit.holdout is not None else refit.cross_validated
 
 
 def refit_job(

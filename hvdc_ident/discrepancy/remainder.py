@@ -21,9 +21,10 @@ from scipy.stats import chi2
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import left_by, unseen_rows
-from hvdc_ident.discrepancy.hypothesis import Refit, held_out_by_record, prediction_error, slot_signals
+from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals
 from hvdc_ident.discrepancy.nominal import Nominal, draws, of_held_out
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE, SearchContext
+from hvdc_ident.discrepancy.prediction import root_mean_square_by_record
 from hvdc_ident.discrepancy.pushes import Inversion, Pushed, pushed
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
@@ -94,14 +95,14 @@ def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float)
 
     floor: mean square of what noise alone leaves.
     """
-    was, now = prediction_error(first), prediction_error(last)
+    was, now = first.unseen, last.unseen
     gap = first.chi2 - floor * first.rows
     share = float(np.clip((last.chi2 - floor * last.rows) / gap, 0.0, 1.0)) if gap > 0 else 0.0
     held, held_p = None, 1.0
     if was is not None and now is not None and np.isfinite(was) and was**2 > floor:
         held = float(np.clip((now**2 - floor) / (was**2 - floor), 0.0, 1.0)) if np.isfinite(now) else 1.0
         held_p = _held_out_p(search, last, now**2 / floor)
-    records = held_out_by_record(last)
+    records = root_mean_square_by_record(last.problem, last.theta)
     most = max(records, key=lambda n: records[n], default="")
     units = float(np.sqrt(last.chi2 / last.rows))
     found = Remainder(

@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.evidence import largest_rmse, louder_than_noise, mat
 from hvdc_ident.discrepancy.explain import moved_parameters
 from hvdc_ident.discrepancy.findings import finding, values_by_place
 from hvdc_ident.discrepancy.forms import alternatives
-from hvdc_ident.discrepancy.hypothesis import Refit, prediction_error, signal
+from hvdc_ident.discrepancy.hypothesis import Refit, signal
 from hvdc_ident.discrepancy.implied import implied
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE, SearchContext
@@ -308,7 +308,7 @@ def leaves_a_gap(search: SearchContext, last: Refit) -> bool:
     beyond_tolerance = largest_rmse(last), dict.fromkeys(tolerance, 0.0)
     if not tolerance and louder_than_noise(last, share):
         return True
-    return material_gap(prediction_error(last), 1.0, share, tolerance, beyond_tolerance)
+    return material_gap(last.unseen, 1.0, share, tolerance, beyond_tolerance)
 
 
 def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Conclusion:

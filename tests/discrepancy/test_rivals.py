@@ -91,8 +91,8 @@ def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it()
     assert held.measured is not None and np.abs(held.measured.values[:, 1]).max() < 0.9
     before = plain(records)
     refit = refitted(beside(before, "limit", "outputs.torque", {"level": 1.45}, {"level": (0.5, 3.0)}))
-    assert before.holdout is not None
-    worse = {by: replace(refit, holdout=before.holdout + by) for by in (0.002, 0.05)}
+    assert before.predicted is not None
+    worse = {by: replace(refit, predicted=before.predicted + by) for by in (0.002, 0.05)}
     told = {
         by: objections(
             before, CandidateFit(Pick(0, 0, 1.0, 500.0), r, 500.0), 0.005, DiagnosisOptions(), {}, first=True

@@ -1,4 +1,4 @@
-"""What a refit predicts of parts of its own records, against the same from the joint normal distribution of all rows."""
+"""What a refit predicts of held-out records and of parts of its own, against the same from the joint normal distribution of all rows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hvdc_ident.discrepancy.hypothesis import cross_validated
+from hvdc_ident.discrepancy.prediction import predictive_score
 from hvdc_ident.fit.residual import ResidualBlock
 
 
@@ -44,7 +44,9 @@ def test_parts_of_a_record_are_scored_by_their_density_given_the_others(event: b
     residual = fitted(design, 3)
     parts = np.split(np.arange(rows), 4)
     # A linear model is the same about any point, and a prior about the estimate does not move it.
-    assert cross_validated([block(residual, -design)]) == pytest.approx(expected(parts, design, residual), rel=1e-9)
+    assert predictive_score([block(residual, -design)], None) == pytest.approx(
+        expected(parts, design, residual), rel=1e-9
+    )
 
 
 def test_experiments_are_left_out_whole_and_what_no_part_tells_changes_nothing() -> None:
@@ -56,5 +58,19 @@ def test_experiments_are_left_out_whole_and_what_no_part_tells_changes_nothing()
         block(residual[c], -np.column_stack([design, design[:, 0], np.zeros(30)])[c], str(k))
         for k, c in enumerate(cuts)
     ]
-    assert cross_validated(alone) == pytest.approx(expected(cuts, design, residual), rel=1e-9)
-    assert cross_validated(blind) == pytest.approx(cross_validated(alone), rel=1e-6)
+    assert predictive_score(alone, None) == pytest.approx(expected(cuts, design, residual), rel=1e-9)
+    assert predictive_score(blind, None) == pytest.approx(predictive_score(alone, None), rel=1e-6)
+
+
+def test_a_held_out_record_is_scored_by_its_density_given_the_fitted_ones() -> None:
+    """The second unknown hardly shows in the fitted record and shows much in the other: an error along it says little."""
+    random = np.random.default_rng(2)
+    design, other = random.standard_normal((40, 2)) * [1.0, 0.05], random.standard_normal((25, 2)) * [1.0, 3.0]
+    residual = fitted(design, 4)
+    error = random.standard_normal(25) + other @ [0.0, 2.0]
+    information = design.T @ design * (1 + 1 / 40)
+    spread = np.eye(25) + other @ np.linalg.inv(information) @ other.T
+    score = -2 * multivariate_normal(np.zeros(25), spread).logpdf(error) - 25 * np.log(2 * np.pi)
+    found = predictive_score([block(residual, -design)], (block(error, -other, "other"),))
+    assert found == pytest.approx(np.sqrt(score / 25), rel=1e-9)
+    assert found is not None and found**2 < 0.5 * float(error @ error) / 25

@@ -21,6 +21,8 @@ SUMS: Mapping[str, Sequence[set[str]]] = {
 """Slots that only enter one sum together: what is added at one might as well be added at another."""
 ONLY_RECORDED: Mapping[str, Sequence[str]] = {"machine": ("Qe",), "converter": ("V", "df")}
 """Signals that nothing reads but the output of the same name: every effect at one is the same at the other."""
+ONE_SOURCE: Mapping[str, Sequence[set[str]]] = {"machine": ({"w", "dw"},), "hydro": ({"w", "dw"},)}
+"""Signals that differ by a constant, which the steady state takes up: what one brings in, so does the other."""
 ADDED = ("offset", "disturbance", "coupling", "droop", "conductance", "loss")
 
 
@@ -43,8 +45,9 @@ def is_truth(line: Line, truth: Line, told: Line, place: bool = True) -> bool:
     if not place:
         return True
     sources = {truth.get("source") or "", told.get("from") or ""}
+    one_source = len(sources) == 1 or any(sources <= group for group in ONE_SOURCE.get(line["plant"], ()))
     one_slot = len(told["at"]) == 1 and same_place(line["plant"], truth["effect"], truth["at"], told["at"][0])
-    return one_slot and len(sources) == 1
+    return one_slot and one_source
 
 
 def outcome(line: Line) -> str:
