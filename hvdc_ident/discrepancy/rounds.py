@@ -6,6 +6,7 @@ In a race all refits run a little, and those that cannot catch up with the best 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -27,6 +28,12 @@ from hvdc_ident.model import Model
 
 REFITS_PER_BATCH = 6
 """Refits in one piece of work, of one model where they share it: a model takes longer to send than some steps of a refit."""
+
+
+REFITS_PER_EFFECT = 8
+"""Refits of one effect in a field, at least where so many come into question: places that cannot be distinguished are neighbours."""
+PROMISING = 0.25
+"""Share of the candidates that are run from other unknowns, the best by the answers that they had."""
 
 
 @dataclass(frozen=True)
@@ -200,13 +207,15 @@ class RoundModel:
         point: Array | None = None,
         *,
         held: bool = False,
+        known: Screen | None = None,
     ) -> Screen:
         """Return the screen of candidates in their simplest forms.
 
-        point: where they are looked at from, instead of the optimum; held: whether their sizes are as they are.
+        point: where they are looked at from, instead of the optimum; held: whether their sizes are as they are. known: a screen from the
+        same point, whose candidates and sizes are not run again.
         """
         asked = [k for k in (range(len(found)) if which is None else which) if not found[k].still]
-        columns = [(k, n) for k in asked for n in _simplest(found[k])]
+        columns = [(k, n) for k in asked for n in _simplest(found[k]) if known is None or (k, n) not in known.answers]
         setup = replace(self.setup, held=True) if held else self.setup  # it keeps what it has worked out
         if point is not None:
             setup = replace(setup, point=point, noise=setup.noise[:, :0])
@@ -215,6 +224,18 @@ class RoundModel:
             setup, found, executor=self.search.executor, tell=lambda n, of: tell(n, of, text), columns=columns,
             spent=lambda: self.search.spent,
         )  # fmt: skip
+
+    def promising(self, screen: Screen, found: Sequence[CandidateEffect], point: Array) -> list[int]:
+        """Return the candidates that promise most from other unknowns, by their answers in a screen (`Screen.reordered`): a share of all,
+        and of each effect as many as are refitted."""
+        order = screen.reordered(replace(self.setup, point=point).without, found)
+        count: Counter[str] = Counter()
+        kept = []
+        for n, k in enumerate(order):
+            count[found[k].effect] += 1
+            if n < PROMISING * len(order) or count[found[k].effect] <= REFITS_PER_EFFECT:
+                kept.append(k)
+        return kept
 
     def movable(self, candidate: CandidateEffect, probe: int) -> Movable | None:
         """Return the model with the candidate's effect to be moved; None where it is put in: at several places, or in a closed model."""

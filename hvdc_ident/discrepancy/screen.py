@@ -9,7 +9,7 @@ from records of noise (the largest of several statistics; Westfall and Young, 19
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,7 @@ from scipy.optimize import lsq_linear
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.hypothesis import FAILURES
-from hvdc_ident.discrepancy.movable import Form, Movable, is_proportional, movable, on_loop
+from hvdc_ident.discrepancy.movable import Form, Movable, in_proportion, is_proportional, movable, on_loop
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.effects import apply_effects, distance_from_neutral, effects
 from hvdc_ident.executor import Executor, mapped
@@ -67,7 +67,7 @@ class Screen:
 
     scores: those that run, the best first. size, left: by candidate and probe the square of the answer in noise units, and what
     of it the parameters leave. largest: (B,) the largest score of all in each record of noise. failures: by candidate why none
-    of its sizes runs.
+    of its sizes runs. answers: by candidate and probe what it adds to the residual, sketched (`Sketch`).
     """
 
     scores: tuple[Score, ...]
@@ -75,6 +75,7 @@ class Screen:
     left: Mapping[tuple[int, int], float]
     largest: Array
     failures: Mapping[int, str]
+    answers: Mapping[tuple[int, int], NDArray[np.float32]] = field(default_factory=dict)
 
     def p(self, fall: float) -> float:
         """Return the chance that noise alone makes chi2 fall as much anywhere."""
@@ -86,6 +87,20 @@ class Screen:
         for s in self.scores:
             found.setdefault(s.candidate, s)
         return found
+
+    def reordered(self, at: Linearised, candidates: Sequence[CandidateEffect]) -> list[int]:
+        """Return the candidates by chi2 after a step from elsewhere, the best first, with the answers that they had where they were run.
+
+        at: the model without effects there. Answers beside other unknowns are not those there: this is an order, which costs no run.
+        """
+        sketch = Sketch(at.residual.size)
+        slopes = np.column_stack([sketch(column) for column in at.jacobian.T])
+        there = Linearised(sketch(at.residual), slopes, at.low, at.high)
+        best: dict[int, float] = {}
+        for (k, n), added in self.answers.items():
+            reach = _reach(candidates[k], n) if in_proportion(candidates[k], n) else UP_TO_ONE
+            best[k] = min(there.stepped(added.astype(float), reach)[1], best.get(k, np.inf))
+        return sorted(best, key=lambda k: best[k])
 
     def usable(self, column: tuple[int, int]) -> bool:
         """Return True for a size that the experiments excite and the parameters cannot make good."""
@@ -138,6 +153,32 @@ class Linearised:
             factor = float(step[-1]) / size
         chi2 += float(2.0 * asked @ step + step @ square @ step)
         return step[: scale.size] / scale, max(chi2, 0.0), factor
+
+
+SKETCHED = 1024
+"""Sums of rows that are kept of an answer: products of two answers are those of all rows to a thirtieth of their lengths."""
+
+
+@dataclass(frozen=True)
+class Sketch:
+    """Sums of rows with random signs, which keep the products of columns about as they are (Charikar, Chen and Farach-Colton 2002).
+
+    rows: number N of a column's rows.
+    """
+
+    rows: int
+
+    @cached_property
+    def _sums(self) -> tuple[NDArray[np.intp], Array]:
+        random = np.random.default_rng(0)
+        return random.integers(SKETCHED, size=self.rows), random.choice([-1.0, 1.0], size=self.rows)
+
+    def __call__(self, column: Array) -> Array:
+        """Return (m,) of a column (N,)."""
+        if self.rows <= SKETCHED:
+            return column
+        to, sign = self._sums
+        return np.asarray(np.bincount(to, sign * column, SKETCHED), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,6 +258,7 @@ class _BatchResult:
     left: dict[tuple[int, int], float]
     largest: Array
     failures: dict[int, str]
+    answers: dict[tuple[int, int], NDArray[np.float32]]
 
 
 def screened(
@@ -239,21 +281,22 @@ def screened(
     size: dict[tuple[int, int], float] = {}
     left: dict[tuple[int, int], float] = {}
     failures: dict[int, str] = {}
+    answers: dict[tuple[int, int], NDArray[np.float32]] = {}
     largest = np.zeros(setup.noise.shape[1])
     for done, found in enumerate(mapped(executor, _screened_batch, batches), start=1):
         scores += found.scores
         size |= found.size
         left |= found.left
         failures |= found.failures
+        answers |= found.answers
         largest = np.maximum(largest, found.largest)
         tell(done, len(batches))
         if spent():
             failures |= {k: NOT_TRIED for batch in batches[done:] for k, _ in batch.columns}
             break
     ran = {s.candidate for s in scores}
-    return Screen(
-        ranked(scores, candidates), size, left, largest, {k: why for k, why in failures.items() if k not in ran}
-    )
+    failures = {k: why for k, why in failures.items() if k not in ran}
+    return Screen(ranked(scores, candidates), size, left, largest, failures, answers)
 
 
 def ranked(scores: Iterable[Score], candidates: Sequence[CandidateEffect]) -> tuple[Score, ...]:
@@ -291,7 +334,7 @@ def _screened_batch(batch: _Batch) -> _BatchResult:
     setup, nominal, runner = batch.setup, batch.setup.nominal, _Runner(batch)
     was = setup.without.residual
     chi2 = float(nominal.residual @ nominal.residual)
-    found = _BatchResult([], {}, {}, np.zeros(setup.noise.shape[1]), {})
+    found, sketch = _BatchResult([], {}, {}, np.zeros(setup.noise.shape[1]), {}, {}), Sketch(was.size)
     answers: dict[tuple[int, int], Array] = {}
     units: list[Array] = []
     several = any(len(batch.candidates[k].at) > 1 for k, _ in batch.columns)
@@ -307,6 +350,7 @@ def _screened_batch(batch: _Batch) -> _BatchResult:
         found.scores.append(Score(*column, chi2 - fell, setup.point + step, factor, setup.point))
         left = nominal.projected((was - r)[:, None])[:, 0]
         found.size[column], found.left[column] = float(np.sum((was - r) ** 2)), float(left @ left)
+        found.answers[column] = sketch(r - was).astype(np.float32)
         if several:
             answers[column] = was - r
         if found.size[column] >= EXCITED_CHI2 and found.left[column] > LEAST_SHARE_LEFT * found.size[column]:
@@ -352,6 +396,7 @@ def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: 
         step, fell, factor = setup.without.stepped(-answer, UP_TO_ONE)
         left = nominal.projected(answer[:, None])[:, 0]
         found.size[k, n], found.left[k, n] = float(answer @ answer), float(left @ left)
+        found.answers[k, n] = Sketch(answer.size)(-answer).astype(np.float32)
         found.scores.append(Score(k, n, chi2 - fell, setup.point + step, factor))
 
 
@@ -359,6 +404,12 @@ def _distance(candidate: CandidateEffect, probe: int) -> float:
     """Return how far a probe is from doing nothing."""
     away = distance_from_neutral(effects()[candidate.effect], candidate.probes[probe].values)
     return max((abs(v) for v in away.values()), default=0.0)
+
+
+def _reach(candidate: CandidateEffect, probe: int) -> tuple[float, float]:
+    """Return the factors on the size of a candidate in proportion to it that a step may ask for."""
+    free = candidate.probes[probe].free
+    return ANY_FACTOR if any(low < 0.0 for low, _ in free.values()) else (0.0, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -371,8 +422,7 @@ class _Runner:
         """Factors on the size that a step may ask for."""
         if not any(is_proportional(m.form) for m in self.batch.movable.values()):
             return UP_TO_ONE
-        free = self.batch.candidates[column[0]].probes[column[1]].free
-        return ANY_FACTOR if any(low < 0.0 for low, _ in free.values()) else (0.0, np.inf)
+        return _reach(self.batch.candidates[column[0]], column[1])
 
     @cached_property
     def _problems(self) -> Mapping[bool, Problem]:

@@ -59,14 +59,12 @@ from hvdc_ident.discrepancy.moves import clocks, held_again, on_their_clocks, re
 from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.residual_checks import tones
-from hvdc_ident.discrepancy.rounds import LEFT_BEHIND, Race, Round, RoundModel, gains_of, refits_of
-from hvdc_ident.discrepancy.screen import Score
+from hvdc_ident.discrepancy.rounds import LEFT_BEHIND, REFITS_PER_EFFECT, Race, Round, RoundModel, gains_of, refits_of
+from hvdc_ident.discrepancy.screen import Score, ranked
 from hvdc_ident.discrepancy.size_search import with_searched_sizes
 from hvdc_ident.effects import effects
 from hvdc_ident.model import AnyModel
 
-REFITS_PER_EFFECT = 8
-"""Refits of one effect in a field, at least where so many come into question: places that cannot be distinguished are neighbours."""
 THOROUGH_FACTOR = 4
 """Times as many of a thorough search."""
 MAX_FAMILIES = 6
@@ -146,8 +144,15 @@ def _explored(
         found = opened.candidates
         # Gains that make up for an effect may leave no trace of it.
         for point in (None,) if given is None else (None, given):
-            where = f"{text}: {'once more' if point is None else 'from the given values'}"
-            scores = _field(search, found, round_model.screen(found, where, point=point).scores)
+            if point is None:
+                where = f"{text}: once more"
+                denser = round_model.screen(found, where, known=opened.screen)
+                every = ranked((*opened.screen.scores, *denser.scores), found)
+            else:
+                where = f"{text}: from the given values"
+                which = round_model.promising(opened.screen, found, point)
+                every = round_model.screen(found, where, which, point).scores
+            scores = _field(search, found, every)
             trials = best_each([*trials, *round_model.refitted(found, scores, where, trials)])
         opened, trials = _with_neighbours_of_leaders(round_model, opened, trials, number)
     elif given is not None and not search.spent:

@@ -46,19 +46,18 @@ def with_searched_sizes(
     if not grids:
         return opened, trials
     text = f"round {number}: sizes to be met"
-    mostly = [gains_of(opened.before, t.refit) for t in by_cost(trials)[:1] if t.refit.chi2 < 0.5 * opened.before.chi2]
+    # Beside the gains of what explains most of the misfit; where nothing does, beside those without an effect.
+    best_of_all = [t.refit for t in by_cost(trials)[:1] if t.refit.chi2 < 0.5 * opened.before.chi2]
+    points: list[Array | None] = [*(gains_of(opened.before, r) for r in best_of_all)] or [None]
     given = with_given_gains(opened.before)
     late = {k: g for k, g in grids.items() if effects()[opened.candidates[k].effect].equivalent_delay is not None}
     levels = {k: g for k, g in grids.items() if k not in late}
     # A sampler that is missing biases the gains as a delay does; levels hardly do.
-    best = _best_sizes(
-        round_model, opened, late, text, [None, *mostly, *([] if given is None else [given])], most=SHORTLIST
-    )
-    rough = _best_sizes(
-        round_model, opened, {k: g[::COARSE_STRIDE] for k, g in levels.items()}, text, [None, *mostly], most=SHORTLIST
-    )
+    best = _best_sizes(round_model, opened, late, text, [*points, *([] if given is None else [given])], most=SHORTLIST)
+    coarse = {k: g[::COARSE_STRIDE] for k, g in levels.items()}
+    rough = _best_sizes(round_model, opened, coarse, text, points, most=SHORTLIST)
     beside = {k: _beside(grids[k], [size for size, _ in own]) for k, own in rough.items()}
-    best |= _best_sizes(round_model, opened, beside, text, [None, *mostly])
+    best |= _best_sizes(round_model, opened, beside, text, points)
     opened, trials = _refitted(round_model, opened, trials, best, text)
     for turn in range(1, N_REFINEMENTS + 1):
         for t in [t for t in by_cost(trials) if t.pick.candidate in grids][:BEAM]:

@@ -19,7 +19,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals, with_given_ga
 from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.rounds import RoundModel
-from hvdc_ident.discrepancy.screen import ANY_FACTOR, UP_TO_ONE, Linearised, screened
+from hvdc_ident.discrepancy.screen import ANY_FACTOR, SKETCHED, UP_TO_ONE, Linearised, Sketch, _Runner, screened
 from hvdc_ident.effects import apply_effects, effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator, Tolerance
@@ -115,6 +115,40 @@ def test_gains_that_hide_an_effect_are_left_for_those_given() -> None:
     assert given is not None
     ranks = [found[k].label for k in round_model(first, found).screen(found, "given", point=given).best()]
     assert ranks.index("lag at wm") < 5
+    # The answers from beside the fitted gains tell it, too: those at other unknowns need a run for the best of them only.
+    stand = round_model(first, found)
+    known = stand.screen(found, "fitted")
+    promising = [found[k].label for k in stand.promising(known, found, given)]
+    assert promising.index("lag at wm") < 5 and len(promising) < len(known.best())
+
+
+def test_sizes_that_were_run_are_not_run_again(lagged: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = listed(lagged, ("lag", "limit"), ("wm", "err"))
+    stand = round_model(lagged, found)
+    known = stand.screen(found, "once")
+    more = tuple(c.with_sizes([{"T": 0.0123}]) if c.effect == "lag" else c for c in found)
+    runs: list[tuple[int, int]] = []
+    plain_run = _Runner.__call__
+
+    def counted(runner: _Runner, column: tuple[int, int]) -> Array:
+        runs.append(column)
+        return plain_run(runner, column)
+
+    monkeypatch.setattr(_Runner, "__call__", counted)
+    again = stand.screen(more, "again", known=known)
+    assert sorted(runs) == sorted((k, len(c.probes)) for k, c in enumerate(found) if c.effect == "lag")
+    assert {s.candidate for s in again.scores} == {k for k, _ in runs}
+
+
+def test_a_sketch_keeps_products() -> None:
+    random = np.random.default_rng(5)
+    one, other = random.standard_normal((2, 20_000))
+    sketch = Sketch(one.size)
+    mixed = one + 0.5 * other
+    exact = mixed @ one / np.linalg.norm(mixed) / np.linalg.norm(one)
+    a, b = sketch(mixed), sketch(one)
+    assert a.size == SKETCHED and a @ b / np.linalg.norm(a) / np.linalg.norm(b) == pytest.approx(exact, abs=0.03)
+    assert Sketch(100)(one[:100]).tolist() == one[:100].tolist()
 
 
 def test_the_largest_score_under_noise_is_that_of_a_direct_computation(lagged: Refit) -> None:
