@@ -76,11 +76,11 @@ def fit(
     found = search(first, optimiser, starts, seed, executor, progress, begun)
     points, runs = found.points, found.runs
     if all(r.status == "failed" or r.cost is None for r in runs):
-        return _failed(first, points, runs, f"no start reached an end: {runs[0].message}")
+        return failed(first, points, runs, f"no start reached an end: {runs[0].message}")
     try:
         problem, result = _result(first, points, runs, whiten)
     except SimulationError as e:
-        return _failed(first, points, runs, f"the optimum cannot be simulated again: {e}")
+        return failed(first, points, runs, f"the optimum cannot be simulated again: {e}")
     return assessed(problem, result) if assess else result
 
 
@@ -114,8 +114,9 @@ def _result(
     outcomes = _outcomes(problem, points, runs, weigh=problem is not first)
     near = [o for o in optima[1:] if (o.cost - best.cost) * effective_share < DISTINCT]
     status, message = _status(problem, best, near, outcomes, effective_share, trend, refitted=refitted)
-    noise = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
-    judged = adequacy(problem, blocks, noise, inner.effective, inner.rho)
+    result = result_at(problem, best, blocks, inner.rho, inner.effective)
+    judged = result.adequacy
+    assert judged is not None
     jump = 0.0 if trend is None else LUCK * trend.roughness
     doubt = _doubt(problem, best, outcomes, samples, effective_share, jump)
     message = f"{doubt}; {message}" if doubt else message
@@ -123,41 +124,61 @@ def _result(
     estimates = estimates_of(problem, best.theta, blocks, inner, everything, systematic=judged.systematic)
     estimates = _with_placed(problem, best.theta, estimates, placed)
     estimates = _with_rivals(problem, estimates, near)
-    squares = sum(float(b.residual @ b.residual) for b in blocks)
-    in_time = blocks if problem.band is None else problem.blocks(best.theta, derivatives=False, in_time=True)
-    return problem, FitResult(
+    nuisance = {
+        e.name: FrozenMap({n: estimates[unknown_of(e.name, n)] for n in e.nuisance})
+        for e in problem.fitted_experiments
+        if e.nuisance
+    }
+    return problem, replace(
+        result,
         status=status,
         message=message,
-        fitted=tuple(f.name for f in problem.free),
-        held=_held(problem),
-        values=FrozenMap(problem.values(best.theta)),
         estimates=FrozenMap({f.name: estimates[f.name] for f in problem.free}),
-        nuisance=FrozenMap(
-            {
-                e.name: FrozenMap({n: estimates[unknown_of(e.name, n)] for n in e.nuisance})
-                for e in problem.fitted_experiments
-                if e.nuisance
-            }
-        ),
-        cost=best.cost,
-        chi2_per_dof=squares / (samples - best.theta.size) if samples > best.theta.size else None,
-        rmse=problem.rmse(best.theta),
-        rmse_start=problem.rmse_start,
-        rmse_given=problem.rmse_given,
-        adequacy=judged,
+        nuisance=FrozenMap(nuisance),
         roughness={} if trend is None else {"delta_chi2": 2.0 * trend.roughness, "text": trend.text},
-        noise_source=FrozenMap(noise),
-        sigma=problem.sigma,
-        rho=inner.rho,
-        effective_samples=inner.effective,
         correlation=inner.correlation(),
-        residual_tests=residual_tests(in_time, problem.fitted_experiments),
         starts=outcomes,
         search_doubt=doubt,
-        loss=problem.loss.name,
-        whitening={o: m for o, m in problem.treatment.whitening.items() if any(m)},
         dof=float(inner.dof) if np.isfinite(inner.dof) else None,
         covariance=Covariance(inner.names, inner.corrected, inner.dof),
+    )
+
+
+def result_at(
+    problem: Problem,
+    at: LocalMinimum,
+    blocks: Sequence[ResidualBlock],
+    rho: Mapping[str, float],
+    effective: Mapping[str, float],
+) -> FitResult:
+    """Return the part of a result that the values alone decide: of a problem in its final weights, without estimates.
+
+    blocks: the residuals there. rho, effective: AR(1) coefficient of the residuals and independent samples, by output.
+    Raises SimulationError.
+    """
+    samples, unknowns = sum(b.residual.size for b in blocks), at.theta.size
+    squares = sum(float(b.residual @ b.residual) for b in blocks)
+    in_time = blocks if problem.band is None else problem.blocks(at.theta, derivatives=False, in_time=True)
+    noise = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
+    return FitResult(
+        status="converged",
+        message="",
+        fitted=tuple(f.name for f in problem.free),
+        held=_held(problem),
+        values=FrozenMap(problem.values(at.theta)),
+        cost=at.cost,
+        chi2_per_dof=squares / (samples - unknowns) if samples > unknowns else None,
+        rmse=problem.rmse(at.theta),
+        rmse_start=problem.rmse_start,
+        rmse_given=problem.rmse_given,
+        adequacy=adequacy(problem, blocks, noise, effective, rho),
+        noise_source=FrozenMap(noise),
+        sigma=problem.sigma,
+        rho=FrozenMap(rho),
+        effective_samples=FrozenMap(effective),
+        residual_tests=residual_tests(in_time, problem.fitted_experiments),
+        loss=problem.loss.name,
+        whitening={o: m for o, m in problem.treatment.whitening.items() if any(m)},
     )
 
 
@@ -402,7 +423,7 @@ def _held(problem: Problem) -> FrozenMap[str]:
     return FrozenMap({n: problem.why.get(n, default[n]) for n in others})
 
 
-def _failed(problem: Problem, points: Sequence[Array], runs: Sequence[OptimiserResult], message: str) -> FitResult:
+def failed(problem: Problem, points: Sequence[Array], runs: Sequence[OptimiserResult], message: str) -> FitResult:
     """Return the result where no run reached an admissible end, or none can be repeated."""
     return FitResult(
         status="failed",

@@ -122,7 +122,7 @@ def uncertainty(
     unseen = norms * spans <= UNSEEN
     norms = np.where(unseen, 1.0, norms)
     inverse, null = _inverse(jacobian / norms, ~unseen)
-    rho, effective = _samples(blocks, p)
+    rho, effective = samples_by_output(blocks, p)
     meat = sum(
         (score_covariance(b.jacobian[part] / norms, rho[b.output]) for b in blocks for part in b.stretches),
         np.zeros((p, p)),
@@ -180,8 +180,8 @@ def _reduced(rows: Array) -> Array:
     return rows
 
 
-def _samples(blocks: Sequence[ResidualBlock], p: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the AR(1) coefficient and the effective number of samples by output."""
+def samples_by_output(blocks: Sequence[ResidualBlock], p: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Return by output the residuals' AR(1) coefficient, and the independent samples they are worth, after a fit of p unknowns."""
     total = sum(b.residual.size for b in blocks)
     rho, effective = {}, {}
     for output in dict.fromkeys(b.output for b in blocks):

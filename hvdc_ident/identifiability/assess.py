@@ -21,7 +21,7 @@ from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.jump_instants import moving_parameters
 from hvdc_ident.fit.noise import unknown_noise
-from hvdc_ident.fit.partial_fits import Group, part_of
+from hvdc_ident.fit.partial_fits import Group, check_groups, part_of
 from hvdc_ident.fit.profile_path import ProfileOptions
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.identifiability.experiment_design import Recommendation, recommend
@@ -334,60 +334,45 @@ def identifiability_by_group(
     """
     simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
     problem = Problem(simulator, tuple(experiments), tuple(candidates))
-    names = [f.name for f in problem.free]
-    listed = [n for g in groups for n in g.parameters]
-    if sorted(listed) != sorted(names):
-        expected, got = ", ".join(names), ", ".join(listed)
-        raise StudyError("groups must hold every candidate once", where="fit groups", expected=expected, got=got)
-    current = {f.name: f.given for f in problem.free}
+    check_groups(problem, groups)
+    at = {f.name: f.given for f in problem.free}
     reports = []
     for group in groups:
-        part = part_of(problem, group, current)
+        part = part_of(problem, group, at)
         both = pair if pair and set(pair) <= set(group.parameters) else None
         report = identifiability(subject, part.experiments, part.free, held=part.held, pair=both, **options)
-        current |= {n: v.value for n, v in report.parameters.items()}
-        reports.append(_noted(report, group, part))
-    merged = _merged(reports, names)
-    if pair and merged.pair is None and not any(set(pair) <= set(g.parameters) for g in groups):
-        note = f"No common profile of {' and '.join(pair)}: they stand in two groups."
-        merged = replace(merged, notes=(*merged.notes, note))
-    return merged
-
-
-def _noted(report: IdentifiabilityReport, group: Group, part: Problem) -> IdentifiabilityReport:
-    """Return what a group's report brings to that of all, each note begun with the group's parameters."""
-    mine = ", ".join(group.parameters)
-    data = f"{', '.join(part.outputs)} in {', '.join(e.name for e in part.fitted_experiments)}"
-    first = f"{mine}: judged alone, on {data}, the other candidates held."
-    return replace(
-        report,
-        notes=(first, *(f"{mine}: {n}" for n in report.notes)),
-        misspecification=replace(
-            report.misspecification, signs=tuple(f"{mine}: {s}" for s in report.misspecification.signs)
-        ),
-        pilot={"groups": [{"parameters": list(group.parameters), **report.pilot}]},
-        bootstrap=None,  # of experiments and of a model that the groups share
-        sensitivities=None,
-    )
-
-
-def _merged(reports: Sequence[IdentifiabilityReport], names: Sequence[str]) -> IdentifiabilityReport:
-    """Return the groups' reports as one, candidates in the order of `names`.
-
-    What to measure next is that of the first group that needs it; the notes say what the others would.
-    """
+        at |= {n: v.value for n, v in report.parameters.items()}
+        reports.append(_noted(report, part))
+    # What to measure next is that of the first group that needs it; the notes say what the others would.
     settled = ("identifiable", "at-bound")
     advised = next((r for r in reports if any(v.verdict not in settled for v in r.parameters.values())), reports[0])
     others = [(r, r.recommended.text) for r in reports if r is not advised and r.recommended is not None]
-    advice = [f"To measure next for {', '.join(r.parameters)}: {text}" for r, text in others]
+    notes = [f"To measure next for {', '.join(r.parameters)}: {text}" for r, text in others]
+    if pair and not any(set(pair) <= set(g.parameters) for g in groups):
+        notes.append(f"No common profile of {' and '.join(pair)}: they stand in two groups.")
     whole = joined([replace(r, recommended=None) for r in reports])
     decided = all(r.structure.status == "decided" for r in reports)
     return replace(
         whole,
-        parameters=FrozenMap({n: whole.parameters[n] for n in names}),
-        identifiable=tuple(n for n in names if n in whole.identifiable),
+        parameters=FrozenMap({n: whole.parameters[n] for n in at}),
+        identifiable=tuple(n for n in at if n in whole.identifiable),
         structure=replace(whole.structure, status="decided" if decided else "not decided"),
-        shares=FrozenMap({e: FrozenMap({n: own.get(n, 0.0) for n in names}) for e, own in whole.shares.items()}),
         recommended=advised.recommended,
-        notes=(*whole.notes, *advice),
+        notes=(*whole.notes, *notes),
+    )
+
+
+def _noted(report: IdentifiabilityReport, part: Problem) -> IdentifiabilityReport:
+    """Return what a group's report brings to that of all, each note begun with the group's parameters."""
+    mine = ", ".join(report.parameters)
+    data = f"{', '.join(part.outputs)} in {', '.join(e.name for e in part.fitted_experiments)}"
+    first = f"{mine}: judged alone, on {data}, the other candidates held."
+    signs = tuple(f"{mine}: {s}" for s in report.misspecification.signs)
+    return replace(
+        report,
+        notes=(first, *(f"{mine}: {n}" for n in report.notes)),
+        misspecification=replace(report.misspecification, signs=signs),
+        pilot={"groups": [{"parameters": list(report.parameters), **report.pilot}]},
+        bootstrap=None,  # of experiments and of a model that the groups share
+        sensitivities=None,
     )

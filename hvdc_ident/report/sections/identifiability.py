@@ -156,7 +156,7 @@ def _pictures(found: dict[str, Any]) -> str:
 
 def _experiments(found: dict[str, Any]) -> str:
     experiments = found.get("experiments") or {}
-    names: list[str] = [n for line in list(experiments.values())[:1] for n in line.get("information") or {}]
+    names = list(dict.fromkeys(n for line in experiments.values() for n in line.get("information") or {}))
     if not names:
         return ""
     rows = [[text(e), *(_percent(line["information"].get(n, 0.0)) for n in names)] for e, line in experiments.items()]
