@@ -141,6 +141,7 @@ def _result(
         search_doubt=doubt,
         dof=float(inner.dof) if np.isfinite(inner.dof) else None,
         covariance=Covariance(inner.names, inner.corrected, inner.dof),
+        instants=placed,
     )
 
 

@@ -294,14 +294,15 @@ def _bounded(f: FitParameter, ends: tuple[float, float], value: float) -> FitPar
 class PlacedInstant:
     """An instant that the records place between two rows, as the interval of the parameter that moves it.
 
-    low, high: the 95 % interval; an end that is a bound of the search and nothing else is not excluded. passes: the range
-    between the two passings of rows that it lies in. points: (value, rise of the cost, (p,) the unknowns) along it,
-    also beyond the ends.
+    low, high: the 95 % interval; an end that is a bound of the search and nothing else is not excluded. rise: of the cost at an
+    end that is no passing of a row. passes: the range between the two passings of rows that it lies in. points: (value, rise of
+    the cost, (p,) the unknowns) along it, also beyond the ends.
     """
 
     name: str
     low: float
     high: float
+    rise: float
     passes: tuple[float, float]
     points: tuple[tuple[float, float, Array], ...]
 
@@ -366,7 +367,7 @@ def _placed(problem: Problem, theta: Array, place: int, rise: float) -> PlacedIn
     if "open" in (below, above) or "jump" not in (below, above):
         return None
     points.sort(key=lambda point: point[0])
-    return PlacedInstant(unknown.name, low, high, (low_edge, high_edge), tuple(points))
+    return PlacedInstant(unknown.name, low, high, rise, (low_edge, high_edge), tuple(points))
 
 
 # --- the search ---

@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
@@ -17,6 +17,9 @@ from hvdc_ident.files import plain
 from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import in_python
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.jump_instants import PlacedInstant
 
 NOT_ASKED = "not a candidate"
 """Reason of a parameter that is held because it was not asked for."""
@@ -108,6 +111,7 @@ class FitResult(Shown):
     dof: degrees of freedom of Student's t behind the intervals, None where the noise is known and white (its square is
     the F quantile of one parameter). goodness, validation: see there.
     covariance: of the unknowns that have one; not in the JSON, which has std and correlation.
+    instants: what the rows tell of each parameter that sets the instant of a jump; not in the JSON, whose estimates say it.
     """
 
     status: Status
@@ -139,6 +143,7 @@ class FitResult(Shown):
     goodness: Mapping[str, Any] = field(default_factory=dict)
     validation: Mapping[str, Any] = field(default_factory=dict)
     covariance: Covariance | None = field(default=None, metadata={"json": False})
+    instants: Mapping[str, PlacedInstant] = field(default_factory=dict, metadata={"json": False})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON takes it: full precision, None for what is not finite."""

@@ -93,6 +93,7 @@ def identifiability(
         first, result = at_given_values(problem)
     _data_notes(assessment, first, result)
     assessment.ends = tuple((o.end, o.cost) for o in result.starts if o.cost is not None)
+    assessment.placed = result.instants
     assessment.thresholds = thresholds(first)
     last = without_insensitive(assessment, with_placed_instants(assessment, first)) if free else None
     last = without_null_directions(assessment, last) if last else None
