@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from hvdc_ident.identifiability.structural import Combination, StructuralAnalysi
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import Collinear, LocalSensitivities
+from hvdc_ident.text import interval_text
 
 IN_JSON = (
     "verdict",
@@ -170,12 +170,9 @@ class IdentifiabilityReport(Shown):
     def _screen(self) -> Iterator[str | Table]:
         fitted = ", ".join(self.identifiable) or "none"
         yield f"Identifiable: {fitted} (of {len(self.parameters)} asked about)."
-        rows = [(n, v.verdict, v.value, v.unit, _interval(v)) for n, v in self.parameters.items()]
+        rows = [(n, v.verdict, v.value, v.unit, interval_text(v.ci95)) for n, v in self.parameters.items()]
         yield Table(("parameter", "verdict", "value", "unit", "95 % interval"), tuple(rows))
         yield "\n".join(f"{n}: {v.reason}" for n, v in self.parameters.items())
-        yield from self._remarks()
-
-    def _remarks(self) -> Iterator[str]:
         signs = self.misspecification
         if signs.flag:
             yield f"The model does not explain these data: {'; '.join(signs.signs)}."
@@ -185,11 +182,6 @@ class IdentifiabilityReport(Shown):
 
     def __str__(self) -> str:
         return "\n\n".join(str(block) for block in self._screen() if block)  # reasons stay whole: they are searched for
-
-    def _repr_html_(self) -> str:
-        rows = [(n, v.verdict, f"{v.value:.6g} {v.unit}", _interval(v), v.reason) for n, v in self.parameters.items()]
-        table = Table(("parameter", "verdict", "value", "95 % interval", "why"), tuple(rows))
-        return table.html + "".join(f"<p>{escape(line)}</p>" for line in self._remarks())
 
     def to_dataframe(self) -> Any:
         """Return the verdicts as a pandas DataFrame, a row a parameter. Raises InputError where pandas is missing."""
@@ -205,13 +197,6 @@ class IdentifiabilityReport(Shown):
             "reason": [v.reason for v in verdicts],
         }
         return data_frame(columns, list(self.parameters), "parameter")
-
-
-def _interval(v: Verdict) -> str:
-    low, high = v.ci95 or (None, None)
-    if low is None or high is None:
-        return "" if low is high else f"below {high:.6g}" if low is None else f"above {low:.6g}"
-    return f"{low:.6g} to {high:.6g}"
 
 
 def _profile(p: Profile) -> dict[str, Any]:
