@@ -17,10 +17,16 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.descent import predicted_reduction
-from hvdc_ident.fit.jump_instants import PlacedInstant, placed_instants, search_instants, within_stretches
+from hvdc_ident.fit.jump_instants import (
+    PlacedInstant,
+    placed_instants,
+    search_instants,
+    within_own_stretches,
+    within_stretches,
+)
 from hvdc_ident.fit.noise import source_text
 from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
-from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
+from hvdc_ident.fit.optimiser import LocalMinimum, Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
@@ -28,7 +34,6 @@ from hvdc_ident.fit.result import NOT_ASKED, Covariance, Estimate, FitResult, St
 from hvdc_ident.fit.search import (
     DISTINCT,
     SAME,
-    LocalMinimum,
     cost_at,
     distinct,
     higher_ends,
@@ -321,14 +326,16 @@ def _doubt(
 ) -> str:
     """Return in words that one start alone reached the lowest cost of several; "" where another did, or none disagrees.
 
-    Nor is there doubt of the starts where the optimum was found beyond where all of them ended, by a search over instants.
+    Nor is there doubt of the starts where the optimum was found beyond where all of them ended, by a search over instants, or where
+    none but one began between the same rows.
 
     Then the starts say nothing of how likely a still lower cost is. The size of the residual is the unit of cost, whether or not the
     noise is known: costs that differ by less lead to the same estimates. samples: number of residuals.
     """
     reached = [LocalMinimum(_end(problem, o), o.cost) for o in outcomes if o.cost is not None]
-    ends = sorted(reached, key=lambda end: end.cost)
-    if len(outcomes) < 2 or not ends:
+    ends = within_own_stretches(problem, sorted(reached, key=lambda end: end.cost))
+    failed = len(outcomes) - len(reached)
+    if not ends or len(ends) + failed < 2:
         return ""
     lowest = ends[0].cost
     unit = max(1.0, 2.0 * lowest / max(samples - len(problem.unknowns), 1))
@@ -339,7 +346,6 @@ def _doubt(
     if len(others) < len(ends) - 1:
         return ""
     levels = [c for k, c in enumerate(others) if k == 0 or c > others[k - 1] + slack]
-    failed = len(outcomes) - len(ends)
     parts = []
     if levels:
         costs = f"{len(levels)} higher costs" if len(levels) > 1 else "a higher cost"

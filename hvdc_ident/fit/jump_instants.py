@@ -17,10 +17,9 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.descent import descend
-from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.optimiser import Optimiser
+from hvdc_ident.fit.fit_parameter import FitParameter, starting_points
+from hvdc_ident.fit.optimiser import LocalMinimum, Optimiser
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import LocalMinimum, starting_points
 from hvdc_ident.fit.simulator import TIME_SHIFT, unknown_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.system import evaluate
@@ -264,6 +263,14 @@ def stretch(problem: Problem, theta: Array, place: int) -> tuple[float, float]:
     ends = _stretches(problem, theta, place)
     k = int(np.clip(np.searchsorted(ends, theta[place], side="left"), 1, ends.size - 1))
     return float(ends[k - 1]), float(ends[k])
+
+
+def within_own_stretches(problem: Problem, ends: Sequence[LocalMinimum]) -> list[LocalMinimum]:
+    """Return the ends of descents, the lowest first, that began in its stretches: no other could come to where it ended."""
+    if not ends:
+        return []
+    own = {k: stretch(problem, ends[0].theta, k) for k in moving(problem)}
+    return [e for e in ends if all(low <= e.theta[k] <= high for k, (low, high) in own.items())]
 
 
 def within_stretches(problem: Problem, theta: Array) -> Problem:

@@ -38,6 +38,14 @@ class OptimiserResult:
     evaluations: int
 
 
+@dataclass(frozen=True, eq=False)
+class LocalMinimum:
+    """A local minimum of the cost: (p,) theta and its cost."""
+
+    theta: Array
+    cost: float
+
+
 class Optimiser(Protocol):
     """An options object that can run. Raises nothing for a simulation that fails: that is a status."""
 

@@ -22,10 +22,9 @@ from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.assessment import assessed, in_final_weights
 from hvdc_ident.fit.estimate import failed, fit, result_at
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
+from hvdc_ident.fit.optimiser import LocalMinimum, Optimiser, OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import Covariance, FitResult, StartOutcome, Status
-from hvdc_ident.fit.search import LocalMinimum
 from hvdc_ident.fit.simulator import unknown_of
 from hvdc_ident.fit.uncertainty import NO_INTERVAL, samples_by_output
 from hvdc_ident.immutable import FrozenMap

@@ -8,17 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.files import plain
 from hvdc_ident.fit.adequacy import Adequacy
+from hvdc_ident.fit.jump_instants import PlacedInstant
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import in_python, interval_text
-
-if TYPE_CHECKING:
-    from hvdc_ident.fit.jump_instants import PlacedInstant
 
 NOT_ASKED = "not a candidate"
 """Reason of a parameter that is held because it was not asked for."""

@@ -16,8 +16,8 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
+from hvdc_ident.fit.fit_parameter import starting_points
 from hvdc_ident.fit.frequency_data import in_time
-from hvdc_ident.fit.search import starting_points
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
