@@ -361,7 +361,7 @@ def _method(model: AnyModel, experiments: tuple[Experiment, ...], base: FrozenMa
     """The integrator of every point: the one that serves at the base values."""
     first = experiments[0]
     try:
-        found = simulate(model, first, base, outputs=first.outputs or None).statistics.method
+        found = simulate(model, first, base).statistics.method
     except (ComputationError, SteadyStateError):
         return "rosenbrock"
     return "nonstiff" if found == "explicit" else "rosenbrock"
