@@ -55,6 +55,7 @@ from hvdc_ident.identifiability.verdicts import (
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, normalised, pivoted_order, rise_over_range
 from hvdc_ident.sensitivity.information import inflation_index
+from hvdc_ident.text import quantity
 
 WORTH = 0.02
 """A fall of the cost by less than this share of a threshold moves no interval: the walks of profiles restart from there too."""
@@ -118,9 +119,10 @@ class Assessment:
             reduced = optimum.with_held(reasons, {n: optimum.value(n) for n in reasons})
             why = "the records cannot be met"
         for n in reasons:
-            value, unit = reduced.problem.held[n], f" {self.units[n]}" if self.units[n] else ""
-            if value != self.free[n].given:
-                remark = f"It is held at {value:.4g}{unit}: at its given value, {self.free[n].given:.4g}{unit}, {why}."
+            value, given = reduced.problem.held[n], self.free[n].given
+            if value != given:
+                unit = self.units[n]
+                remark = f"It is held at {quantity(value, unit)}: at its given value, {quantity(given, unit)}, {why}."
                 self.held_at[n] = value
                 self.held[n] = f"{self.held[n]} {remark}"
                 self.verdicts[n] = self.verdicts[n].noted(remark)

@@ -278,17 +278,12 @@ class _Runs:
         return "; ".join(parts)
 
 
-def rank_analysis(problem: Problem, seed: int = 0) -> StructuralAnalysis:
-    """Return the structure from the rank of the whitened sensitivities at the start and at five random points in the bounds.
-
-    For anything that can be simulated; local. Points that cannot be simulated are passed over; those of the five are counted in
-    the note. A parameter without any effect stands among the admissible ones: the data's verdict on it says more.
-    """
-    return _from_runs(_Runs(problem, seed))
-
-
 def _from_runs(runs: _Runs, status: str = "decided", why: str = "") -> StructuralAnalysis:
-    """Return the structure that the runs show. why: the equations do not tell it."""
+    """Return the structure that the runs show, for anything that can be simulated. why: the equations do not tell it.
+
+    Points that cannot be simulated are passed over; those of the five are counted in the note. A parameter without any effect
+    stands among the admissible ones: the data's verdict on it says more.
+    """
     names = runs.names
     if not runs.points:
         return StructuralAnalysis("not decided", METHOD, names, note="no random point could be simulated")
