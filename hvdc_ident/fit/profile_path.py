@@ -138,6 +138,7 @@ class ProfilePath:
                 if failures > 6:
                     return self._ended("not-found", f"beyond {self._value(x):.4g} the simulation fails: {error.what}")
                 continue
+            failures = 0
             self.points.append((ahead, point))
             rise = point.at.cost - self.best.at.cost
             if rise >= self.rise:
