@@ -31,8 +31,8 @@ AS_PROMISED = 0.1
 """A reduction within this share of the promised one shows no error of the simulation."""
 SMALLEST = 1e-10
 """A scaled coordinate below this counts as this large where its step is judged: an optimum may lie at 0."""
-NEAR = 10.0
-"""Longest first step of a descent that begins near a minimum: no parabola holds over four decades of a logarithm."""
+LONGEST = 10.0
+"""Longest first step of a descent that begins near a minimum, and along a tangent: no parabola holds over four decades of a logarithm."""
 
 
 class Residuals(Protocol):
@@ -265,7 +265,7 @@ def descend(
     For descents that begin near a minimum, as each of a profile's or bootstrap's hundreds does: by Gauss-Newton steps until a
     predicted fall of the cost is less than `enough`. Raises SimulationError where theta is inadmissible.
     """
-    down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough, reach=NEAR), fixed)
+    down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough, reach=LONGEST), fixed)
     down.go(theta)
     if down.at is None:
         assert down.failure is not None

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import solve_banded
-from scipy.special import stdtrit
+from scipy.special import chdtri, stdtrit
 
 from hvdc_ident.data import Array
 from hvdc_ident.fit.fit_parameter import FitParameter
@@ -30,10 +30,10 @@ from hvdc_ident.text import figures
 if TYPE_CHECKING:
     from hvdc_ident.fit.nonsmooth import Trend
 
-TWO_SIDED = 1.92
-"""Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
-ONE_SIDED = 1.353
-"""Rise at the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile."""
+TWO_SIDED = 0.5 * float(chdtri(1.0, 0.05))
+"""Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree; 1.92."""
+ONE_SIDED = 0.5 * float(chdtri(1.0, 0.10))
+"""Rise at the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile; 1.353."""
 NO_INTERVAL = "no interval: the model lacks something"
 """Remark on an estimate where the residual is more than noise."""
 WIDER = 2.0

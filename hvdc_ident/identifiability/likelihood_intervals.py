@@ -20,6 +20,7 @@ from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.descent import DescentResult, bounded_step, descend
 from hvdc_ident.fit.profile import PairProfile, Profile, profile_pair
+from hvdc_ident.fit.search import same_place
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.identifiability.verdicts import Verdict
@@ -35,8 +36,6 @@ EVALUATIONS = 25
 """A descent that has not come near by then is given up."""
 NEAR = 10.0
 """Ends of the multistart whose cost is more than so many thresholds above the best are optima of their own, but no rivals."""
-SAME = 1e-3
-"""Points that differ by less in every scaled coordinate are one."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +198,8 @@ def pair_of(
 ) -> PairProfile:
     """The common profile of two fitted parameters, over twice their intervals but within the bounds.
 
-    Its rises are in units of the threshold for one parameter, so 95 % of both together lie within JOINT/1.92.
+    Its rises are in units of the threshold for one parameter, so 95 % of both together lie within 2.996/1.92: half the quantiles
+    of chi-square with two degrees of freedom and with one.
     """
     grids = []
     for n in names:
@@ -231,38 +231,33 @@ def other_optima(
     with their costs. The search starts from those, and from the best with two parameters of one unit exchanged, the most
     alike in their effect first, or with a sign turned: that is where the usual second solutions lie.
     """
-    space = best.problem.coordinates
     limit = max(limits.values())
 
     def same_basin(theta: Array) -> bool:
         """Return True where a point is the best one but for the roughness of the cost."""
         return best.trend is not None and best.trend.holds(theta, limit)
 
-    known = [space.scaled(best.theta)]
+    known, reached = [best.theta], [best.theta]
     starts: list[Array] = []
     for theta in (*_ended(best, ends, limit), *_exchanged(best)):
-        if _new(space.scaled(theta), known) and not same_basin(theta):
-            known.append(space.scaled(theta))
+        if not any(same_place(best.problem, theta, k) for k in known) and not same_basin(theta):
+            known.append(theta)
             starts.append(theta)
     rivals: list[DescentResult] = []
-    reached = [space.scaled(best.theta)]
     for theta in starts:
         try:
             end = descend(best.problem, theta, enough=1e-4 * limit, max_evaluations=EVALUATIONS)
         except SimulationError:
             continue
-        if end.at.cost - best.cost < limit and _new(space.scaled(end.theta), reached) and not same_basin(end.theta):
-            reached.append(space.scaled(end.theta))
+        found_before = any(same_place(best.problem, end.theta, k) for k in reached)
+        if end.at.cost - best.cost < limit and not found_before and not same_basin(end.theta):
+            reached.append(end.theta)
             rivals.append(end)
     rivals.sort(key=lambda r: r.at.cost)
     names = best.problem.names
     return tuple(
         OtherOptimum(FrozenMap(zip(names, map(float, r.theta), strict=True)), r.at.cost - best.cost) for r in rivals
     )
-
-
-def _new(x: Array, known: Sequence[Array]) -> bool:
-    return not any((np.abs(x - k) <= SAME).all() for k in known)
 
 
 def _ended(best: LocalAnalysis, ends: Sequence[tuple[Mapping[str, float], float]], limit: float) -> Iterator[Array]:

@@ -11,6 +11,7 @@ from math import log, sqrt
 import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
+from scipy.stats import chi2
 
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter
@@ -91,7 +92,7 @@ def test_at_a_bound_the_limit_is_one_sided() -> None:
 
     found = profiles(LeastSquares(unknowns, line), np.zeros(1), options=EXACT).by_name["x"]
     assert found.one_sided and found.lower.status == "open-at-bound"
-    assert found.upper.limit == pytest.approx(sqrt(1 + 2 * 1.353) - 1, rel=1e-9)
+    assert found.upper.limit == pytest.approx(sqrt(1 + chi2.ppf(0.90, 1)) - 1, rel=1e-9)
 
 
 def test_a_crossing_that_leans_on_a_search_bound_does_not_count() -> None:
