@@ -35,7 +35,6 @@ from hvdc_ident.identifiability.likelihood_intervals import (
 )
 from hvdc_ident.identifiability.pilot_fit import HALF_95, LocalAnalysis
 from hvdc_ident.identifiability.structural import (
-    Combination,
     StructuralAnalysis,
     combinations_of,
     parameter_directions,
@@ -53,7 +52,7 @@ from hvdc_ident.identifiability.verdicts import (
     structural_verdict,
 )
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import independent, normalised, pivoted_order, rise_over_range
+from hvdc_ident.sensitivity import Combination, independent, normalised, pivoted_order, rise_over_range
 from hvdc_ident.sensitivity.information import inflation_index
 from hvdc_ident.text import quantity
 

@@ -19,10 +19,10 @@ from hvdc_ident.fit.profile import PairProfile, Profile
 from hvdc_ident.identifiability.experiment_design import Recommendation
 from hvdc_ident.identifiability.likelihood_intervals import OtherOptimum
 from hvdc_ident.identifiability.misspecification import Heterogeneity, Misspecification
-from hvdc_ident.identifiability.structural import Combination, StructuralAnalysis
+from hvdc_ident.identifiability.structural import StructuralAnalysis
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import Collinear, LocalSensitivities
+from hvdc_ident.sensitivity import Collinear, Combination, LocalSensitivities
 from hvdc_ident.text import interval_text
 
 IN_JSON = (
