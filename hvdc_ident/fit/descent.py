@@ -1,4 +1,4 @@
-"""Bounded Levenberg-Marquardt on exact sensitivities: the descent that fits, profiles, refits and bootstraps share.
+"""Bounded Levenberg-Marquardt on exact sensitivities: the descent that fits, profiles and refits share.
 
 A step minimises |r + J p|^2 + lambda |D p|^2 in scaled coordinates with D the largest column norms so far (Moré 1978), with
 bounds met by an active set; lambda follows the ratio of actual to predicted reduction as in Nielsen (1999), "Damping parameter
@@ -44,14 +44,6 @@ class Residuals(Protocol):
 
     def residual(self, theta: Array) -> tuple[Array, Array]:
         """Return r, (n,), and dr/dtheta, (n, p), at theta, (p,). Raises SimulationError where theta is inadmissible."""
-
-
-@dataclass(frozen=True, eq=False)
-class LeastSquares:
-    """A sum of squares given by a function: theta to r, (n,), and dr/dtheta, (n, p)."""
-
-    unknowns: tuple[FitParameter, ...]
-    residual: Callable[[Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +254,7 @@ def descend(
 ) -> DescentResult:
     """Return the minimum near theta, (p,), over the unknowns that are not fixed, within their bounds.
 
-    For descents that begin near a minimum, as each of a profile's or bootstrap's hundreds does: by Gauss-Newton steps until a
+    For descents that begin near a minimum, as each of a profile's hundreds does: by Gauss-Newton steps until a
     predicted fall of the cost is less than `enough`. Raises SimulationError where theta is inadmissible.
     """
     down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough, reach=LONGEST), fixed)

@@ -17,7 +17,6 @@ from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
-from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.jump_instants import moving_parameters
 from hvdc_ident.fit.noise import unknown_noise
@@ -48,11 +47,6 @@ from hvdc_ident.immutable import FrozenMap, joined
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import LocalSensitivities, collinear_subsets, sensitivities
 from hvdc_ident.simulate import ModelSimulator
-
-ENOUGH = 5
-"""From so many experiments on they are drawn anew: five give 126 tests samples, four only 35."""
-TELLING = 4.0
-"""So many of them, counted by information, must tell of a parameter to draw experiments anew for it."""
 
 
 def identifiability(
@@ -98,7 +92,7 @@ def identifiability(
     last = without_insensitive(assessment, with_placed_instants(assessment, first)) if free else None
     last = without_null_directions(assessment, last) if last else None
     last = profile_remaining(assessment, last, executor) if last else None
-    report = _assembled(assessment, structure, first, last, result, executor)
+    report = _assembled(assessment, structure, first, last, result)
     if pair and last is not None and set(pair) <= set(report.identifiable):
         return replace(report, pair=pair_of(last, report.parameters, pair))
     note = f"No common profile of {' and '.join(pair)}: not both are fitted." if pair else ""
@@ -159,7 +153,6 @@ def _assembled(
     first: LocalAnalysis,
     last: LocalAnalysis | None,
     result: FitResult,
-    executor: Executor | None,
 ) -> IdentifiabilityReport:
     """Return the report. first: the optimum of the pilot fit; last: that of the set that is fitted."""
     bound = {n for n, v in assessment.verdicts.items() if v.verdict == "at-bound"}
@@ -174,8 +167,6 @@ def _assembled(
     whole = _whole(assessment, last or first)
     unjudged = _unjudged(assessment, whole, fitted, first)
     held = {n: (v, assessment.verdicts[n].reason if n in unjudged else why) for n, (v, why) in held.items()}
-    resampled = _resampled(assessment, last, executor)
-    scatter = resampled.ci95() if resampled else {}
     for n, verdict in assessment.verdicts.items():
         value = held[n][0] if n in held else verdict.value
         if last is not None and not np.isfinite(value):
@@ -183,7 +174,6 @@ def _assembled(
         scale = scale_of(assessment.free[n], value)[0]
         norm = whole.information.norms[n]
         verdict = replace(verdict.noted(assessment.remark), value=value, scale=scale, sensitivity_norm=norm)
-        verdict = verdict.scattered(scatter[n], resampled) if resampled and n in scatter else verdict
         assessment.verdicts[n] = verdict.under_misfit() if first.adequacy.systematic else verdict
     several = last is not None and len(last.problem.fitted_experiments) > 1
     tests = heterogeneity(last) if last is not None and several else FrozenMap()
@@ -213,7 +203,6 @@ def _assembled(
             "noise_source": dict(result.noise_source),
         },
         notes=tuple(assessment.notes),
-        bootstrap=resampled,
         sensitivities=_sensitivities(assessment, whole),
         not_judged=unjudged,
         optima=assessment.optima,
@@ -274,36 +263,6 @@ def _sensitivities(assessment: Assessment, whole: LocalAnalysis) -> LocalSensiti
         )
     except (SimulationError, SteadyStateError) as error:
         assessment.notes.append(f"No table of sensitivities: {error}.")
-        return None
-
-
-def _resampled(assessment: Assessment, last: LocalAnalysis | None, executor: Executor | None) -> Bootstrap | None:
-    """Return the estimates from experiments drawn anew, of those parameters that enough experiments tell of.
-
-    A parameter that one or two experiments determine would be lost in every sample without them: it stays where it is.
-    """
-    if last is None or len(last.problem.fitted_experiments) < ENOUGH:
-        return None
-    telling = last.information.telling()
-    resampled = [n for n in last.names if telling[n] >= TELLING]
-    others = [n for n in last.names if n not in resampled]
-    if not resampled:
-        assessment.notes.append("Experiments are not drawn anew: of every parameter only a few of them tell.")
-        return None
-    if others:
-        assessment.notes.append(f"While experiments are drawn anew {', '.join(others)} stay: only a few tell of them.")
-    assessment.report_stage("experiments drawn anew")
-    fixed = {n: last.value(n) for n in others}
-    places = [i for i, n in enumerate(last.problem.names) if n not in fixed]
-    problem = replace(
-        last.problem,
-        free=tuple(f for f in last.problem.free if f.name in resampled),
-        held=last.problem.held | fixed,
-    )
-    try:
-        return bootstrap(problem, last.theta[places], seed=assessment.seed, executor=executor)
-    except SimulationError as error:
-        assessment.notes.append(f"The bootstrap over experiments came to nothing: {error.what}.")
         return None
 
 
@@ -374,6 +333,5 @@ def _noted(report: IdentifiabilityReport, part: Problem) -> IdentifiabilityRepor
         notes=(first, *(f"{mine}: {n}" for n in report.notes)),
         misspecification=replace(report.misspecification, signs=signs),
         pilot={"groups": [{"parameters": list(report.parameters), **report.pilot}]},
-        bootstrap=None,  # of experiments and of a model that the groups share
-        sensitivities=None,
+        sensitivities=None,  # of a model that the groups share
     )

@@ -17,7 +17,6 @@ from scipy.special import stdtrit
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.descent import DescentResult, bounded_step, descend
 from hvdc_ident.fit.profile import PairProfile, Profile, profile_pair
 from hvdc_ident.fit.search import same_place
@@ -56,23 +55,15 @@ def spreads(optimum: LocalAnalysis) -> dict[str, Spread]:
 
     The rise is 1.92; with estimated noise half the square of Student's t. Times what correlated samples and model error
     add to the variance in the parameter's direction (vertical scaling of an independence likelihood: Chandler and Bate
-    2007, doi 10.1093/biomet/asm015): the wider of the AR(1) sandwich times the excess misfit and, where the misfit
-    shows model error, the sandwich over experiments with t(n - 1).
+    2007, doi 10.1093/biomet/asm015): the AR(1) sandwich times the excess misfit.
     """
     u = optimum.uncertainty
     quantile = 0.5 * float(stdtrit(u.dof, 0.975)) ** 2 if np.isfinite(u.dof) else TWO_SIDED
     raw = np.diag(u.raw)
     safe = np.where(raw > 0, raw, 1.0)
     factor = np.maximum(np.where(raw > 0, np.diag(u.corrected) / safe, 1.0) * optimum.excess, 1.0)
-    limits = quantile * factor
-    if optimum.excess > 1.0 and len({b.experiment for b in optimum.blocks}) >= FEWEST and not u.singular:
-        covariance, dof = cluster_sandwich(optimum.blocks)
-        scatter = np.where(raw > 0, np.diag(covariance) / safe, 0.0)
-        wider = 0.5 * float(stdtrit(dof, 0.975)) ** 2 * scatter
-        factor = np.where(wider > limits, scatter, factor)
-        limits = np.maximum(limits, wider)
-    stds = np.sqrt(raw * factor)
-    return {n: Spread(float(s), float(v)) for n, s, v in zip(optimum.names, stds, limits, strict=False)}
+    rows = zip(optimum.names, np.sqrt(raw * factor), quantile * factor, strict=False)
+    return {n: Spread(float(std), float(rise)) for n, std, rise in rows}
 
 
 def range_of(free: FitParameter, value: float, reach: float) -> tuple[float, float]:

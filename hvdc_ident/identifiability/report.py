@@ -14,7 +14,6 @@ import numpy as np
 from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.files import plain
-from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import PairProfile, Profile
 from hvdc_ident.identifiability.experiment_design import Recommendation
 from hvdc_ident.identifiability.likelihood_intervals import OtherOptimum
@@ -32,7 +31,6 @@ IN_JSON = (
     "unit",
     "scale",
     "ci95",
-    "ci95_experiments",
     "std",
     "relative_std",
     "sensitivity_norm",
@@ -58,8 +56,7 @@ class IdentifiabilityReport(Shown):
     combinations: what is seen of those that cannot be told apart. collinear: subsets with their index, worst first within
     each size. shares: of each parameter's information, by experiment.
     pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
-    search met. bootstrap: the estimates of the set fitted, from experiments drawn anew, where there are enough.
-    sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
+    search met. sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
     the model has no equations here.
     """
 
@@ -78,7 +75,6 @@ class IdentifiabilityReport(Shown):
     pilot: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     pair: PairProfile | None = None
-    bootstrap: Bootstrap | None = None
     sensitivities: LocalSensitivities | None = None
     not_judged: tuple[str, ...] = ()
     optima: tuple[OtherOptimum, ...] = ()
@@ -90,18 +86,7 @@ class IdentifiabilityReport(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON takes it: full precision, None for what is not finite."""
-        s, drawn = self.structure, self.bootstrap
-        bootstrap = (
-            None
-            if drawn is None
-            else {
-                "samples": len(drawn.values),
-                "failed": drawn.failed,
-                "experiments": drawn.experiments,
-                "ci95": {n: list(interval) for n, interval in drawn.ci95().items()},
-                "std": drawn.std(),
-            }
-        )
+        s = self.structure
         found = {
             "parameters": {n: {f: getattr(v, f) for f in IN_JSON} for n, v in self.parameters.items()},
             "identifiable": list(self.identifiable),
@@ -138,7 +123,6 @@ class IdentifiabilityReport(Shown):
             "recommended_experiment": self.recommended.to_dict() if self.recommended else None,
             "profiles": {n: _profile(v.profile) for n, v in self.parameters.items() if v.profile is not None},
             "pair": self.pair,
-            "bootstrap": bootstrap,
             "sensitivities": self.sensitivities.to_dict() if self.sensitivities else None,
             "pilot": self.pilot,
             "notes": [*self.notes, CONDITIONS],

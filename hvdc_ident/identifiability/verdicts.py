@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.profile import Profile
 from hvdc_ident.text import figures_of, quantity, span, times_text
@@ -27,8 +26,6 @@ VerdictName = Literal[
 ]
 WIDE = 0.5
 """A half-width of more than this share of the value (of the range where 0 is admissible) makes a parameter weak."""
-WIDER = 1.5
-"""A bootstrap's interval that is so many times wider than the profile's is worth a remark."""
 COLLINEAR = 20.0
 """A standard deviation that the others make so many times larger is worded, and so is half of that: a parameter that is known well all the
 same is not weak."""
@@ -41,7 +38,7 @@ class Verdict:
     value: at the optimum; of a held one, what it is held at. ci95: from the profile; an end that is None is not known.
     std, relative_std: only of identifiable ones. sensitivity_norm: of its whitened, scaled column. collinearity: by how
     much the others widen its standard deviation. partner: the one most collinear with it. conditional_on: parameters
-    held without which it could not be told. profile: the evidence. ci95_experiments: from experiments drawn anew.
+    held without which it could not be told. profile: the evidence.
     scale: what widths are compared with, the value or, where 0 is admissible, the range. optima: its value at every optimum
     that is as good, the best first, where there are several.
     """
@@ -59,7 +56,6 @@ class Verdict:
     partner: str = ""
     conditional_on: tuple[str, ...] = ()
     profile: Profile | None = None
-    ci95_experiments: tuple[float, float] | None = None
     scale: float | None = None
     optima: tuple[float, ...] = ()
 
@@ -68,23 +64,11 @@ class Verdict:
         return replace(self, reason=" ".join([self.reason, *(n for n in notes if n)]))
 
     def under_misfit(self) -> Verdict:
-        """Return the verdict without interval and standard deviation, what it says of them made conditional on the model.
-
-        The scatter over experiments stays: it is a finding whatever the model lacks.
-        """
+        """Return the verdict without interval and standard deviation, what it says of them made conditional on the model."""
         if self.ci95 is None:
             return self
         reason = f"If nothing else is missing, {self.reason[:1].lower()}{self.reason[1:]}"
         return replace(self, reason=reason, ci95=None, std=None, relative_std=None)
-
-    def scattered(self, interval: tuple[float, float], over: Bootstrap) -> Verdict:
-        """Return the verdict with the interval from experiments drawn anew, and a remark where that is much the wider."""
-        found = replace(self, ci95_experiments=interval)
-        low, high = self.ci95 or (None, None)
-        if low is None or high is None or interval[1] - interval[0] < WIDER * (high - low):
-            return found
-        wider = span(*interval, self.unit, word="…")
-        return found.noted(f"Drawn anew, the {over.experiments} experiments scatter it wider: {wider}.")
 
 
 def structural_verdict(

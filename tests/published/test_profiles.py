@@ -15,9 +15,9 @@ from scipy.stats import chi2
 
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter
-from hvdc_ident.fit.descent import LeastSquares
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.fit.profile_path import ProfileOptions
+from tests.fit.simulators import LeastSquares
 
 EXACT = ProfileOptions(tolerance=1e-10)
 
