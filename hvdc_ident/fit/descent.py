@@ -103,9 +103,7 @@ class LinearResiduals:
         def solve(free: NDArray[np.bool_], p: Array) -> Array:
             return np.asarray(np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ p[~free], rcond=None)[0])
 
-        g = self.gradient
-        blocked = ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))
-        return active_set(solve, ~blocked, low, high)
+        return active_set(solve, ~_blocked(self.gradient, low, high), low, high)
 
     def predicted(self, p: Array) -> float:
         """Return the reduction of the cost that the linear residuals promise for the step p, (p,)."""
@@ -231,7 +229,7 @@ class Descent:
         return True
 
     def _stationary(self, here: LinearResiduals, low: Array, high: Array) -> bool:
-        g = np.where(((low >= 0) & (here.gradient > 0)) | ((high <= 0) & (here.gradient < 0)), 0.0, here.gradient)
+        g = np.where(_blocked(here.gradient, low, high), 0.0, here.gradient)
         return bool((np.abs(g) <= self.options.gradient * here.norms * np.sqrt(2.0 * here.cost)).all())
 
 
@@ -285,8 +283,12 @@ def bounded_step(g: Array, h: Array, low: Array, high: Array) -> Array:
         rhs = target[free] - matrix[np.ix_(free, ~free)] @ (p * scale)[~free]
         return np.asarray(np.linalg.lstsq(matrix[np.ix_(free, free)], rhs, rcond=1e-12)[0]) / scale[free]
 
-    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))) & (np.diag(h) > 0)
-    return active_set(solve, free, low, high)
+    return active_set(solve, ~_blocked(g, low, high) & (np.diag(h) > 0), low, high)
+
+
+def _blocked(gradient: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Return the entries, (p,), that have no room where the gradient would have them go; low, high: how far they may move."""
+    return ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0)) | ((low >= 0) & (high <= 0))
 
 
 def active_set(
