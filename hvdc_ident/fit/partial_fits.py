@@ -22,7 +22,7 @@ from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.assessment import assessed, in_final_weights
 from hvdc_ident.fit.estimate import failed, fit, result_at
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.optimiser import LocalMinimum, Optimiser, OptimiserResult
+from hvdc_ident.fit.optimiser import LocalMinimum, OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import Covariance, FitResult, StartOutcome, Status
 from hvdc_ident.fit.simulator import unknown_of
@@ -148,9 +148,6 @@ def fit_each(
     problem: Problem,
     *,
     runs: Mapping[str, Sequence[str]] | None = None,
-    starts: int = 1,
-    seed: int = 0,
-    optimiser: Optimiser | str | None = None,
     whiten: str = "no",
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -164,8 +161,7 @@ def fit_each(
     number is `on_bound`. Raises UnknownNameError for a run's experiment that is not fitted, StudyError for an empty run.
     """
     parts = _parts(problem, runs)
-    one = partial(_alone, starts=starts, seed=seed, optimiser=optimiser, whiten=whiten)
-    outcomes: Iterator[FitResult] = mapped(executor, one, list(parts.values()))
+    outcomes: Iterator[FitResult] = mapped(executor, partial(_alone, whiten=whiten), list(parts.values()))
     results: dict[str, FitResult] = {}
     for name, result in zip(parts, outcomes, strict=True):
         results[name] = result
@@ -186,8 +182,9 @@ def _parts(problem: Problem, runs: Mapping[str, Sequence[str]] | None) -> dict[s
     return parts
 
 
-def _alone(problem: Problem, *, starts: int, seed: int, optimiser: Optimiser | str | None, whiten: str) -> FitResult:
-    return fit(problem, starts=starts, seed=seed, optimiser=optimiser, whiten=whiten, assess=False)
+def _alone(problem: Problem, *, whiten: str) -> FitResult:
+    """Return the fit that begins at the start alone."""
+    return fit(problem, starts=1, whiten=whiten, assess=False)
 
 
 def _row(free: FitParameter, results: Mapping[str, FitResult]) -> dict[str, Any]:

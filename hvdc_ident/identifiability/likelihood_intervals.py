@@ -184,9 +184,7 @@ def _cost(g: Array, h: Array, p: Array) -> float:
     return float(g @ p + 0.5 * p @ h @ p)
 
 
-def pair_of(
-    optimum: LocalAnalysis, verdicts: Mapping[str, Verdict], names: tuple[str, str], points: int = 13
-) -> PairProfile:
+def pair_of(optimum: LocalAnalysis, verdicts: Mapping[str, Verdict], names: tuple[str, str]) -> PairProfile:
     """The common profile of two fitted parameters, over twice their intervals but within the bounds.
 
     Its rises are in units of the threshold for one parameter, so 95 % of both together lie within 2.996/1.92: half the quantiles
@@ -199,7 +197,7 @@ def pair_of(
         low, high = v.profile.ci95 if v.profile is not None else (None, None)
         half = 0.5 * (high - low) if low is not None and high is not None else 0.25 * u.span
         centre = optimum.value(n)
-        grids.append(np.linspace(max(u.min, centre - 2 * half), min(u.max, centre + 2 * half), points))
+        grids.append(np.linspace(max(u.min, centre - 2 * half), min(u.max, centre + 2 * half), 13))
     limit = max(thresholds(optimum)[n] for n in names)
     pair = profile_pair(optimum.problem, optimum.theta, names, *grids, enough=1e-3 * limit)
     return replace(pair, rises=pair.rises / limit)

@@ -23,7 +23,7 @@ from hvdc_ident.fit.profile import _descend
 from hvdc_ident.immutable import FrozenMap
 
 BOUND = {
-    "one": _alone,  # partial(_alone, ...)
+    "partial(_alone, whiten=whiten)": _alone,
     "partial(method.run, problem)": Optimiser.run,
     "partial(_descend, objective)": _descend,
 }
