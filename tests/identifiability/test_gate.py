@@ -14,7 +14,7 @@ from hvdc_ident.errors import UnknownNameError
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
 from hvdc_ident.parameters import Parameter
-from tests.fit.simulators import line
+from tests.fit.simulators import line, recorded
 from tests.identifiability.cases import closed, line_and_nothing, measured, product
 
 
@@ -64,6 +64,19 @@ def test_what_a_fit_elsewhere_than_the_report_may_state() -> None:
     weak = {**report, "parameters": {**report["parameters"], "b": {**report["parameters"]["b"], "verdict": "weak"}}}
     b = gated_fit(moved, weak, partial(fit, starts=1)).estimates["b"]
     assert (b.method, b.ci95, b.std) == ("none", None, None) and "disagree" in b.reason
+
+
+def test_where_the_fit_leaves_more_than_noise_no_interval_of_the_report_stands() -> None:
+    """The report is of a record that a line follows; the record that is fitted has a wave on it, ten times the noise."""
+    plant = closed(line, a=1.0, b=1.0)
+    free = (FitParameter("a", 1, -5, 5), FitParameter("b", 1, -5, 5))
+    straight = measured(plant, {"a": 1, "b": 2}, 0.01)
+    report = identifiability(plant, [straight], free, starts=1).to_dict()
+    assert all(line["ci95"] is not None for line in report["parameters"].values())
+    y = straight.measured["y"] + 0.1 * np.sin(40.0 * straight.time)
+    wavy = recorded("e", straight.time, {"y": 0.01}, y=y)
+    for e in gated_fit(Problem(plant, (wavy,), free), report, partial(fit, starts=1)).estimates.values():
+        assert (e.method, e.ci95, e.std) == ("none", None, None) and "lacks something" in e.reason
 
 
 def test_one_at_a_bound_stands_there_with_its_limit() -> None:
