@@ -184,7 +184,7 @@ def _assembled(
         held=FrozenMap(held),
         structure=structure,
         combinations=tuple(assessment.combinations),
-        collinear=collinear_subsets(matrix, first.names)[:200] if len(first.names) > 1 else (),
+        collinear=collinear_subsets(matrix, first.names)[:200],
         correlation=last.uncertainty.correlation() if last is not None else {},
         shares=whole.information.shares(),
         heterogeneity=tests,

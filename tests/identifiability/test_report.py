@@ -63,3 +63,15 @@ def test_words_and_notebook_show_every_verdict(report) -> None:
     for n, v in report.parameters.items():
         assert v.reason in said and f"<td>{n}</td><td>{v.verdict}</td>" in shown
     assert "<table>" in shown and "Every verdict holds for these outputs" in shown
+
+
+def test_the_collinearity_of_an_offset_and_a_slope_is_that_of_their_columns() -> None:
+    """gamma of two columns with the cosine c is 1/sqrt(1 - c): Brun, Reichert and Kuensch, Water Resour. Res. 37 (2001) 1015."""
+    data = runs([2.0])
+    found = identifiability(LINE, data, FREE, starts=1).to_dict()["collinearity"]
+    time = data[0].time
+    cosine = time.sum() / np.sqrt(time.size * (time @ time))
+    assert [pair["parameters"] for pair in found] == [["a", "b"]]
+    assert found[0]["index"] == pytest.approx(1.0 / np.sqrt(1.0 - cosine), rel=1e-6)
+    alone = identifiability(LINE, data, FREE[:1], held={"b": 2.0}, starts=1)
+    assert alone.collinear == ()
