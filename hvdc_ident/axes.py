@@ -1,4 +1,4 @@
-"""Drawing of profiles and intervals from the JSON of an identifiability report, on given axes.
+"""Drawing of profiles and intervals from the JSON of an identifiability report or a fit, on given axes.
 
 It imports nothing that computes them, so that a page of results is made quickly.
 """
@@ -42,7 +42,7 @@ def joined(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> None:
-    """Draw the 95 % interval of each parameter about its value, in % of its scale, open ends as arrows, with the verdict."""
+    """Draw the 95 % interval of each parameter about its value, in % of its scale, open ends as arrows, with any verdict."""
     names = list(parameters)
     ends = {n: _relative(parameters[n]) for n in names}
     known = [abs(e) for pair in ends.values() if pair is not None for e in pair if e is not None and e != 0]
@@ -62,7 +62,7 @@ def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> No
     ticks = _decades(smallest, reach)
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks], minor=False)
     axes.set_xticks([], minor=True)
-    axes.set_yticks(range(len(names)), [f"{n}\n{parameters[n]['verdict']}" for n in names], fontsize=7)
+    axes.set_yticks(range(len(names)), [f"{n}\n{parameters[n].get('verdict', '')}".rstrip() for n in names], fontsize=7)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlabel("95 % interval, % of the value (of the range where 0 is admissible); x: held", fontsize=8)
     _plain(axes)

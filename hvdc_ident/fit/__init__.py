@@ -1,7 +1,7 @@
 """Estimation of parameters from experiments, for anything that can be simulated.
 
 `fit` solves a `Problem`: the parameters to estimate, the experiments, the noise. `fit_each` and `fit_individually` fit parts
-of it. Profile likelihoods, bootstraps and uncertainties are in modules of their own.
+of it. Profile likelihoods and uncertainties are in modules of their own.
 """
 
 from typing import TYPE_CHECKING

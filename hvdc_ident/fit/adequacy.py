@@ -359,13 +359,13 @@ def residual_tests(blocks: Sequence[ResidualBlock], experiments: Sequence[Experi
     return table
 
 
-def ljung_box(r: Array, lags: int | None = None, parts: Sequence[slice] = ()) -> dict[str, Any]:
-    """Return Ljung and Box's (1978) statistic over the first lags (default: 10, or a fifth of the rows), with its p.
+def ljung_box(r: Array, parts: Sequence[slice] = ()) -> dict[str, Any]:
+    """Return Ljung and Box's (1978) statistic over the first 10 lags, or a fifth of the rows, with its p.
 
     parts: stretches of rows between which some are missing; none for one stretch.
     """
     n = r.size
-    lags = min(10, n // 5) if lags is None else lags
+    lags = min(10, n // 5)
     centred = r - r.mean()
     power = float(centred @ centred)
     if lags < 1 or power == 0.0:
@@ -392,14 +392,14 @@ def runs(r: Array) -> dict[str, Any]:
     return {"runs": count, "expected": expected, "p": math.erfc(abs(count - expected) / math.sqrt(2.0 * variance))}
 
 
-def cross_correlation(r: Array, u: Array, lags: int | None = None) -> dict[str, Any]:
+def cross_correlation(r: Array, u: Array) -> dict[str, Any]:
     """Return the largest correlation of the residual with the same or an earlier input row, its lag, and the p of all lags.
 
     Both are first filtered by their own AR(1) coefficient, so that two slow signals do not count as related; the
     statistic n sum(ccf^2) over lags 0 to 20 (or a fifth of the rows) is chi-square (Box and Jenkins, section 11.3).
     """
     n = r.size
-    lags = min(20, n // 5) if lags is None else lags
+    lags = min(20, n // 5)
     a, b = _innovation(r), _innovation(u)
     power = math.sqrt(float(a @ a) * float(b @ b))
     if power == 0.0 or n < 5:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, fdtrc, stdtrit
+from scipy.special import stdtrit
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
@@ -72,7 +72,7 @@ def assessed(problem: Problem, result: FitResult) -> FitResult:
     held_out = {e.name for e in problem.experiments if e.role == "holdout"}
     return replace(
         result,
-        goodness=goodness(problem, result, {n: c for n, c in by_experiment.items() if n not in held_out}),
+        goodness=goodness({n: c for n, c in by_experiment.items() if n not in held_out}),
         validation=validation(problem, result, {n: by_experiment.get(n) for n in sorted(held_out)}, nuisances),
     )
 
@@ -162,50 +162,27 @@ def curves(
     return table
 
 
-def goodness(problem: Problem, result: FitResult, by_experiment: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
-    """Return the goodness of fit over the fitted experiments.
-
-    chi2, dof, p: of all residuals together, against the given noise, with the independent samples that correlated
-    residuals are worth; None, with the reason, where the noise came from the misfit. noise_dof: samples behind a noise
-    that was estimated; the p is then that of F(dof, noise_dof), else of chi-square. outputs: see `_quality`.
-    """
+def goodness(by_experiment: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
+    """Return the quality of the curves of the fitted experiments: {outputs {output {experiment: see `_quality`}}}."""
     table: dict[str, dict[str, Any]] = {}
     for experiment, line in by_experiment.items():
         for output, c in line.items():
             table.setdefault(output, {})[experiment] = _quality(c)
-    samples = sum(q["n"] for line in table.values() for q in line.values())
-    effective = sum(result.effective_samples.values())
-    given = bool(result.noise_source) and not any(map(from_misfit, result.noise_source.values()))
-    behind = problem.noise_dof
-    overall: dict[str, Any] = {"chi2": None, "dof": None, "p": None, "reason": "", "noise_dof": None}
-    if not given:
-        overall["reason"] = "the noise is taken from the misfit, which then says nothing about the fit"
-    elif result.chi2_per_dof is None or not samples:
-        overall["reason"] = "no more rows than unknowns"
-    else:
-        dof = max(effective - len(result.fitted), 1.0)
-        value = result.chi2_per_dof * dof
-        known = not np.isfinite(behind)
-        p = chdtrc(dof, value) if known else fdtrc(dof, behind, result.chi2_per_dof)
-        overall |= {"chi2": value, "dof": dof, "p": float(p), "noise_dof": None if known else behind}
-    return {**overall, "outputs": table}
+    return {"outputs": table}
 
 
 def _quality(c: Curve) -> dict[str, Any]:
     """Return the quality of one curve.
 
-    n: rows; rmse, in the unit; rmse_per_sigma; r2: share of the variance explained; fit_percent: 100 (1 - |e|/|y - mean|),
-    None where the record stands still; in_band: share of rows in the 95 % band.
+    n: rows; rmse, in the unit; r2: share of the variance explained, None where the record stands still; in_band: share of rows
+    in the 95 % band.
     """
     e, y = c.misfit, c.measured[c.rows]
     moved = float(np.sum((y - y.mean()) ** 2))
-    squares = float(e @ e)
     return {
         "n": int(e.size),
         "rmse": c.rmse,
-        "rmse_per_sigma": float(np.sqrt(np.mean(c.residual**2))),
-        "r2": 1.0 - squares / moved if moved > 0 else None,
-        "fit_percent": 100.0 * (1.0 - np.sqrt(squares / moved)) if moved > 0 else None,
+        "r2": 1.0 - float(e @ e) / moved if moved > 0 else None,
         "in_band": float(np.mean(np.abs(e) <= c.band[c.rows])) if c.band is not None else None,
     }
 

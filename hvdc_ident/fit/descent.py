@@ -1,4 +1,4 @@
-"""Bounded Levenberg-Marquardt on exact sensitivities: the descent that fits, profiles, refits and bootstraps share.
+"""Bounded Levenberg-Marquardt on exact sensitivities: the descent that fits, profiles and refits share.
 
 A step minimises |r + J p|^2 + lambda |D p|^2 in scaled coordinates with D the largest column norms so far (Moré 1978), with
 bounds met by an active set; lambda follows the ratio of actual to predicted reduction as in Nielsen (1999), "Damping parameter
@@ -31,8 +31,8 @@ AS_PROMISED = 0.1
 """A reduction within this share of the promised one shows no error of the simulation."""
 SMALLEST = 1e-10
 """A scaled coordinate below this counts as this large where its step is judged: an optimum may lie at 0."""
-NEAR = 10.0
-"""Longest first step of a descent that begins near a minimum: no parabola holds over four decades of a logarithm."""
+LONGEST = 10.0
+"""Longest first step of a descent that begins near a minimum, and along a tangent: no parabola holds over four decades of a logarithm."""
 
 
 class Residuals(Protocol):
@@ -44,14 +44,6 @@ class Residuals(Protocol):
 
     def residual(self, theta: Array) -> tuple[Array, Array]:
         """Return r, (n,), and dr/dtheta, (n, p), at theta, (p,). Raises SimulationError where theta is inadmissible."""
-
-
-@dataclass(frozen=True, eq=False)
-class LeastSquares:
-    """A sum of squares given by a function: theta to r, (n,), and dr/dtheta, (n, p)."""
-
-    unknowns: tuple[FitParameter, ...]
-    residual: Callable[[Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +103,7 @@ class LinearResiduals:
         def solve(free: NDArray[np.bool_], p: Array) -> Array:
             return np.asarray(np.linalg.lstsq(matrix[:, free], right - matrix[:, ~free] @ p[~free], rcond=None)[0])
 
-        g = self.gradient
-        blocked = ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))
-        return active_set(solve, ~blocked, low, high)
+        return active_set(solve, ~_blocked(self.gradient, low, high), low, high)
 
     def predicted(self, p: Array) -> float:
         """Return the reduction of the cost that the linear residuals promise for the step p, (p,)."""
@@ -239,7 +229,7 @@ class Descent:
         return True
 
     def _stationary(self, here: LinearResiduals, low: Array, high: Array) -> bool:
-        g = np.where(((low >= 0) & (here.gradient > 0)) | ((high <= 0) & (here.gradient < 0)), 0.0, here.gradient)
+        g = np.where(_blocked(here.gradient, low, high), 0.0, here.gradient)
         return bool((np.abs(g) <= self.options.gradient * here.norms * np.sqrt(2.0 * here.cost)).all())
 
 
@@ -262,10 +252,10 @@ def descend(
 ) -> DescentResult:
     """Return the minimum near theta, (p,), over the unknowns that are not fixed, within their bounds.
 
-    For descents that begin near a minimum, as each of a profile's or bootstrap's hundreds does: by Gauss-Newton steps until a
+    For descents that begin near a minimum, as each of a profile's hundreds does: by Gauss-Newton steps until a
     predicted fall of the cost is less than `enough`. Raises SimulationError where theta is inadmissible.
     """
-    down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough, reach=NEAR), fixed)
+    down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough, reach=LONGEST), fixed)
     down.go(theta)
     if down.at is None:
         assert down.failure is not None
@@ -293,8 +283,12 @@ def bounded_step(g: Array, h: Array, low: Array, high: Array) -> Array:
         rhs = target[free] - matrix[np.ix_(free, ~free)] @ (p * scale)[~free]
         return np.asarray(np.linalg.lstsq(matrix[np.ix_(free, free)], rhs, rcond=1e-12)[0]) / scale[free]
 
-    free = ~(((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | ((low >= 0) & (high <= 0))) & (np.diag(h) > 0)
-    return active_set(solve, free, low, high)
+    return active_set(solve, ~_blocked(g, low, high) & (np.diag(h) > 0), low, high)
+
+
+def _blocked(gradient: Array, low: Array, high: Array) -> NDArray[np.bool_]:
+    """Return the entries, (p,), that have no room where the gradient would have them go; low, high: how far they may move."""
+    return ((low >= 0) & (gradient > 0)) | ((high <= 0) & (gradient < 0)) | ((low >= 0) & (high <= 0))
 
 
 def active_set(

@@ -17,10 +17,16 @@ from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import assessed
 from hvdc_ident.fit.descent import predicted_reduction
-from hvdc_ident.fit.jump_instants import PlacedInstant, placed_instants, search_instants, within_stretches
+from hvdc_ident.fit.jump_instants import (
+    PlacedInstant,
+    placed_instants,
+    search_instants,
+    within_own_stretches,
+    within_stretches,
+)
 from hvdc_ident.fit.noise import source_text
 from hvdc_ident.fit.nonsmooth import LUCK, Trend, residual_at, threshold_of, trend_of
-from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
+from hvdc_ident.fit.optimiser import LocalMinimum, Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import ResidualBlock
@@ -28,7 +34,6 @@ from hvdc_ident.fit.result import NOT_ASKED, Covariance, Estimate, FitResult, St
 from hvdc_ident.fit.search import (
     DISTINCT,
     SAME,
-    LocalMinimum,
     cost_at,
     distinct,
     higher_ends,
@@ -78,11 +83,11 @@ def fit(
     found = search(first, optimiser, starts, seed, executor, progress, begun, misfit_expected=misfit_expected)
     points, runs = found.points, found.runs
     if all(r.status == "failed" or r.cost is None for r in runs):
-        return _failed(first, points, runs, f"no start reached an end: {runs[0].message}")
+        return failed(first, points, runs, f"no start reached an end: {runs[0].message}")
     try:
         problem, result = _result(first, points, runs, whiten)
     except SimulationError as e:
-        return _failed(first, points, runs, f"the optimum cannot be simulated again: {e}")
+        return failed(first, points, runs, f"the optimum cannot be simulated again: {e}")
     return assessed(problem, result) if assess else result
 
 
@@ -116,8 +121,9 @@ def _result(
     outcomes = _outcomes(problem, points, runs, weigh=problem is not first)
     near = [o for o in optima[1:] if (o.cost - best.cost) * effective_share < DISTINCT]
     status, message = _status(problem, best, near, outcomes, effective_share, trend, refitted=refitted)
-    noise = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
-    judged = adequacy(problem, blocks, noise, inner.effective, inner.rho)
+    result = result_at(problem, best, blocks, inner.rho, inner.effective)
+    judged = result.adequacy
+    assert judged is not None
     jump = 0.0 if trend is None else LUCK * trend.roughness
     doubt = _doubt(problem, best, outcomes, samples, effective_share, jump)
     message = f"{doubt}; {message}" if doubt else message
@@ -125,41 +131,62 @@ def _result(
     estimates = estimates_of(problem, best.theta, blocks, inner, everything, systematic=judged.systematic)
     estimates = _with_placed(problem, best.theta, estimates, placed)
     estimates = _with_rivals(problem, estimates, near)
-    squares = sum(float(b.residual @ b.residual) for b in blocks)
-    in_time = blocks if problem.band is None else problem.blocks(best.theta, derivatives=False, in_time=True)
-    return problem, FitResult(
+    nuisance = {
+        e.name: FrozenMap({n: estimates[unknown_of(e.name, n)] for n in e.nuisance})
+        for e in problem.fitted_experiments
+        if e.nuisance
+    }
+    return problem, replace(
+        result,
         status=status,
         message=message,
-        fitted=tuple(f.name for f in problem.free),
-        held=_held(problem),
-        values=FrozenMap(problem.values(best.theta)),
         estimates=FrozenMap({f.name: estimates[f.name] for f in problem.free}),
-        nuisance=FrozenMap(
-            {
-                e.name: FrozenMap({n: estimates[unknown_of(e.name, n)] for n in e.nuisance})
-                for e in problem.fitted_experiments
-                if e.nuisance
-            }
-        ),
-        cost=best.cost,
-        chi2_per_dof=squares / (samples - best.theta.size) if samples > best.theta.size else None,
-        rmse=problem.rmse(best.theta),
-        rmse_start=problem.rmse_start,
-        rmse_given=problem.rmse_given,
-        adequacy=judged,
+        nuisance=FrozenMap(nuisance),
         roughness={} if trend is None else {"delta_chi2": 2.0 * trend.roughness, "text": trend.text},
-        noise_source=FrozenMap(noise),
-        sigma=problem.sigma,
-        rho=inner.rho,
-        effective_samples=inner.effective,
         correlation=inner.correlation(),
-        residual_tests=residual_tests(in_time, problem.fitted_experiments),
         starts=outcomes,
         search_doubt=doubt,
-        loss=problem.loss.name,
-        whitening={o: m for o, m in problem.treatment.whitening.items() if any(m)},
         dof=float(inner.dof) if np.isfinite(inner.dof) else None,
         covariance=Covariance(inner.names, inner.corrected, inner.dof),
+        instants=placed,
+    )
+
+
+def result_at(
+    problem: Problem,
+    at: LocalMinimum,
+    blocks: Sequence[ResidualBlock],
+    rho: Mapping[str, float],
+    effective: Mapping[str, float],
+) -> FitResult:
+    """Return the part of a result that the values alone decide: of a problem in its final weights, without estimates.
+
+    blocks: the residuals there. rho, effective: AR(1) coefficient of the residuals and independent samples, by output.
+    Raises SimulationError.
+    """
+    samples, unknowns = sum(b.residual.size for b in blocks), at.theta.size
+    squares = sum(float(b.residual @ b.residual) for b in blocks)
+    in_time = blocks if problem.band is None else problem.blocks(at.theta, derivatives=False, in_time=True)
+    noise = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
+    return FitResult(
+        status="converged",
+        message="",
+        fitted=tuple(f.name for f in problem.free),
+        held=_held(problem),
+        values=FrozenMap(problem.values(at.theta)),
+        cost=at.cost,
+        chi2_per_dof=squares / (samples - unknowns) if samples > unknowns else None,
+        rmse=problem.rmse(at.theta),
+        rmse_start=problem.rmse_start,
+        rmse_given=problem.rmse_given,
+        adequacy=adequacy(problem, blocks, noise, effective, rho),
+        noise_source=FrozenMap(noise),
+        sigma=problem.sigma,
+        rho=FrozenMap(rho),
+        effective_samples=FrozenMap(effective),
+        residual_tests=residual_tests(in_time, problem.fitted_experiments),
+        loss=problem.loss.name,
+        whitening={o: m for o, m in problem.treatment.whitening.items() if any(m)},
     )
 
 
@@ -301,14 +328,16 @@ def _doubt(
 ) -> str:
     """Return in words that one start alone reached the lowest cost of several; "" where another did, or none disagrees.
 
-    Nor is there doubt of the starts where the optimum was found beyond where all of them ended, by a search over instants.
+    Nor is there doubt of the starts where the optimum was found beyond where all of them ended, by a search over instants, or where
+    none but one began between the same rows.
 
     Then the starts say nothing of how likely a still lower cost is. The size of the residual is the unit of cost, whether or not the
     noise is known: costs that differ by less lead to the same estimates. samples: number of residuals.
     """
     reached = [LocalMinimum(_end(problem, o), o.cost) for o in outcomes if o.cost is not None]
-    ends = sorted(reached, key=lambda end: end.cost)
-    if len(outcomes) < 2 or not ends:
+    ends = within_own_stretches(problem, sorted(reached, key=lambda end: end.cost))
+    failed = len(outcomes) - len(reached)
+    if not ends or len(ends) + failed < 2:
         return ""
     lowest = ends[0].cost
     unit = max(1.0, 2.0 * lowest / max(samples - len(problem.unknowns), 1))
@@ -319,7 +348,6 @@ def _doubt(
     if len(others) < len(ends) - 1:
         return ""
     levels = [c for k, c in enumerate(others) if k == 0 or c > others[k - 1] + slack]
-    failed = len(outcomes) - len(ends)
     parts = []
     if levels:
         costs = f"{len(levels)} higher costs" if len(levels) > 1 else "a higher cost"
@@ -404,7 +432,7 @@ def _held(problem: Problem) -> FrozenMap[str]:
     return FrozenMap({n: problem.why.get(n, default[n]) for n in others})
 
 
-def _failed(problem: Problem, points: Sequence[Array], runs: Sequence[OptimiserResult], message: str) -> FitResult:
+def failed(problem: Problem, points: Sequence[Array], runs: Sequence[OptimiserResult], message: str) -> FitResult:
     """Return the result where no run reached an admissible end, or none can be repeated."""
     return FitResult(
         status="failed",

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -116,6 +117,23 @@ def _even_in_log(far: float, size: float, share: float) -> float:
     """Return the distance at a share in [0, 1] of the way, in the logarithm, from a hundredth of the size to `far`."""
     near = 0.01 * size
     return near * (max(far, size) / near) ** share
+
+
+def starting_points(
+    spread: Sequence[FitParameter], others: Sequence[FitParameter], count: int, seed: int | Sequence[int]
+) -> list[Array]:
+    """Return `count` points, (p,) each, of a seeded Latin hypercube.
+
+    spread: unknowns spread over their bounds (even in the logarithm where scaled so). others: unknowns that keep their own
+    start, as nuisances do: they are small by nature, and far off they only lead a run astray.
+    """
+    if count < 1:
+        return []
+    from scipy.stats import qmc
+
+    kept = [u.start for u in others]
+    shares = qmc.LatinHypercube(d=len(spread), seed=np.random.default_rng(seed)).random(count)
+    return [np.array([*(u.draw(float(s)) for u, s in zip(spread, row, strict=True)), *kept]) for row in shares]
 
 
 @dataclass(frozen=True, eq=False)

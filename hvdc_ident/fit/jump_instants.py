@@ -17,10 +17,9 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.descent import descend
-from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.optimiser import Optimiser
+from hvdc_ident.fit.fit_parameter import FitParameter, starting_points
+from hvdc_ident.fit.optimiser import LocalMinimum, Optimiser
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.search import LocalMinimum, starting_points
 from hvdc_ident.fit.simulator import TIME_SHIFT, unknown_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.system import evaluate
@@ -266,6 +265,14 @@ def stretch(problem: Problem, theta: Array, place: int) -> tuple[float, float]:
     return float(ends[k - 1]), float(ends[k])
 
 
+def within_own_stretches(problem: Problem, ends: Sequence[LocalMinimum]) -> list[LocalMinimum]:
+    """Return the ends of descents, the lowest first, that began in its stretches: no other could come to where it ended."""
+    if not ends:
+        return []
+    own = {k: stretch(problem, ends[0].theta, k) for k in moving(problem)}
+    return [e for e in ends if all(low <= e.theta[k] <= high for k, (low, high) in own.items())]
+
+
 def within_stretches(problem: Problem, theta: Array) -> Problem:
     """Return the problem in which the parameters that move instants are bounded by their stretches: its cost is smooth."""
     return within(
@@ -294,14 +301,15 @@ def _bounded(f: FitParameter, ends: tuple[float, float], value: float) -> FitPar
 class PlacedInstant:
     """An instant that the records place between two rows, as the interval of the parameter that moves it.
 
-    low, high: the 95 % interval; an end that is a bound of the search and nothing else is not excluded. passes: the range
-    between the two passings of rows that it lies in. points: (value, rise of the cost, (p,) the unknowns) along it,
-    also beyond the ends.
+    low, high: the 95 % interval; an end that is a bound of the search and nothing else is not excluded. rise: of the cost at an
+    end that is no passing of a row. passes: the range between the two passings of rows that it lies in. points: (value, rise of
+    the cost, (p,) the unknowns) along it, also beyond the ends.
     """
 
     name: str
     low: float
     high: float
+    rise: float
     passes: tuple[float, float]
     points: tuple[tuple[float, float, Array], ...]
 
@@ -366,7 +374,7 @@ def _placed(problem: Problem, theta: Array, place: int, rise: float) -> PlacedIn
     if "open" in (below, above) or "jump" not in (below, above):
         return None
     points.sort(key=lambda point: point[0])
-    return PlacedInstant(unknown.name, low, high, (low_edge, high_edge), tuple(points))
+    return PlacedInstant(unknown.name, low, high, rise, (low_edge, high_edge), tuple(points))
 
 
 # --- the search ---

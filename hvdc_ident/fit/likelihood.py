@@ -1,6 +1,6 @@
 """The likelihood of a residual: least squares, robust losses, quantised noise, and priors beside the data.
 
-Each is put as least squares of a changed residual s(r) with s^2/2 = the loss, so that every optimiser, profile and bootstrap
+Each is put as least squares of a changed residual s(r) with s^2/2 = the loss, so that every optimiser and profile
 serves all. Tuning constants of the losses are those of 95 % efficiency in white normal noise.
 """
 

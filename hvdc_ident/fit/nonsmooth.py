@@ -31,7 +31,7 @@ REACH = 2.0
 """First reach of the places, in standard deviations: the interval."""
 LUCK = 3.0
 """So many times the roughness may lie between the costs of the lowest of some twenty local minima and of the next."""
-RUNS = 9
+RUNS = UNEVEN.size
 """Evaluations that an estimate of the roughness takes."""
 ROUNDS = 8
 """Times that the places are moved or spread before the last trend is taken."""

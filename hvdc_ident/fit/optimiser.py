@@ -7,7 +7,8 @@ the library returns, and so is the budget.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
@@ -36,6 +37,14 @@ class OptimiserResult:
     status: OptimiserStatus
     message: str
     evaluations: int
+
+
+@dataclass(frozen=True, eq=False)
+class LocalMinimum:
+    """A local minimum of the cost: (p,) theta and its cost."""
+
+    theta: Array
+    cost: float
 
 
 class Optimiser(Protocol):
@@ -122,21 +131,19 @@ class OptimiserRun:
         if self.cost is None or cost < self.cost:
             self.cost, self.best = cost, np.asarray(theta, dtype=float).copy()
 
-    def ended(self, converged: bool, message: str) -> OptimiserResult:
-        """Return the best point seen. Without any admissible point the run failed."""
+    def result(self, minimise: Callable[[OptimiserRun], tuple[bool, str]]) -> OptimiserResult:
+        """Return the best point that a method sees. Without any admissible point the run failed.
+
+        minimise: runs the method from `x0` and returns whether it says that it converged, and its message.
+        """
+        try:
+            self.value_and_gradient(self.x0)
+            converged, message = (False, "") if self.cost is None else minimise(self)
+            status: OptimiserStatus = "converged" if converged else "stopped"
+        except BudgetSpentError:
+            status, message = "max-evaluations", f"no optimum within {self.limit} evaluations"
         if self.cost is None:
-            return OptimiserResult(
-                self.start, None, "failed", f"no point could be simulated: {self.failure}", self.evaluations
-            )
-        status: OptimiserStatus = "converged" if converged else "stopped"
+            why = f"no point could be simulated: {self.failure}"
+            return OptimiserResult(self.start, None, "failed", why, self.evaluations)
         more = f"; {self.failures} of {self.evaluations} points could not be simulated" if self.failures else ""
         return OptimiserResult(self.best, self.cost, status, message + more, self.evaluations)
-
-    def spent(self) -> OptimiserResult:
-        """Return the result where the evaluations were used up."""
-        end = self.ended(False, f"no optimum within {self.limit} evaluations")
-        return end if end.status == "failed" else replace(end, status="max-evaluations")
-
-    def refused(self, message: str) -> OptimiserResult:
-        """Return the result where the method gave up."""
-        return replace(self.ended(False, message), status="failed")

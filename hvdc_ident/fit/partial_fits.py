@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial, reduce
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,19 +19,16 @@ from scipy.special import stdtrit
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError, StudyError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
-from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.assessment import assessed, in_final_weights
-from hvdc_ident.fit.estimate import fit
+from hvdc_ident.fit.estimate import failed, fit, result_at
 from hvdc_ident.fit.fit_parameter import FitParameter
-from hvdc_ident.fit.optimiser import Optimiser
+from hvdc_ident.fit.optimiser import LocalMinimum, OptimiserResult
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import Covariance, FitResult, StartOutcome, Status
 from hvdc_ident.fit.simulator import unknown_of
-from hvdc_ident.fit.uncertainty import NO_INTERVAL
-from hvdc_ident.immutable import FrozenMap, joined
+from hvdc_ident.fit.uncertainty import NO_INTERVAL, samples_by_output
+from hvdc_ident.immutable import FrozenMap
 
-_OF_EACH = ("estimates", "nuisance", "noise_source", "rho", "effective_samples", "correlation", "whitening")
-"""Fields of a result that each group fills for its own parameters and outputs."""
 _WORST: tuple[Status, ...] = ("failed", "not-converged", "two-optima", "at-bound", "converged")
 
 
@@ -48,43 +45,31 @@ def fit_individually(
     problem: Problem,
     groups: Sequence[Group],
     *,
-    starts: int | None = None,
-    seed: int = 0,
-    optimiser: Optimiser | str | None = None,
-    whiten: str = "no",
-    executor: Executor | None = None,
-    progress: Progress | None = None,
     begun: Callable[[Sequence[str]], Sequence[StartOutcome]] = lambda names: (),
+    **options: Any,
 ) -> FitResult:
     """Return the fits of the groups, one after the other, as one result.
 
     While one group is fitted the other free parameters are held: at their estimate if their turn has been, else at
     their given value. Every estimate is conditional on those. The status is the worst of the groups'; cost, RMSE and tests
     are those of the whole problem with all estimates put in. A group that fails leaves its parameters at those values.
-    begun: from the names of a group's parameters the search that its fit takes up.
+    begun: from the names of a group's parameters the search that its fit takes up. options: as in `fit`.
     Raises StudyError or UnknownNameError for groups that do not fit the problem.
     """
-    _check(problem, groups)
-    current = {f.name: f.given for f in problem.free}
-    results = []
+    check_groups(problem, groups)
+    whole, at = problem, {f.name: f.given for f in problem.free}
+    parts: list[FitResult] = []
     for group in groups:
-        result = fit(
-            part_of(problem, group, current),
-            starts=starts,
-            seed=seed,
-            optimiser=optimiser,
-            whiten=whiten,
-            executor=executor,
-            progress=progress,
-            assess=False,
-            begun=begun(group.parameters),
-        )
-        current |= {n: result.values[n] for n in group.parameters if n in result.values and n in result.estimates}
-        results.append(result)
-    return _merged(problem, results, current)
+        result = fit(part_of(problem, group, at), assess=False, begun=begun(group.parameters), **options)
+        at |= {n: e.value for n, e in result.estimates.items()}
+        whole = in_final_weights(whole, result)
+        parts.append(result)
+    result = _together(whole, at, parts)
+    return result if result.status == "failed" else assessed(whole, result)
 
 
-def _check(problem: Problem, groups: Sequence[Group]) -> None:
+def check_groups(problem: Problem, groups: Sequence[Group]) -> None:
+    """Raise StudyError or UnknownNameError for groups that do not fit the problem."""
     free, where = [f.name for f in problem.free], "fit groups"
     grouped = [n for g in groups for n in g.parameters]
     require_known("free parameter", grouped, free, where)
@@ -121,74 +106,48 @@ def part_of(problem: Problem, group: Group, current: dict[str, float]) -> Proble
     )
 
 
-def _merged(problem: Problem, results: Sequence[FitResult], current: dict[str, float]) -> FitResult:
-    """Return the groups' results as one, judged on the whole problem."""
-    status: Status = min((r.status for r in results), key=_WORST.index)
-    message = "; ".join(f"group {i + 1}: {r.status}, {r.message}" for i, r in enumerate(results))
-    found: dict[str, Any] = {n: joined([getattr(r, n) for r in results]) for n in _OF_EACH}
-    nuisance = found["nuisance"]
-    whole = replace(
-        reduce(in_final_weights, results, problem),
-        experiments=tuple(
-            e if e.role != "fit" else e.with_(nuisance=tuple(n for n in e.nuisance if n in nuisance.get(e.name, {})))
-            for e in problem.experiments
-        ),
-    )
-    estimated = current | {unknown_of(e, n): v.value for e, own in nuisance.items() for n, v in own.items()}
-    theta = np.array([estimated.get(u.name, u.start) for u in whole.unknowns])
-    found["estimates"] = FrozenMap(
-        {f.name: found["estimates"][f.name] for f in problem.free if f.name in found["estimates"]}
-    )
-    result = FitResult(
+def _together(whole: Problem, at: Mapping[str, float], parts: Sequence[FitResult]) -> FitResult:
+    """Return the result of the problem, which is in final weights, with the estimates of its parts, (`at` by parameter).
+
+    Parts fitted one after the other are taken as independent. Of a nuisance that several estimated the last estimate stands.
+    """
+    numbered = [(f"group {i}", r) for i, r in enumerate(parts, start=1)]
+    nuisance = {e: own for r in parts for e, own in r.nuisance.items()}
+    values = {**at, **{unknown_of(e, n): v.value for e, own in nuisance.items() for n, v in own.items()}}
+    theta = np.array([values.get(u.name, u.start) for u in whole.unknowns])
+    status: Status = min((r.status for r in parts), key=_WORST.index)
+    message = "; ".join(f"{group}: {r.status}, {r.message}" for group, r in numbered)
+    try:
+        blocks = whole.blocks(theta, derivatives=False)
+        result = result_at(whole, LocalMinimum(theta, whole.cost(theta)), blocks, *samples_by_output(blocks, theta.size))
+    except SimulationError as error:
+        point = OptimiserResult(theta, None, "failed", str(error), 1)
+        return failed(whole, [theta], [point], f"{message}; all estimates together: {error}")
+    estimates = {n: e for r in parts for n, e in r.estimates.items()}
+    if result.adequacy is not None and result.adequacy.systematic:  # together, though each may fit its own records
+        stated = {n: e for n, e in estimates.items() if e.method != "none"}
+        estimates |= {n: e.without_interval(NO_INTERVAL) for n, e in stated.items()}
+    known = [r.covariance for r in parts if r.covariance is not None]
+    names = tuple(n for c in known for n in c.names)
+    joint = Covariance(names, block_diag(*(c.matrix for c in known)), min((c.dof for c in known), default=np.inf))
+    return replace(
+        result,
         status=status,
         message=message,
-        fitted=tuple(f.name for f in problem.free),
-        held=FrozenMap({n: w for n, w in results[0].held.items() if n not in current}),
-        values=FrozenMap(whole.values(theta)),
-        rmse=whole.rmse(theta),
-        rmse_start=problem.rmse_start,
-        rmse_given=problem.rmse_given,
-        sigma=whole.sigma,
-        starts=tuple(replace(s, group=i) for i, r in enumerate(results) for s in r.starts),
-        search_doubt="; ".join(f"group {i + 1}: {r.search_doubt}" for i, r in enumerate(results) if r.search_doubt),
-        loss=problem.loss.name,
-        dof=min((r.dof for r in results if r.dof is not None), default=None),
-        covariance=_joint(results),
-        **found,
+        estimates=FrozenMap({f.name: estimates[f.name] for f in whole.free if f.name in estimates}),
+        nuisance=FrozenMap(nuisance),
+        correlation={n: line for r in parts for n, line in r.correlation.items()},
+        starts=tuple(replace(s, group=i) for i, r in enumerate(parts) for s in r.starts),
+        search_doubt="; ".join(f"{group}: {r.search_doubt}" for group, r in numbered if r.search_doubt),
+        dof=min((r.dof for r in parts if r.dof is not None), default=None),
+        covariance=joint if len(set(names)) == len(names) else None,
     )
-    try:
-        cost = whole.cost(theta)
-        blocks = whole.blocks(theta, derivatives=False, in_time=True)
-    except SimulationError as error:
-        return replace(result, status="failed", message=f"{message}; all estimates together: {error}")
-    squares = sum(float(b.residual @ b.residual) for b in blocks)
-    spare = sum(b.residual.size for b in blocks) - theta.size
-    tests = residual_tests(blocks, whole.fitted_experiments)
-    judged = adequacy(whole, blocks, result.noise_source, result.effective_samples, result.rho)
-    chi2 = squares / spare if spare > 0 else None
-    stated = result.estimates
-    if judged.systematic:  # together, though each group may fit its own records
-        stated = FrozenMap({n: e if e.method == "none" else e.without_interval(NO_INTERVAL) for n, e in stated.items()})
-    result = replace(result, cost=cost, chi2_per_dof=chi2, adequacy=judged, residual_tests=tests, estimates=stated)
-    return assessed(whole, result)
-
-
-def _joint(results: Sequence[FitResult]) -> Covariance | None:
-    """Return the covariances as one: groups fitted one after the other are taken as independent."""
-    parts = [r.covariance for r in results if r.covariance is not None]
-    names = tuple(n for c in parts for n in c.names)
-    if not parts or len(set(names)) < len(names):
-        return None  # a nuisance that two groups estimated
-    return Covariance(names, block_diag(*(c.matrix for c in parts)), min(c.dof for c in parts))
 
 
 def fit_each(
     problem: Problem,
     *,
     runs: Mapping[str, Sequence[str]] | None = None,
-    starts: int = 1,
-    seed: int = 0,
-    optimiser: Optimiser | str | None = None,
     whiten: str = "no",
     executor: Executor | None = None,
     progress: Progress | None = None,
@@ -202,8 +161,7 @@ def fit_each(
     number is `on_bound`. Raises UnknownNameError for a run's experiment that is not fitted, StudyError for an empty run.
     """
     parts = _parts(problem, runs)
-    one = partial(_alone, starts=starts, seed=seed, optimiser=optimiser, whiten=whiten)
-    outcomes: Iterator[FitResult] = mapped(executor, one, list(parts.values()))
+    outcomes: Iterator[FitResult] = mapped(executor, partial(_alone, whiten=whiten), list(parts.values()))
     results: dict[str, FitResult] = {}
     for name, result in zip(parts, outcomes, strict=True):
         results[name] = result
@@ -224,8 +182,9 @@ def _parts(problem: Problem, runs: Mapping[str, Sequence[str]] | None) -> dict[s
     return parts
 
 
-def _alone(problem: Problem, *, starts: int, seed: int, optimiser: Optimiser | str | None, whiten: str) -> FitResult:
-    return fit(problem, starts=starts, seed=seed, optimiser=optimiser, whiten=whiten, assess=False)
+def _alone(problem: Problem, *, whiten: str) -> FitResult:
+    """Return the fit that begins at the start alone."""
+    return fit(problem, starts=1, whiten=whiten, assess=False)
 
 
 def _row(free: FitParameter, results: Mapping[str, FitResult]) -> dict[str, Any]:

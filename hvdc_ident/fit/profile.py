@@ -241,10 +241,6 @@ def _profile(sides: Sequence[tuple[ProfilePath, Side]]) -> Profile:
     return Profile(path.name, value, lower, upper, thetas[:, path.i], rises, thetas, path.rise, path.on_bound)
 
 
-JOINT = 2.996
-"""Rise of the cost on the border of a joint 95 % region of two parameters: half the chi-square quantile, 2 degrees."""
-
-
 @dataclass(frozen=True, eq=False)
 class PairProfile:
     """The rise of the cost over a grid. first: (m,), second: (n,) values in their units; rises: (m, n), nan: failed."""

@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.descent import DescentResult
+from hvdc_ident.fit.descent import LONGEST, DescentResult
 from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 
-LONGEST = 10.0
-"""A logarithm moves along the tangent by at most this: no parabola holds over four decades."""
 BEYOND = 10.0
 """Without bounds a path goes on to so many times where a parabola would cross: the typical size is often a guess."""
 
@@ -125,7 +123,7 @@ class ProfilePath:
         if x == end:
             return Side("open-at-bound", None, "the optimum lies on this bound")
         # Half the way to where a parabola would cross, in scaled coordinates.
-        step, failures = float(min(0.5 * self._parabola, self._largest(), 10.0)), 0
+        step, failures = float(min(0.5 * self._parabola, self._largest(), LONGEST)), 0
         goal = np.sqrt(2.0 * self.rise)
         while len(self.points) < self.options.points and abs(x - self.x0[self.i]) < self.reach:
             ahead = x + self.direction * min(step, self._largest())
@@ -138,6 +136,7 @@ class ProfilePath:
                 if failures > 6:
                     return self._ended("not-found", f"beyond {self._value(x):.4g} the simulation fails: {error.what}")
                 continue
+            failures = 0
             self.points.append((ahead, point))
             rise = point.at.cost - self.best.at.cost
             if rise >= self.rise:

@@ -1,11 +1,10 @@
 """Results of a fit and their forms.
 
-A `FitResult` prints as one screen, and gives the JSON of the stage, a data frame, a figure and the values to paste into a study.
+A `FitResult` prints as one screen, and gives the JSON of the stage, a data frame and a figure.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -15,8 +14,9 @@ from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.files import plain
 from hvdc_ident.fit.adequacy import Adequacy
+from hvdc_ident.fit.jump_instants import PlacedInstant
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import in_python
+from hvdc_ident.text import in_python, interval_text
 
 NOT_ASKED = "not a candidate"
 """Reason of a parameter that is held because it was not asked for."""
@@ -108,6 +108,7 @@ class FitResult(Shown):
     dof: degrees of freedom of Student's t behind the intervals, None where the noise is known and white (its square is
     the F quantile of one parameter). goodness, validation: see there.
     covariance: of the unknowns that have one; not in the JSON, which has std and correlation.
+    instants: what the rows tell of each parameter that sets the instant of a jump; not in the JSON, whose estimates say it.
     """
 
     status: Status
@@ -139,6 +140,7 @@ class FitResult(Shown):
     goodness: Mapping[str, Any] = field(default_factory=dict)
     validation: Mapping[str, Any] = field(default_factory=dict)
     covariance: Covariance | None = field(default=None, metadata={"json": False})
+    instants: Mapping[str, PlacedInstant] = field(default_factory=dict, metadata={"json": False})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON takes it: full precision, None for what is not finite."""
@@ -149,13 +151,13 @@ class FitResult(Shown):
         yield self._quality()
         yield f"{self.roughness['text']}." if self.roughness else ""
         start = self.starts[0].start if self.starts else {}
-        rows = [(n, e.value, e.unit, _ends(e), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
+        rows = [(n, e.value, e.unit, interval_text(e.ci95), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
         yield (
             Table(("parameter", "estimate", "unit", "95 % interval", "std", "start", "remark"), tuple(rows))
             if rows
             else ""
         )
-        own = [(x, n, e.value, e.unit, _ends(e)) for x, table in self.nuisance.items() for n, e in table.items()]
+        own = [(x, n, e.value, e.unit, interval_text(e.ci95)) for x, table in self.nuisance.items() for n, e in table.items()]
         yield Table(("experiment", "nuisance", "estimate", "unit", "95 % interval"), tuple(own)) if own else ""
         yield self._held()
         columns = (self.rmse_given, self.rmse_start, self.rmse)
@@ -181,22 +183,12 @@ class FitResult(Shown):
         return "\n".join([*lines, *([f"Not asked about: {', '.join(others)}."] if others else [])])
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the estimates with their 95 % intervals about the start, in % of it, and return the axes."""
+        """Draw the 95 % interval of each estimate about its value, in % of it, and return the axes."""
+        from hvdc_ident.axes import draw_intervals
+
         axes = axes_of(ax, 7.0, 1.2 + 0.4 * max(len(self.estimates), 1))
-        start = self.starts[0].start if self.starts else {}
-        for row, (name, e) in enumerate(self.estimates.items()):
-            base = start.get(name) or 0.0
-            size = abs(base) or abs(e.value) or 1.0
-            axes.plot([100 * (e.value - base) / size], [row], marker="o", color="#1f5fa8")
-            low, high = e.ci95 or (None, None)
-            if low is not None and high is not None:
-                axes.plot(
-                    [100 * (low - base) / size, 100 * (high - base) / size], [row, row], color="#1f5fa8", linewidth=2
-                )
-        axes.axvline(0.0, color="#999999", linestyle=":")
-        axes.set_yticks(range(len(self.estimates)), list(self.estimates))
-        axes.invert_yaxis()
-        axes.set_xlabel("change from the start, with the 95 % interval, %")
+        lines = {n: {"value": e.value, "ci95": e.ci95, "scale": abs(e.value)} for n, e in self.estimates.items()}
+        draw_intervals(axes, lines)
         return axes
 
     def to_dataframe(self) -> Any:
@@ -210,27 +202,3 @@ class FitResult(Shown):
             "ci95_high": [high for _, high in ends],
         }
         return data_frame(columns, list(self.estimates), "parameter")
-
-    def to_toml_values(self) -> str:
-        """Return the text of a [model.values] table: fitted and held parameters, full precision, with units as comments."""
-        lines = ["[model.values]"]
-        for name, value in self.values.items():
-            unit = self.estimates[name].unit if name in self.estimates else ""
-            lines.append(f"{_key(name)} = {float(value)!r}" + (f"  # {unit}" if unit else ""))
-        return "\n".join(lines) + "\n"
-
-
-def _ends(e: Estimate) -> str:
-    """Return the 95 % interval as text, with the figures that tell its ends apart."""
-    low, high = e.ci95 or (None, None)
-    if low is None or high is None:
-        return "" if low is high else f"below {high:.6g}" if low is None else f"above {low:.6g}"
-    width = high - low
-    figures = 6 if width <= 0 else min(15, max(4, math.ceil(math.log10(max(abs(low), abs(high)) / width)) + 2))
-    return f"{low:.{figures}g} to {high:.{figures}g}"
-
-
-def _key(name: str) -> str:
-    """Return the name as a TOML key."""
-    bare = name and all(c.isascii() and (c.isalnum() or c in "_-") for c in name)
-    return name if bare else json.dumps(name)

@@ -16,10 +16,11 @@ from hvdc_ident.data import MAD_TO_STD, Array
 from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
 from hvdc_ident.fit.adequacy import MATTERS
-from hvdc_ident.fit.fit_parameter import FitParameter
+from hvdc_ident.fit.fit_parameter import starting_points
+from hvdc_ident.fit.jump_instants import within_own_stretches
 from hvdc_ident.fit.noise import MISFIT, floor_of, models_before_event
 from hvdc_ident.fit.nonsmooth import LUCK, roughness
-from hvdc_ident.fit.optimiser import Optimiser, OptimiserResult
+from hvdc_ident.fit.optimiser import LocalMinimum, Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers import optimiser as named
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
@@ -45,14 +46,6 @@ DISTINCT = TWO_SIDED
 """Costs that differ by less are as good: half the 95 % quantile of chi-square with one degree of freedom."""
 TIE = 1e-6
 """Costs that differ by this share differ by what no number of rows makes a likelihood notice (half of it a row)."""
-
-
-@dataclass(frozen=True, eq=False)
-class LocalMinimum:
-    """A local minimum of the cost: (p,) theta and its cost."""
-
-    theta: Array
-    cost: float
 
 
 @dataclass(frozen=True)
@@ -165,7 +158,7 @@ def _runs(
 
 def _worth_more(problem: Problem, found: Search, *, misfit_expected: bool) -> bool:
     """Return whether further starts are called for, and the simulations allow them."""
-    ends = found.ends
+    ends = within_own_stretches(problem, found.ends)
     differences = len(problem.unknowns) if approximate(problem.simulator) else 0
     if sum(r.evaluations for r in found.runs) * (1 + differences) >= SIMULATIONS or not ends:
         return False
@@ -261,23 +254,6 @@ def same_place(problem: Problem, theta: Array, other: Array) -> bool:
     """Return whether two points, (p,) each, differ by no more than a thousandth of each scaled coordinate's range."""
     space = problem.coordinates
     return bool((np.abs(space.scaled(theta) - space.scaled(other)) <= 1e-3 * space.ranges).all())
-
-
-def starting_points(
-    spread: Sequence[FitParameter], others: Sequence[FitParameter], count: int, seed: int | Sequence[int]
-) -> list[Array]:
-    """Return `count` points, (p,) each, of a seeded Latin hypercube.
-
-    spread: unknowns spread over their bounds (even in the logarithm where scaled so). others: unknowns that keep their own
-    start, as nuisances do: they are small by nature, and far off they only lead a run astray.
-    """
-    if count < 1:
-        return []
-    from scipy.stats import qmc
-
-    kept = [u.start for u in others]
-    shares = qmc.LatinHypercube(d=len(spread), seed=np.random.default_rng(seed)).random(count)
-    return [np.array([*(u.draw(float(s)) for u, s in zip(spread, row, strict=True)), *kept]) for row in shares]
 
 
 def local_minima(runs: Sequence[OptimiserResult]) -> list[LocalMinimum]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import solve_banded
-from scipy.special import stdtrit
+from scipy.special import chdtri, stdtrit
 
 from hvdc_ident.data import Array
 from hvdc_ident.fit.fit_parameter import FitParameter
@@ -24,15 +24,16 @@ from hvdc_ident.fit.result import Estimate
 from hvdc_ident.fit.simulator import unit_of, unknown_of
 from hvdc_ident.fit.whitening import independent_samples
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.sensitivity import null_directions
 from hvdc_ident.text import figures
 
 if TYPE_CHECKING:
     from hvdc_ident.fit.nonsmooth import Trend
 
-TWO_SIDED = 1.92
-"""Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree."""
-ONE_SIDED = 1.353
-"""Rise at the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile."""
+TWO_SIDED = 0.5 * float(chdtri(1.0, 0.05))
+"""Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree; 1.92."""
+ONE_SIDED = 0.5 * float(chdtri(1.0, 0.10))
+"""Rise at the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile; 1.353."""
 NO_INTERVAL = "no interval: the model lacks something"
 """Remark on an estimate where the residual is more than noise."""
 WIDER = 2.0
@@ -121,8 +122,9 @@ def uncertainty(
     norms = np.linalg.norm(jacobian, axis=0)
     unseen = norms * spans <= UNSEEN
     norms = np.where(unseen, 1.0, norms)
-    inverse, null = _inverse(jacobian / norms, ~unseen)
-    rho, effective = _samples(blocks, p)
+    seen = np.where(unseen, 0.0, jacobian / norms)
+    inverse, null = _inverse(seen), null_directions(seen, SINGULAR)
+    rho, effective = samples_by_output(blocks, p)
     meat = sum(
         (score_covariance(b.jacobian[part] / norms, rho[b.output]) for b in blocks for part in b.stretches),
         np.zeros((p, p)),
@@ -154,34 +156,14 @@ def uncertainty(
     )
 
 
-def _inverse(normalised: Array, observable: Array) -> tuple[Array, Array]:
-    """Return the inverse of J'J, (p, p), over the directions that are determined, and a sparse basis (k, p) of the others."""
-    p = observable.size
-    inverse, null = np.zeros((p, p)), np.zeros((0, p))
-    columns = np.flatnonzero(observable)
-    if columns.size:
-        _, s, vt = np.linalg.svd(np.linalg.qr(normalised[:, columns], mode="r"), full_matrices=True)
-        s = np.concatenate([s, np.zeros(columns.size - s.size)])
-        good = s > SINGULAR * s[0]
-        inverse[np.ix_(columns, columns)] = (vt[good].T / s[good] ** 2) @ vt[good]
-        null = np.zeros((int((~good).sum()), p))
-        null[:, columns] = _reduced(vt[~good])
-    return inverse, null
+def _inverse(columns: Array) -> Array:
+    """Return the inverse of J'J, (p, p), over the directions that are determined, from columns J of length 1 or 0."""
+    root = np.linalg.pinv(np.linalg.qr(columns, mode="r"), rcond=SINGULAR)
+    return np.asarray(root @ root.T)
 
 
-def _reduced(rows: Array) -> Array:
-    """Return a basis of the row space in reduced echelon form, so that each row names as few unknowns as possible."""
-    rows = rows.copy()
-    for i in range(rows.shape[0]):
-        pivot = int(np.argmax(np.abs(rows[i])))
-        rows[i] /= rows[i, pivot]
-        others = np.arange(rows.shape[0]) != i
-        rows[others] -= np.outer(rows[others, pivot], rows[i])
-    return rows
-
-
-def _samples(blocks: Sequence[ResidualBlock], p: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the AR(1) coefficient and the effective number of samples by output."""
+def samples_by_output(blocks: Sequence[ResidualBlock], p: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Return by output the residuals' AR(1) coefficient, and the independent samples they are worth, after a fit of p unknowns."""
     total = sum(b.residual.size for b in blocks)
     rho, effective = {}, {}
     for output in dict.fromkeys(b.output for b in blocks):

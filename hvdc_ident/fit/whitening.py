@@ -20,19 +20,19 @@ MOST = 8
 """The highest AR order that is tried."""
 FEWEST = 20
 """From fewer rows the noise is not whitened: a coefficient would be known to 0.2 at best."""
-FEWEST_OF_RESIDUALS = 4
-"""From fewer rows no autocorrelation of residuals is told; with a few tens it is a rough guess and errs to the wide side."""
 
 
 def autocorrelation(residuals: Sequence[Array], unknowns: float) -> float:
     """Return the AR(1) coefficient of several records together, 0 where it is not significant (5 %, one-sided) or negative.
+
+    With a few tens of rows it is a rough guess and errs to the wide side; of four or fewer none is significant.
 
     unknowns: how many parameters were fitted to them; a fit lowers the coefficient by about (k + (k + 2) rho)/n
     (Marriott and Pope 1954, for k = 1 and 2), which is added back.
     """
     n = sum(r.size for r in residuals)
     power = sum(float(r @ r) for r in residuals)
-    if power == 0.0 or n < FEWEST_OF_RESIDUALS:
+    if power == 0.0:
         return 0.0
     rho = sum(float(r[1:] @ r[:-1]) for r in residuals) / power
     if rho < 1.645 / np.sqrt(n):

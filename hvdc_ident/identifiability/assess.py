@@ -17,11 +17,10 @@ from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
-from hvdc_ident.fit.bootstrap import Bootstrap, bootstrap
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.jump_instants import moving_parameters
 from hvdc_ident.fit.noise import unknown_noise
-from hvdc_ident.fit.partial_fits import Group, part_of
+from hvdc_ident.fit.partial_fits import Group, check_groups, part_of
 from hvdc_ident.fit.profile_path import ProfileOptions
 from hvdc_ident.fit.simulator import inputs_of
 from hvdc_ident.identifiability.experiment_design import Recommendation, recommend
@@ -48,11 +47,6 @@ from hvdc_ident.immutable import FrozenMap, joined
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import LocalSensitivities, collinear_subsets, sensitivities
 from hvdc_ident.simulate import ModelSimulator
-
-ENOUGH = 5
-"""From so many experiments on they are drawn anew: five give 126 tests samples, four only 35."""
-TELLING = 4.0
-"""So many of them, counted by information, must tell of a parameter to draw experiments anew for it."""
 
 
 def identifiability(
@@ -93,11 +87,12 @@ def identifiability(
         first, result = at_given_values(problem)
     _data_notes(assessment, first, result)
     assessment.ends = tuple((o.end, o.cost) for o in result.starts if o.cost is not None)
+    assessment.placed = result.instants
     assessment.thresholds = thresholds(first)
     last = without_insensitive(assessment, with_placed_instants(assessment, first)) if free else None
     last = without_null_directions(assessment, last) if last else None
     last = profile_remaining(assessment, last, executor) if last else None
-    report = _assembled(assessment, structure, first, last, result, executor)
+    report = _assembled(assessment, structure, first, last, result)
     if pair and last is not None and set(pair) <= set(report.identifiable):
         return replace(report, pair=pair_of(last, report.parameters, pair))
     note = f"No common profile of {' and '.join(pair)}: not both are fitted." if pair else ""
@@ -158,7 +153,6 @@ def _assembled(
     first: LocalAnalysis,
     last: LocalAnalysis | None,
     result: FitResult,
-    executor: Executor | None,
 ) -> IdentifiabilityReport:
     """Return the report. first: the optimum of the pilot fit; last: that of the set that is fitted."""
     bound = {n for n, v in assessment.verdicts.items() if v.verdict == "at-bound"}
@@ -173,8 +167,6 @@ def _assembled(
     whole = _whole(assessment, last or first)
     unjudged = _unjudged(assessment, whole, fitted, first)
     held = {n: (v, assessment.verdicts[n].reason if n in unjudged else why) for n, (v, why) in held.items()}
-    resampled = _resampled(assessment, last, executor)
-    scatter = resampled.ci95() if resampled else {}
     for n, verdict in assessment.verdicts.items():
         value = held[n][0] if n in held else verdict.value
         if last is not None and not np.isfinite(value):
@@ -182,7 +174,6 @@ def _assembled(
         scale = scale_of(assessment.free[n], value)[0]
         norm = whole.information.norms[n]
         verdict = replace(verdict.noted(assessment.remark), value=value, scale=scale, sensitivity_norm=norm)
-        verdict = verdict.scattered(scatter[n], resampled) if resampled and n in scatter else verdict
         assessment.verdicts[n] = verdict.under_misfit() if first.adequacy.systematic else verdict
     several = last is not None and len(last.problem.fitted_experiments) > 1
     tests = heterogeneity(last) if last is not None and several else FrozenMap()
@@ -193,7 +184,7 @@ def _assembled(
         held=FrozenMap(held),
         structure=structure,
         combinations=tuple(assessment.combinations),
-        collinear=collinear_subsets(matrix, first.names)[:200] if len(first.names) > 1 else (),
+        collinear=collinear_subsets(matrix, first.names)[:200],
         correlation=last.uncertainty.correlation() if last is not None else {},
         shares=whole.information.shares(),
         heterogeneity=tests,
@@ -212,7 +203,6 @@ def _assembled(
             "noise_source": dict(result.noise_source),
         },
         notes=tuple(assessment.notes),
-        bootstrap=resampled,
         sensitivities=_sensitivities(assessment, whole),
         not_judged=unjudged,
         optima=assessment.optima,
@@ -276,36 +266,6 @@ def _sensitivities(assessment: Assessment, whole: LocalAnalysis) -> LocalSensiti
         return None
 
 
-def _resampled(assessment: Assessment, last: LocalAnalysis | None, executor: Executor | None) -> Bootstrap | None:
-    """Return the estimates from experiments drawn anew, of those parameters that enough experiments tell of.
-
-    A parameter that one or two experiments determine would be lost in every sample without them: it stays where it is.
-    """
-    if last is None or len(last.problem.fitted_experiments) < ENOUGH:
-        return None
-    telling = last.information.telling()
-    resampled = [n for n in last.names if telling[n] >= TELLING]
-    others = [n for n in last.names if n not in resampled]
-    if not resampled:
-        assessment.notes.append("Experiments are not drawn anew: of every parameter only a few of them tell.")
-        return None
-    if others:
-        assessment.notes.append(f"While experiments are drawn anew {', '.join(others)} stay: only a few tell of them.")
-    assessment.report_stage("experiments drawn anew")
-    fixed = {n: last.value(n) for n in others}
-    places = [i for i, n in enumerate(last.problem.names) if n not in fixed]
-    problem = replace(
-        last.problem,
-        free=tuple(f for f in last.problem.free if f.name in resampled),
-        held=last.problem.held | fixed,
-    )
-    try:
-        return bootstrap(problem, last.theta[places], seed=assessment.seed, executor=executor)
-    except SimulationError as error:
-        assessment.notes.append(f"The bootstrap over experiments came to nothing: {error.what}.")
-        return None
-
-
 def _recommended(assessment: Assessment, whole: LocalAnalysis, *, misfit: bool) -> Recommendation | None:
     """Return what to measure next, where there is an input to move. misfit: whether more than a known noise is left."""
     assessment.report_stage("what to measure next")
@@ -334,60 +294,44 @@ def identifiability_by_group(
     """
     simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
     problem = Problem(simulator, tuple(experiments), tuple(candidates))
-    names = [f.name for f in problem.free]
-    listed = [n for g in groups for n in g.parameters]
-    if sorted(listed) != sorted(names):
-        expected, got = ", ".join(names), ", ".join(listed)
-        raise StudyError("groups must hold every candidate once", where="fit groups", expected=expected, got=got)
-    current = {f.name: f.given for f in problem.free}
+    check_groups(problem, groups)
+    at = {f.name: f.given for f in problem.free}
     reports = []
     for group in groups:
-        part = part_of(problem, group, current)
+        part = part_of(problem, group, at)
         both = pair if pair and set(pair) <= set(group.parameters) else None
         report = identifiability(subject, part.experiments, part.free, held=part.held, pair=both, **options)
-        current |= {n: v.value for n, v in report.parameters.items()}
-        reports.append(_noted(report, group, part))
-    merged = _merged(reports, names)
-    if pair and merged.pair is None and not any(set(pair) <= set(g.parameters) for g in groups):
-        note = f"No common profile of {' and '.join(pair)}: they stand in two groups."
-        merged = replace(merged, notes=(*merged.notes, note))
-    return merged
-
-
-def _noted(report: IdentifiabilityReport, group: Group, part: Problem) -> IdentifiabilityReport:
-    """Return what a group's report brings to that of all, each note begun with the group's parameters."""
-    mine = ", ".join(group.parameters)
-    data = f"{', '.join(part.outputs)} in {', '.join(e.name for e in part.fitted_experiments)}"
-    first = f"{mine}: judged alone, on {data}, the other candidates held."
-    return replace(
-        report,
-        notes=(first, *(f"{mine}: {n}" for n in report.notes)),
-        misspecification=replace(
-            report.misspecification, signs=tuple(f"{mine}: {s}" for s in report.misspecification.signs)
-        ),
-        pilot={"groups": [{"parameters": list(group.parameters), **report.pilot}]},
-        bootstrap=None,  # of experiments and of a model that the groups share
-        sensitivities=None,
-    )
-
-
-def _merged(reports: Sequence[IdentifiabilityReport], names: Sequence[str]) -> IdentifiabilityReport:
-    """Return the groups' reports as one, candidates in the order of `names`.
-
-    What to measure next is that of the first group that needs it; the notes say what the others would.
-    """
+        at |= {n: v.value for n, v in report.parameters.items()}
+        reports.append(_noted(report, part))
+    # What to measure next is that of the first group that needs it; the notes say what the others would.
     settled = ("identifiable", "at-bound")
     advised = next((r for r in reports if any(v.verdict not in settled for v in r.parameters.values())), reports[0])
     others = [(r, r.recommended.text) for r in reports if r is not advised and r.recommended is not None]
-    advice = [f"To measure next for {', '.join(r.parameters)}: {text}" for r, text in others]
+    notes = [f"To measure next for {', '.join(r.parameters)}: {text}" for r, text in others]
+    if pair and not any(set(pair) <= set(g.parameters) for g in groups):
+        notes.append(f"No common profile of {' and '.join(pair)}: they stand in two groups.")
     whole = joined([replace(r, recommended=None) for r in reports])
     decided = all(r.structure.status == "decided" for r in reports)
     return replace(
         whole,
-        parameters=FrozenMap({n: whole.parameters[n] for n in names}),
-        identifiable=tuple(n for n in names if n in whole.identifiable),
+        parameters=FrozenMap({n: whole.parameters[n] for n in at}),
+        identifiable=tuple(n for n in at if n in whole.identifiable),
         structure=replace(whole.structure, status="decided" if decided else "not decided"),
-        shares=FrozenMap({e: FrozenMap({n: own.get(n, 0.0) for n in names}) for e, own in whole.shares.items()}),
         recommended=advised.recommended,
-        notes=(*whole.notes, *advice),
+        notes=(*whole.notes, *notes),
+    )
+
+
+def _noted(report: IdentifiabilityReport, part: Problem) -> IdentifiabilityReport:
+    """Return what a group's report brings to that of all, each note begun with the group's parameters."""
+    mine = ", ".join(report.parameters)
+    data = f"{', '.join(part.outputs)} in {', '.join(e.name for e in part.fitted_experiments)}"
+    first = f"{mine}: judged alone, on {data}, the other candidates held."
+    signs = tuple(f"{mine}: {s}" for s in report.misspecification.signs)
+    return replace(
+        report,
+        notes=(first, *(f"{mine}: {n}" for n in report.notes)),
+        misspecification=replace(report.misspecification, signs=signs),
+        pilot={"groups": [{"parameters": list(report.parameters), **report.pilot}]},
+        sensitivities=None,  # of a model that the groups share
     )

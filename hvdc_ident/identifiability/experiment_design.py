@@ -6,6 +6,7 @@ with the largest determinant (D-optimal) is named beside it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -35,12 +36,8 @@ HOPELESS = 1e3
 WORTH = 0.9
 """An interval that does not shrink below this share of what it is now is no gain to speak of."""
 NAMED = 3
-NEW_SIGNAL = 1.1
-"""Recording another signal is advised only where it raises the smallest eigenvalue by more than this factor."""
-EQUAL = 0.01
-"""Designs whose smallest eigenvalue is within this share of the best are equals: the larger determinant is taken."""
-ADDED = 0.1
-"""A second step that raises the logarithm of the determinant by less adds nothing."""
+GAIN = WORTH**-2.0
+"""Factor of the information that narrows an interval so far: recording another signal, or a second step, is advised from it on."""
 BEGUN_WITH = 3
 """So many of the best single steps are tried with a second step of every other input."""
 LISTED = 8
@@ -334,7 +331,7 @@ def recommend(
     if not ranked:
         return None
     base = whole.information.matrix
-    best = _e_optimal(ranked)
+    best = max(ranked, key=lambda r: (*_order(r), -len(r.new), -len(r.design.moves)))
     by_determinant = max(
         ranked, key=lambda r: (r.criteria.directions, r.criteria.log_determinant, -len(r.design.moves))
     )
@@ -380,7 +377,7 @@ class _Ranking:
                 more = optimality(self.base + gain, self.whole.error)
                 if (more.directions, more.smallest_eigenvalue) > (
                     first.directions,
-                    first.smallest_eigenvalue * NEW_SIGNAL,
+                    first.smallest_eigenvalue * GAIN,
                 ):
                     yield RankedDesign(design, (*self.recorded, signal), (signal,), more, gain)
 
@@ -413,15 +410,6 @@ class _Ranking:
         return share * float(np.abs(values).max()) or typical
 
 
-def _e_optimal(ranked: Sequence[RankedDesign]) -> RankedDesign:
-    """The one with most directions seen and the largest smallest eigenvalue; of equals the larger determinant."""
-    seen = max(r.criteria.directions for r in ranked)
-    most = [r for r in ranked if r.criteria.directions == seen]
-    largest = max(r.criteria.smallest_eigenvalue for r in most)
-    equals = [r for r in most if r.criteria.smallest_eigenvalue >= (1.0 - EQUAL) * largest]
-    return max(equals, key=lambda r: (r.criteria.log_determinant, -len(r.new), -len(r.design.moves)))
-
-
 def _others(ranked: Sequence[RankedDesign], best: RankedDesign) -> Iterator[RankedDesign]:
     """Yield the best of each other kind and set of inputs, best first; pairs only where the second step adds something."""
     shown = {(best.design.kind, frozenset(best.design.inputs))}
@@ -435,7 +423,7 @@ def _others(ranked: Sequence[RankedDesign], best: RankedDesign) -> Iterator[Rank
             len(r.design.moves) > 1
             and single is not None
             and r.criteria.directions <= single.criteria.directions
-            and r.criteria.log_determinant <= single.criteria.log_determinant + ADDED
+            and r.criteria.log_determinant <= single.criteria.log_determinant + math.log(GAIN)
         ):
             continue
         shown.add(key)

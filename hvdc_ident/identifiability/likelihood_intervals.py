@@ -17,9 +17,9 @@ from scipy.special import stdtrit
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.bootstrap import FEWEST, cluster_sandwich
 from hvdc_ident.fit.descent import DescentResult, bounded_step, descend
 from hvdc_ident.fit.profile import PairProfile, Profile, profile_pair
+from hvdc_ident.fit.search import same_place
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.identifiability.verdicts import Verdict
@@ -35,8 +35,6 @@ EVALUATIONS = 25
 """A descent that has not come near by then is given up."""
 NEAR = 10.0
 """Ends of the multistart whose cost is more than so many thresholds above the best are optima of their own, but no rivals."""
-SAME = 1e-3
-"""Points that differ by less in every scaled coordinate are one."""
 
 
 @dataclass(frozen=True)
@@ -57,23 +55,15 @@ def spreads(optimum: LocalAnalysis) -> dict[str, Spread]:
 
     The rise is 1.92; with estimated noise half the square of Student's t. Times what correlated samples and model error
     add to the variance in the parameter's direction (vertical scaling of an independence likelihood: Chandler and Bate
-    2007, doi 10.1093/biomet/asm015): the wider of the AR(1) sandwich times the excess misfit and, where the misfit
-    shows model error, the sandwich over experiments with t(n - 1).
+    2007, doi 10.1093/biomet/asm015): the AR(1) sandwich times the excess misfit.
     """
     u = optimum.uncertainty
     quantile = 0.5 * float(stdtrit(u.dof, 0.975)) ** 2 if np.isfinite(u.dof) else TWO_SIDED
     raw = np.diag(u.raw)
     safe = np.where(raw > 0, raw, 1.0)
     factor = np.maximum(np.where(raw > 0, np.diag(u.corrected) / safe, 1.0) * optimum.excess, 1.0)
-    limits = quantile * factor
-    if optimum.excess > 1.0 and len({b.experiment for b in optimum.blocks}) >= FEWEST and not u.singular:
-        covariance, dof = cluster_sandwich(optimum.blocks)
-        scatter = np.where(raw > 0, np.diag(covariance) / safe, 0.0)
-        wider = 0.5 * float(stdtrit(dof, 0.975)) ** 2 * scatter
-        factor = np.where(wider > limits, scatter, factor)
-        limits = np.maximum(limits, wider)
-    stds = np.sqrt(raw * factor)
-    return {n: Spread(float(s), float(v)) for n, s, v in zip(optimum.names, stds, limits, strict=False)}
+    rows = zip(optimum.names, np.sqrt(raw * factor), quantile * factor, strict=False)
+    return {n: Spread(float(std), float(rise)) for n, std, rise in rows}
 
 
 def range_of(free: FitParameter, value: float, reach: float) -> tuple[float, float]:
@@ -194,12 +184,11 @@ def _cost(g: Array, h: Array, p: Array) -> float:
     return float(g @ p + 0.5 * p @ h @ p)
 
 
-def pair_of(
-    optimum: LocalAnalysis, verdicts: Mapping[str, Verdict], names: tuple[str, str], points: int = 13
-) -> PairProfile:
+def pair_of(optimum: LocalAnalysis, verdicts: Mapping[str, Verdict], names: tuple[str, str]) -> PairProfile:
     """The common profile of two fitted parameters, over twice their intervals but within the bounds.
 
-    Its rises are in units of the threshold for one parameter, so 95 % of both together lie within JOINT/1.92.
+    Its rises are in units of the threshold for one parameter, so 95 % of both together lie within 2.996/1.92: half the quantiles
+    of chi-square with two degrees of freedom and with one.
     """
     grids = []
     for n in names:
@@ -208,7 +197,7 @@ def pair_of(
         low, high = v.profile.ci95 if v.profile is not None else (None, None)
         half = 0.5 * (high - low) if low is not None and high is not None else 0.25 * u.span
         centre = optimum.value(n)
-        grids.append(np.linspace(max(u.min, centre - 2 * half), min(u.max, centre + 2 * half), points))
+        grids.append(np.linspace(max(u.min, centre - 2 * half), min(u.max, centre + 2 * half), 13))
     limit = max(thresholds(optimum)[n] for n in names)
     pair = profile_pair(optimum.problem, optimum.theta, names, *grids, enough=1e-3 * limit)
     return replace(pair, rises=pair.rises / limit)
@@ -231,38 +220,33 @@ def other_optima(
     with their costs. The search starts from those, and from the best with two parameters of one unit exchanged, the most
     alike in their effect first, or with a sign turned: that is where the usual second solutions lie.
     """
-    space = best.problem.coordinates
     limit = max(limits.values())
 
     def same_basin(theta: Array) -> bool:
         """Return True where a point is the best one but for the roughness of the cost."""
         return best.trend is not None and best.trend.holds(theta, limit)
 
-    known = [space.scaled(best.theta)]
+    known, reached = [best.theta], [best.theta]
     starts: list[Array] = []
     for theta in (*_ended(best, ends, limit), *_exchanged(best)):
-        if _new(space.scaled(theta), known) and not same_basin(theta):
-            known.append(space.scaled(theta))
+        if not any(same_place(best.problem, theta, k) for k in known) and not same_basin(theta):
+            known.append(theta)
             starts.append(theta)
     rivals: list[DescentResult] = []
-    reached = [space.scaled(best.theta)]
     for theta in starts:
         try:
             end = descend(best.problem, theta, enough=1e-4 * limit, max_evaluations=EVALUATIONS)
         except SimulationError:
             continue
-        if end.at.cost - best.cost < limit and _new(space.scaled(end.theta), reached) and not same_basin(end.theta):
-            reached.append(space.scaled(end.theta))
+        found_before = any(same_place(best.problem, end.theta, k) for k in reached)
+        if end.at.cost - best.cost < limit and not found_before and not same_basin(end.theta):
+            reached.append(end.theta)
             rivals.append(end)
     rivals.sort(key=lambda r: r.at.cost)
     names = best.problem.names
     return tuple(
         OtherOptimum(FrozenMap(zip(names, map(float, r.theta), strict=True)), r.at.cost - best.cost) for r in rivals
     )
-
-
-def _new(x: Array, known: Sequence[Array]) -> bool:
-    return not any((np.abs(x - k) <= SAME).all() for k in known)
 
 
 def _ended(best: LocalAnalysis, ends: Sequence[tuple[Mapping[str, float], float]], limit: float) -> Iterator[Array]:

@@ -18,7 +18,7 @@ from hvdc_ident.fit.uncertainty import TWO_SIDED, score_covariance
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, normalised, pivoted_order, standard_deviations
-from hvdc_ident.text import percentage, times_text
+from hvdc_ident.text import percentage, span, times_text
 
 LEVEL = 0.01
 """Level of the test of all parameters together (Bonferroni)."""
@@ -116,10 +116,9 @@ def misspecification(
     signs = []
     for name, h in tests.items():
         if h.p < LEVEL / len(tests) and h.i2 > 0.5:
-            low, high = min(h.estimates.values()), max(h.estimates.values())
-            unit = f" {units[name]}" if units.get(name) else ""
+            ends = span(min(h.estimates.values()), max(h.estimates.values()), units.get(name, ""), word="to")
             signs.append(
-                f"the experiments disagree on {name}: alone they would put it at {low:.4g} to {high:.4g}{unit} "
+                f"the experiments disagree on {name}: alone they would put it at {ends} "
                 f"(Q {h.q:.0f} for {h.dof} degree{'' if h.dof == 1 else 's'} of freedom, I2 {percentage(h.i2)})"
             )
     if optimum.excess > 1.0:

@@ -6,6 +6,7 @@ values it bounds the standard deviations from below (Cramer and Rao).
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
 from hvdc_ident.fit.adequacy import Adequacy, adequacy
+from hvdc_ident.fit.assessment import deviations_from_misfit
 from hvdc_ident.fit.descent import descend
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit
 from hvdc_ident.fit.nonsmooth import Trend
@@ -26,13 +28,13 @@ from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.result import FitResult, StartOutcome
 from hvdc_ident.fit.search import misfit_weights
 from hvdc_ident.fit.simulator import sensitivity_error
-from hvdc_ident.fit.uncertainty import Uncertainty, uncertainty
+from hvdc_ident.fit.uncertainty import TWO_SIDED, Uncertainty, uncertainty
 from hvdc_ident.identifiability.structural import combinations_of, parameter_directions, scaled_slope
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import Information, independent, marginal, standard_deviations
 from hvdc_ident.text import listed, quantity
 
-HALF_95 = 1.96
+HALF_95 = math.sqrt(2.0 * TWO_SIDED)
 """Half the width of a normal distribution's central 95 %, in standard deviations."""
 
 
@@ -168,12 +170,7 @@ def pilot_fit(
     )  # fmt: skip
     if result.status == "failed":
         raise _failure(problem, result.message)
-    weights = {
-        o: next(s[o] for s in result.sigma.values() if o in s)
-        for o, source in result.noise_source.items()
-        if from_misfit(source)
-    }
-    weighted = problem.with_(weights={**problem.weights, **weights})
+    weighted = problem.with_(weights=problem.weights | deviations_from_misfit(result))
     theta = [result.values[f.name] for f in problem.free]
     theta += [result.nuisance[e.name][n].value for e in problem.fitted_experiments for n in e.nuisance]
     assert len(theta) == len(weighted.names)

@@ -13,10 +13,9 @@ from functools import partial
 
 import numpy as np
 
-from hvdc_ident.data import Array
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.jump_instants import PlacedInstant, placed_instants, within
+from hvdc_ident.fit.jump_instants import PlacedInstant, within
 from hvdc_ident.fit.nonsmooth import LUCK, roughness, trend_of
 from hvdc_ident.fit.profile import Profile, profiles, trend_profiles
 from hvdc_ident.fit.profile_path import ProfileOptions, Side
@@ -36,7 +35,6 @@ from hvdc_ident.identifiability.likelihood_intervals import (
 )
 from hvdc_ident.identifiability.pilot_fit import HALF_95, LocalAnalysis
 from hvdc_ident.identifiability.structural import (
-    Combination,
     StructuralAnalysis,
     combinations_of,
     parameter_directions,
@@ -54,8 +52,9 @@ from hvdc_ident.identifiability.verdicts import (
     structural_verdict,
 )
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import independent, normalised, pivoted_order, rise_over_range
+from hvdc_ident.sensitivity import Combination, independent, normalised, pivoted_order, rise_over_range
 from hvdc_ident.sensitivity.information import inflation_index
+from hvdc_ident.text import quantity
 
 WORTH = 0.02
 """A fall of the cost by less than this share of a threshold moves no interval: the walks of profiles restart from there too."""
@@ -87,7 +86,7 @@ class Assessment:
     unmoved: tuple[str, ...] = ()
     ends: tuple[tuple[Mapping[str, float], float], ...] = ()
     optima: tuple[OtherOptimum, ...] = ()
-    placed: dict[str, PlacedInstant] = field(default_factory=dict)
+    placed: Mapping[str, PlacedInstant] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.free: dict[str, FitParameter] = {f.name: f for f in self.problem.free}
@@ -119,9 +118,10 @@ class Assessment:
             reduced = optimum.with_held(reasons, {n: optimum.value(n) for n in reasons})
             why = "the records cannot be met"
         for n in reasons:
-            value, unit = reduced.problem.held[n], f" {self.units[n]}" if self.units[n] else ""
-            if value != self.free[n].given:
-                remark = f"It is held at {value:.4g}{unit}: at its given value, {self.free[n].given:.4g}{unit}, {why}."
+            value, given = reduced.problem.held[n], self.free[n].given
+            if value != given:
+                unit = self.units[n]
+                remark = f"It is held at {quantity(value, unit)}: at its given value, {quantity(given, unit)}, {why}."
                 self.held_at[n] = value
                 self.held[n] = f"{self.held[n]} {remark}"
                 self.verdicts[n] = self.verdicts[n].noted(remark)
@@ -152,9 +152,6 @@ def with_placed_instants(assessment: Assessment, optimum: LocalAnalysis) -> Loca
     The cost jumps where the instant passes a row. So the stages that follow, whose verdicts rest on derivatives or on a
     continuous cost, see it between these rows alone, and leave the parameters themselves to `_profile_of_instant`.
     """
-    limits = assessment.thresholds
-    rise = max((limits[n] for n in optimum.names), default=TWO_SIDED)
-    assessment.placed = placed_instants(optimum.problem, optimum.theta, rise) if optimum.trend is None else {}
     ranges = {n: instant.passes for n, instant in assessment.placed.items()}
     return replace(optimum, problem=within(optimum.problem, optimum.theta, ranges)) if ranges else optimum
 
@@ -180,11 +177,11 @@ def _thresholds(assessment: Assessment, optimum: LocalAnalysis) -> dict[str, flo
     return {n: widest if n in assessment.placed else limits[n] for n in optimum.names}
 
 
-def _profile_of_instant(instant: PlacedInstant, theta: Array, i: int, threshold: float) -> Profile:
+def _profile_of_instant(instant: PlacedInstant, value: float) -> Profile:
     """Return the profile of a parameter that moves an instant: it ends where the instant passes a row, or before."""
     values, rises, thetas = (np.array(column) for column in zip(*instant.points, strict=True))
     lower, upper = Side("closed", instant.low), Side("closed", instant.high)
-    return Profile(instant.name, float(theta[i]), lower, upper, values, rises, thetas, threshold)
+    return Profile(instant.name, value, lower, upper, values, rises, thetas, instant.rise)
 
 
 def without_insensitive(assessment: Assessment, optimum: LocalAnalysis) -> LocalAnalysis | None:
@@ -318,9 +315,7 @@ def _profiles(
     assessment.notes += [f"A better optimum was found: {r}." for r in found.restarts]
     optimum = LocalAnalysis(problem, found.theta)
     instants = {
-        n: _profile_of_instant(assessment.placed[n], found.theta, i, limits[n])
-        for i, n in enumerate(optimum.names)
-        if n in assessment.placed
+        n: _profile_of_instant(assessment.placed[n], optimum.value(n)) for n in optimum.names if n in assessment.placed
     }
 
     def walk_again(to: Mapping[str, float]) -> FrozenMap[Profile]:

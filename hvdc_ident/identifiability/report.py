@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from html import escape
 from typing import Any
 
 import numpy as np
@@ -15,15 +14,15 @@ import numpy as np
 from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.files import plain
-from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.profile import PairProfile, Profile
 from hvdc_ident.identifiability.experiment_design import Recommendation
 from hvdc_ident.identifiability.likelihood_intervals import OtherOptimum
 from hvdc_ident.identifiability.misspecification import Heterogeneity, Misspecification
-from hvdc_ident.identifiability.structural import Combination, StructuralAnalysis
+from hvdc_ident.identifiability.structural import StructuralAnalysis
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.sensitivity import Collinear, LocalSensitivities
+from hvdc_ident.sensitivity import Collinear, Combination, LocalSensitivities
+from hvdc_ident.text import interval_text
 
 IN_JSON = (
     "verdict",
@@ -32,7 +31,6 @@ IN_JSON = (
     "unit",
     "scale",
     "ci95",
-    "ci95_experiments",
     "std",
     "relative_std",
     "sensitivity_norm",
@@ -58,8 +56,7 @@ class IdentifiabilityReport(Shown):
     combinations: what is seen of those that cannot be told apart. collinear: subsets with their index, worst first within
     each size. shares: of each parameter's information, by experiment.
     pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
-    search met. bootstrap: the estimates of the set fitted, from experiments drawn anew, where there are enough.
-    sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
+    search met. sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
     the model has no equations here.
     """
 
@@ -78,7 +75,6 @@ class IdentifiabilityReport(Shown):
     pilot: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     pair: PairProfile | None = None
-    bootstrap: Bootstrap | None = None
     sensitivities: LocalSensitivities | None = None
     not_judged: tuple[str, ...] = ()
     optima: tuple[OtherOptimum, ...] = ()
@@ -90,18 +86,7 @@ class IdentifiabilityReport(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The report as JSON takes it: full precision, None for what is not finite."""
-        s, drawn = self.structure, self.bootstrap
-        bootstrap = (
-            None
-            if drawn is None
-            else {
-                "samples": len(drawn.values),
-                "failed": drawn.failed,
-                "experiments": drawn.experiments,
-                "ci95": {n: list(interval) for n, interval in drawn.ci95().items()},
-                "std": drawn.std(),
-            }
-        )
+        s = self.structure
         found = {
             "parameters": {n: {f: getattr(v, f) for f in IN_JSON} for n, v in self.parameters.items()},
             "identifiable": list(self.identifiable),
@@ -138,7 +123,6 @@ class IdentifiabilityReport(Shown):
             "recommended_experiment": self.recommended.to_dict() if self.recommended else None,
             "profiles": {n: _profile(v.profile) for n, v in self.parameters.items() if v.profile is not None},
             "pair": self.pair,
-            "bootstrap": bootstrap,
             "sensitivities": self.sensitivities.to_dict() if self.sensitivities else None,
             "pilot": self.pilot,
             "notes": [*self.notes, CONDITIONS],
@@ -170,12 +154,9 @@ class IdentifiabilityReport(Shown):
     def _screen(self) -> Iterator[str | Table]:
         fitted = ", ".join(self.identifiable) or "none"
         yield f"Identifiable: {fitted} (of {len(self.parameters)} asked about)."
-        rows = [(n, v.verdict, v.value, v.unit, _interval(v)) for n, v in self.parameters.items()]
+        rows = [(n, v.verdict, v.value, v.unit, interval_text(v.ci95)) for n, v in self.parameters.items()]
         yield Table(("parameter", "verdict", "value", "unit", "95 % interval"), tuple(rows))
         yield "\n".join(f"{n}: {v.reason}" for n, v in self.parameters.items())
-        yield from self._remarks()
-
-    def _remarks(self) -> Iterator[str]:
         signs = self.misspecification
         if signs.flag:
             yield f"The model does not explain these data: {'; '.join(signs.signs)}."
@@ -185,11 +166,6 @@ class IdentifiabilityReport(Shown):
 
     def __str__(self) -> str:
         return "\n\n".join(str(block) for block in self._screen() if block)  # reasons stay whole: they are searched for
-
-    def _repr_html_(self) -> str:
-        rows = [(n, v.verdict, f"{v.value:.6g} {v.unit}", _interval(v), v.reason) for n, v in self.parameters.items()]
-        table = Table(("parameter", "verdict", "value", "95 % interval", "why"), tuple(rows))
-        return table.html + "".join(f"<p>{escape(line)}</p>" for line in self._remarks())
 
     def to_dataframe(self) -> Any:
         """Return the verdicts as a pandas DataFrame, a row a parameter. Raises InputError where pandas is missing."""
@@ -205,13 +181,6 @@ class IdentifiabilityReport(Shown):
             "reason": [v.reason for v in verdicts],
         }
         return data_frame(columns, list(self.parameters), "parameter")
-
-
-def _interval(v: Verdict) -> str:
-    low, high = v.ci95 or (None, None)
-    if low is None or high is None:
-        return "" if low is high else f"below {high:.6g}" if low is None else f"above {low:.6g}"
-    return f"{low:.6g} to {high:.6g}"
 
 
 def _profile(p: Profile) -> dict[str, Any]:

@@ -8,7 +8,7 @@ error it states) and so serves models with delays and sampled parts, recordings 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,21 +16,20 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
+from hvdc_ident.fit.fit_parameter import starting_points
 from hvdc_ident.fit.frequency_data import in_time
-from hvdc_ident.fit.search import starting_points
 from hvdc_ident.fit.simulator import sensitivity_error
-from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import (
     SENSITIVITY_ERROR,
-    StructuralCombination,
+    Combination,
     StructuralResult,
     identifiable_subset,
     null_directions,
     structural_identifiability,
 )
 from hvdc_ident.sensitivity.information import leading
-from hvdc_ident.sensitivity.structural.combinations import SMALL, Point, combinations_seen, held_of
+from hvdc_ident.sensitivity.structural.combinations import SMALL, Point, combinations_seen, held_of, only_seen
 from hvdc_ident.simulate import ModelEquations
 from hvdc_ident.text import listed
 
@@ -52,35 +51,6 @@ INSIDE = (0.2, 0.8)
 """Share of the bounds that the points are drawn from: at a bound a parameter may do nothing that does else."""
 CONSTANT = 1e-3
 """Share of itself by which a direction found from runs may differ from one point to the next and still be the same."""
-
-
-@dataclass(frozen=True)
-class Combination:
-    """Parameters of which only combinations are seen.
-
-    members: in the order listed. seen: the combinations, in words. kind: "structural" (no data could tell) or
-    "practical" (these data do not). direction: the change of the members that leaves the outputs alone, in scaled
-    coordinates (relative, or share of the range). held: those put at their given value so that the others can be told.
-    text: the finding in words where `seen` has none.
-    """
-
-    members: tuple[str, ...]
-    seen: tuple[str, ...]
-    kind: Literal["structural", "practical"]
-    direction: FrozenMap[float] = field(default_factory=FrozenMap)
-    held: tuple[str, ...] = ()
-    text: str = ""
-
-    @property
-    def words(self) -> str:
-        """The finding as a sentence."""
-        names = listed(self.members)
-        if self.text:
-            return self.text
-        if not self.seen:
-            return f"{names} cannot be told apart" if len(self.members) > 1 else f"{names} is not seen"
-        verb = "is" if len(self.seen) == 1 else "are"
-        return f"only {listed(self.seen)} {verb} seen, not {names} apart"
 
 
 def in_words(direction: Array, names: Sequence[str], logs: Sequence[bool], values: Sequence[float]) -> tuple[str, ...]:
@@ -133,9 +103,10 @@ def combinations_of(
     """Return one combination for each null direction, (k, p) in scaled coordinates, with its members and words."""
     found = []
     for row in null:
-        members = tuple(n for n, v in zip(names, row, strict=True) if abs(v) > SMALL * np.abs(row).max())
-        direction = FrozenMap({n: float(v) for n, v in zip(names, row, strict=True) if n in members})
-        found.append(Combination(members, in_words(row, names, logs, values), kind, direction))
+        direction = {n: float(v) for n, v in zip(names, row, strict=True) if abs(v) > SMALL * np.abs(row).max()}
+        members, seen = tuple(direction), in_words(row, names, logs, values)
+        words = only_seen(members, seen)
+        found.append(Combination(members, seen, words, directions=(tuple(direction.values()),), kind=kind))
     return tuple(found)
 
 
@@ -261,7 +232,7 @@ class _Runs:
         found = combinations_seen(names, points, start, more, CONSTANT)
         held = frozenset(names[k] for k in held_of(points[0].directions))
         nearest = min(points, key=lambda p: float(np.abs(p.theta - start).max()))
-        return tuple(_combination(c) if c.seen else _local(c, names, nearest) for c in found), held
+        return tuple(c if c.seen else _local(c, names, nearest) for c in found), held
 
     @property
     def note(self) -> str:
@@ -278,17 +249,12 @@ class _Runs:
         return "; ".join(parts)
 
 
-def rank_analysis(problem: Problem, seed: int = 0) -> StructuralAnalysis:
-    """Return the structure from the rank of the whitened sensitivities at the start and at five random points in the bounds.
-
-    For anything that can be simulated; local. Points that cannot be simulated are passed over; those of the five are counted in
-    the note. A parameter without any effect stands among the admissible ones: the data's verdict on it says more.
-    """
-    return _from_runs(_Runs(problem, seed))
-
-
 def _from_runs(runs: _Runs, status: str = "decided", why: str = "") -> StructuralAnalysis:
-    """Return the structure that the runs show. why: the equations do not tell it."""
+    """Return the structure that the runs show, for anything that can be simulated. why: the equations do not tell it.
+
+    Points that cannot be simulated are passed over; those of the five are counted in the note. A parameter without any effect
+    stands among the admissible ones: the data's verdict on it says more.
+    """
     names = runs.names
     if not runs.points:
         return StructuralAnalysis("not decided", METHOD, names, note="no random point could be simulated")
@@ -333,7 +299,7 @@ def structural_analysis(model: Model | None, problem: Problem, seed: int = 0) ->
         wide = structural_identifiability(model, names, outputs, seed=seed, time_limit=SECONDS)
         invisible = {n for n in unseen if any(c.members == (n,) for c in wide.combinations)} - switched
     together, held, apart = _where_neither_sees(result, runs)
-    alone = [_combination(c) for c in result.combinations if c.members[0] in invisible and len(c.members) == 1]
+    alone = [c for c in result.combinations if c.members[0] in invisible and len(c.members) == 1]
     note = (
         f"the equations at the start would not tell {', '.join(apart)} apart, but these experiments do" if apart else ""
     )
@@ -351,7 +317,7 @@ def _where_neither_sees(result: StructuralResult, runs: _Runs) -> tuple[list[Com
             continue
         members = [result.parameters.index(n) for n in c.members]
         if all(len(p.directions) >= c.free for p in runs.unseen(members)):
-            found.append(_combination(c))
+            found.append(c)
             held |= set(c.members) - set(identifiable_subset(result, c.members))
             continue
         parts, stuck = runs.combinations(members)
@@ -393,21 +359,13 @@ def _behind_switches(model: Model, outputs: Sequence[str]) -> set[str]:
     return {names[k] for _, group, k in behind if group == "p"}
 
 
-def _combination(c: StructuralCombination) -> Combination:
-    """Return a combination that the equations found, in this room's form."""
-    direction: FrozenMap[float] = (
-        FrozenMap(zip(c.members, c.directions[0], strict=True)) if c.directions else FrozenMap()
-    )
-    return Combination(c.members, c.seen, "structural", direction, text="" if c.seen else c.words)
-
-
-def _local(c: StructuralCombination, names: Sequence[str], at: Point) -> Combination:
+def _local(c: Combination, names: Sequence[str], at: Point) -> Combination:
     """Return a combination without a simple form, with what is seen near a point."""
     if len(c.members) == 1:
-        return _combination(c)
+        return c
     members = [names.index(n) for n in c.members]
     rows = at.among(members).directions * at.theta[members]
-    seen = dict.fromkeys(w for row in rows for w in in_words(row, c.members, [False] * len(row), row))
-    text = f"{listed(c.members)} cannot be told apart, only {listed(seen)} {'is' if len(seen) == 1 else 'are'} seen"
+    seen = tuple(dict.fromkeys(w for row in rows for w in in_words(row, c.members, [False] * len(row), row)))
+    words = f"{listed(c.members)} cannot be told apart, {only_seen(c.members, seen)}"
     largest = rows[0] / rows[0][leading(rows[0])]
-    return Combination(c.members, (), "structural", FrozenMap(zip(c.members, largest.tolist(), strict=True)), text=text)
+    return replace(c, words=words, directions=(tuple(largest.tolist()),))

@@ -10,10 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from hvdc_ident.fit.bootstrap import Bootstrap
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.profile import Profile
-from hvdc_ident.text import times_text
+from hvdc_ident.text import figures_of, quantity, span, times_text
 
 VerdictName = Literal[
     "structurally-unidentifiable",
@@ -27,8 +26,6 @@ VerdictName = Literal[
 ]
 WIDE = 0.5
 """A half-width of more than this share of the value (of the range where 0 is admissible) makes a parameter weak."""
-WIDER = 1.5
-"""A bootstrap's interval that is so many times wider than the profile's is worth a remark."""
 COLLINEAR = 20.0
 """A standard deviation that the others make so many times larger is worded, and so is half of that: a parameter that is known well all the
 same is not weak."""
@@ -41,7 +38,7 @@ class Verdict:
     value: at the optimum; of a held one, what it is held at. ci95: from the profile; an end that is None is not known.
     std, relative_std: only of identifiable ones. sensitivity_norm: of its whitened, scaled column. collinearity: by how
     much the others widen its standard deviation. partner: the one most collinear with it. conditional_on: parameters
-    held without which it could not be told. profile: the evidence. ci95_experiments: from experiments drawn anew.
+    held without which it could not be told. profile: the evidence.
     scale: what widths are compared with, the value or, where 0 is admissible, the range. optima: its value at every optimum
     that is as good, the best first, where there are several.
     """
@@ -59,7 +56,6 @@ class Verdict:
     partner: str = ""
     conditional_on: tuple[str, ...] = ()
     profile: Profile | None = None
-    ci95_experiments: tuple[float, float] | None = None
     scale: float | None = None
     optima: tuple[float, ...] = ()
 
@@ -68,24 +64,11 @@ class Verdict:
         return replace(self, reason=" ".join([self.reason, *(n for n in notes if n)]))
 
     def under_misfit(self) -> Verdict:
-        """Return the verdict without interval and standard deviation, what it says of them made conditional on the model.
-
-        The scatter over experiments stays: it is a finding whatever the model lacks.
-        """
+        """Return the verdict without interval and standard deviation, what it says of them made conditional on the model."""
         if self.ci95 is None:
             return self
         reason = f"If nothing else is missing, {self.reason[:1].lower()}{self.reason[1:]}"
         return replace(self, reason=reason, ci95=None, std=None, relative_std=None)
-
-    def scattered(self, interval: tuple[float, float], over: Bootstrap) -> Verdict:
-        """Return the verdict with the interval from experiments drawn anew, and a remark where that is much the wider."""
-        found = replace(self, ci95_experiments=interval)
-        low, high = self.ci95 or (None, None)
-        if low is None or high is None or interval[1] - interval[0] < WIDER * (high - low):
-            return found
-        half = 0.5 * (interval[1] - interval[0])
-        span = f"{_digits(interval[0], half)} … {_digits(interval[1], half)} {self.unit}".rstrip()
-        return found.noted(f"Drawn anew, the {over.experiments} experiments scatter it wider: {span}.")
 
 
 def structural_verdict(
@@ -103,7 +86,7 @@ def structural_verdict(
     """
     text = f"{'At every point tried' if local else 'However good the data'}, {words}"
     if held_at is not None:
-        text += f": it is held at {_with_unit(held_at, unit)}."
+        text += f": it is held at {quantity(held_at, unit)}."
         return Verdict(name, "structurally-unidentifiable", text, held_at, unit)
     text += f": what is found holds for {', '.join(conditional_on)} as held." if conditional_on else "."
     return Verdict(name, "structurally-unidentifiable", text, float("nan"), unit, conditional_on=tuple(conditional_on))
@@ -116,10 +99,9 @@ def insensitive_verdict(
 
     rise: of the cost at the worse end. also: a remark.
     """
-    span = f"Anywhere between {ends[0]:.4g} and {_with_unit(ends[1], unit)}"
     effect = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
     why = "" if rise < 1e-9 else f", where {threshold:.3g} would be needed to see it"
-    return Verdict(free.name, "insensitive", f"{span} {effect}{why}. {also}".rstrip(), free.given, unit)
+    return Verdict(free.name, "insensitive", f"Anywhere between {span(*ends, unit)} {effect}{why}. {also}".rstrip(), free.given, unit)
 
 
 def open_verdict(profile: Profile, words: str, unit: str) -> Verdict:
@@ -133,7 +115,7 @@ def open_verdict(profile: Profile, words: str, unit: str) -> Verdict:
         f"These data do not bound it {' nor '.join(f'from {side} ({why})' for side, end, why in ends if end is None)}"
     )
     if low is not None or high is not None:
-        known = f"above {_with_unit(low, unit)}" if low is not None else f"below {_with_unit(high or 0.0, unit)}"
+        known = f"above {quantity(low, unit)}" if low is not None else f"below {quantity(high or 0.0, unit)}"
         text += f"; with 95 % confidence it is {known}"
     text += "." + (f" Of these data {words}." if words else "")
     return Verdict(profile.name, "practically-unidentifiable", text, profile.value, unit, profile.ci95, profile=profile)
@@ -148,7 +130,7 @@ def unjudged_verdict(judged: Verdict, times: float, half: float) -> Verdict:
     if judged.verdict == "at-bound":
         return judged.noted(f"Not to be believed before the misfit is explained: {why}.")
     text = f"Not judged: {why}. Against that misfit it is {judged.verdict}; "
-    text += f"against the noise alone its 95 % confidence interval would be ±{_with_unit(half, judged.unit)}."
+    text += f"against the noise alone its 95 % confidence interval would be ±{quantity(half, judged.unit)}."
     return replace(judged, verdict="not-judged", reason=text)
 
 
@@ -156,7 +138,7 @@ def with_misfit_remark(judged: Verdict, times: float, half: float) -> Verdict:
     """Return a weak verdict with the remark that only the misfit makes it so. times: the misfit over the noise. half: as above."""
     return judged.noted(
         f"That is the misfit's doing, {times_text(times)} the noise: against the noise alone its 95 % "
-        f"confidence interval would be ±{_with_unit(half, judged.unit)}; diagnose first."
+        f"confidence interval would be ±{quantity(half, judged.unit)}; diagnose first."
     )
 
 
@@ -175,8 +157,8 @@ def at_bound_verdict(profile: Profile, free: FitParameter, physical: bool, unit:
     kind = "physical" if physical else "search"
     beyond = "" if physical else "; the optimum may lie beyond it, so widen the bounds"
     text = (
-        f"The best value is its {side} {kind} bound {_with_unit(profile.value, unit)}{beyond}; with 95 % confidence it is "
-        f"{'below' if low else 'above'} {_with_unit(limit, unit)}."
+        f"The best value is its {side} {kind} bound {quantity(profile.value, unit)}{beyond}; with 95 % confidence it is "
+        f"{'below' if low else 'above'} {quantity(limit, unit)}."
     )
     return Verdict(profile.name, "at-bound", text, profile.value, unit, ci, profile=profile)
 
@@ -194,9 +176,9 @@ def closed_verdict(
     share = half / scale if scale > 0 else math.inf
     judged = Verdict(profile.name, "weak", "", profile.value, unit, (low, high), profile=profile)
     judged = replace(judged, collinearity=collinearity, partner=partner)
-    span = f"{_digits(low, half)} … {_digits(high, half)} {unit}".rstrip()
+    interval = span(low, high, unit, word="…")
     if share > WIDE:
-        text = _where(profile, span)
+        text = _where(profile, interval)
         ends = (profile.lower.crossing, profile.upper.crossing)
         if ends == (None, None):
             pass  # the width of the bounds is no result
@@ -207,7 +189,7 @@ def closed_verdict(
         if collinearity > COLLINEAR:
             text += f", and {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
         return replace(judged, reason=f"{text}.")
-    text = f"It is known to ±{100 * share:.2g} % {of} (95 %: {span}), mostly from {best}"
+    text = f"It is known to ±{100 * share:.2g} % {of} (95 %: {interval}), mostly from {best}"
     if collinearity > COLLINEAR:
         text += f", though {partner} can make good nearly all it does (collinearity {collinearity:.3g})"
     elif collinearity > 0.5 * COLLINEAR:
@@ -216,14 +198,14 @@ def closed_verdict(
     return replace(judged, verdict="identifiable", reason=f"{text}.", std=std, relative_std=relative)
 
 
-def _where(profile: Profile, span: str) -> str:
+def _where(profile: Profile, interval: str) -> str:
     """Return the words for the profile of a weak parameter; an end that is only the parameter's own bound is no finding of the data."""
     low, high = profile.lower.crossing, profile.upper.crossing
     if low is not None and high is not None:
-        return f"It is known only to lie in {span}"
+        return f"It is known only to lie in {interval}"
     if low is not None or high is not None:
-        return f"It is known only to lie in {span}, where the {'upper' if high is None else 'lower'} end is its physical bound"
-    return f"These data do not narrow its physical bounds, {span}"
+        return f"It is known only to lie in {interval}, where the {'upper' if high is None else 'lower'} end is its physical bound"
+    return f"These data do not narrow its physical bounds, {interval}"
 
 
 def scale_of(free: FitParameter, value: float) -> tuple[float, str]:
@@ -243,25 +225,13 @@ def local_verdict(judged: Verdict, others: Sequence[float], rise: float) -> Verd
     """Return the verdict where several optima are as good. others: its values there; rise: of the cost at the next best."""
     low, high = judged.ci95 or (None, None)
     assert low is not None and high is not None
-    half = 0.5 * (high - low)
     values = tuple(dict.fromkeys(others))
-    unit = f" {judged.unit}" if judged.unit else ""
-    this = f"{_digits(judged.value, half)}{unit} (95 %: {_digits(low, half)} … {_digits(high, half)})"
-    other = " and ".join(f"{_digits(v, half)}{unit}" for v in values)
+    digits = figures_of((low, high), 4)
+    this = f"{quantity(judged.value, judged.unit, digits)} (95 %: {span(low, high, word='…')})"
+    other = " and ".join(quantity(v, judged.unit, digits) for v in values)
     text = f"{this} explains these records, and so does {other} with other values beside it (cost higher by {max(rise, 0.0):.2g}): "
     reason = f"{text}only other knowledge can choose."
     if judged.verdict != "identifiable":
         reason = f"{reason} About the first: {judged.reason.removeprefix('It is ')}"
     optima = (judged.value, *values)
     return replace(judged, verdict="locally-identifiable", reason=reason, std=None, relative_std=None, optima=optima)
-
-
-def _digits(value: float, half: float) -> str:
-    """Return the value with as many digits as its half-width has meaning for."""
-    if half <= 0 or not value:
-        return f"{value:.6g}"
-    return f"{value:.{max(2, min(12, int(math.log10(abs(value) / half)) + 3))}g}"
-
-
-def _with_unit(value: float, unit: str) -> str:
-    return f"{value:.4g} {unit}".rstrip()

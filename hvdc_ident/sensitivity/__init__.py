@@ -31,7 +31,7 @@ if TYPE_CHECKING:
         trajectory_sensitivities,
     )
     from hvdc_ident.sensitivity.structural import (
-        StructuralCombination,
+        Combination,
         StructuralResult,
         identifiable_subset,
         structural_identifiability,
@@ -47,7 +47,7 @@ else:
             "information": "SENSITIVITY_ERROR Collinear Information collinear_subsets independent marginal "
             "normalised null_directions pivoted_order rise_over_range standard_deviations",
             "global_screening": "ScreeningResult morris sobol",
-            "structural": "StructuralCombination StructuralResult identifiable_subset structural_identifiability",
+            "structural": "Combination StructuralResult identifiable_subset structural_identifiability",
             "sweep_points": "Points Quantities Samples grid latin_hypercube listed log_grid",
             "sweep_run": "SweepResult sweep",
         },
@@ -56,6 +56,7 @@ else:
 __all__ = [
     "SENSITIVITY_ERROR",
     "Collinear",
+    "Combination",
     "Information",
     "LinearSensitivities",
     "LocalSensitivities",
@@ -66,7 +67,6 @@ __all__ = [
     "ScreeningResult",
     "Sensitivities",
     "SteadySensitivities",
-    "StructuralCombination",
     "StructuralResult",
     "SweepResult",
     "collinear_subsets",

@@ -16,11 +16,10 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, axes_of, library
 from hvdc_ident.errors import ComputationError, StudyError
-from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.sensitivity.local_sensitivities import bars
-from hvdc_ident.sensitivity.sweep_points import Against, Samples
+from hvdc_ident.sensitivity.sweep_points import Samples
 from hvdc_ident.sensitivity.sweep_run import sweep
 
 if TYPE_CHECKING:
@@ -91,18 +90,14 @@ def morris(
     experiments: Sequence[Experiment],
     ranges: Mapping[str, tuple[float, float]],
     *,
-    against: Against = "data",
-    outputs: Sequence[str] | None = None,
-    values: Mapping[str, float] | None = None,
     trajectories: int = 20,
     seed: int = 0,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> ScreeningResult:
     """Return elementary effects of the RMSE over the ranges: trajectories (k + 1) runs for k parameters; same seed, same result.
 
-    ranges: (min, max) by parameter, in its unit. A trajectory with a failed run is left out and counted. Other arguments
-    as in `sweep`. Raises InputError where SALib is not installed, ComputationError where no trajectory is whole.
+    ranges: (min, max) by parameter, in its unit. A trajectory with a failed run is left out and counted. options: as in
+    `sweep`. Raises InputError where SALib is not installed, ComputationError where no trajectory is whole.
     """
     library("SALib", "global screening", "'hvdc_ident[screening]'")
     from SALib.analyze import morris as analyse
@@ -110,16 +105,7 @@ def morris(
 
     problem = _problem(ranges, trajectories)
     points = _points(sample.sample, problem, trajectories, num_levels=LEVELS, seed=seed)
-    swept = sweep(
-        model,
-        experiments,
-        points,
-        against=against,
-        outputs=outputs,
-        values=values,
-        executor=executor,
-        progress=progress,
-    )
+    swept = sweep(model, experiments, points, **options)
     good = np.isfinite(swept.rmse).all(axis=1)
     whole = good.reshape(trajectories, -1).all(axis=1)
     if whole.sum() < 2:
@@ -140,17 +126,13 @@ def sobol(
     experiments: Sequence[Experiment],
     ranges: Mapping[str, tuple[float, float]],
     *,
-    against: Against = "data",
-    outputs: Sequence[str] | None = None,
-    values: Mapping[str, float] | None = None,
     samples: int = 256,
     seed: int = 0,
-    executor: Executor | None = None,
-    progress: Progress | None = None,
+    **options: Any,
 ) -> ScreeningResult:
     """Return first-order and total shares of the RMSE's variance over the ranges: samples (k + 2) runs; same seed, same result.
 
-    samples: a power of 2. Other arguments as in `morris`. Raises InputError where SALib is not installed,
+    samples: a power of 2. options: as in `sweep`. Raises InputError where SALib is not installed,
     ComputationError where a run fails: the indices need every one.
     """
     library("SALib", "global screening", "'hvdc_ident[screening]'")
@@ -161,16 +143,7 @@ def sobol(
         raise StudyError("the number of samples is wrong", where="sobol", expected="a power of 2", got=str(samples))
     problem = _problem(ranges, samples)
     points = _points(sample.sample, problem, samples, calc_second_order=False, seed=seed)
-    swept = sweep(
-        model,
-        experiments,
-        points,
-        against=against,
-        outputs=outputs,
-        values=values,
-        executor=executor,
-        progress=progress,
-    )
+    swept = sweep(model, experiments, points, **options)
     failed = int((~np.isfinite(swept.rmse).all(axis=1)).sum())
     if failed:
         raise ComputationError(

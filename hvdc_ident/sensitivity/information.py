@@ -68,12 +68,6 @@ class Information:
             }
         )
 
-    def telling(self) -> FrozenMap[float]:
-        """By parameter how many experiments tell of it: 1/(sum of squared shares), n where n tell equally much."""
-        table = self.shares()
-        squares = {n: sum(line[n] ** 2 for line in table.values()) for n in self.names}
-        return FrozenMap({n: 1.0 / s if s > 0 else 0.0 for n, s in squares.items()})
-
     def select(self, names: Sequence[str]) -> Information:
         """The information on some of the parameters, the others known."""
         rows = np.ix_([self.names.index(n) for n in names], [self.names.index(n) for n in names])

@@ -20,7 +20,8 @@ from hvdc_ident.display import Shown, Table, axes_of
 from hvdc_ident.errors import LinearizationError, StudyError, require_known
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
-from hvdc_ident.simulate import simulate
+from hvdc_ident.simulate import Simulation, simulate
+from hvdc_ident.text import with_unit
 
 if TYPE_CHECKING:
     import xarray
@@ -80,9 +81,8 @@ class Sensitivities(Shown):
     """Derivatives of the outputs of some experiments by parameters.
 
     values: of the parameters. factors: what a derivative is multiplied by to be normalised, in the parameter's unit:
-    its value, or its range where one is given or the value is 0. outputs: by experiment; times: (n,) s; gradients:
-    (n, outputs, parameters), output unit per parameter unit; compared: (n,) the rows inside the window.
-    notes: by experiment, a reason why its sensitivities say little.
+    its value, or its range where one is given or the value is 0. By experiment: runs, with the derivatives; compared: (n,) the
+    rows inside the window; notes: a reason why its sensitivities say little.
     """
 
     model: str
@@ -90,24 +90,20 @@ class Sensitivities(Shown):
     parameter_units: tuple[str, ...]
     values: FrozenMap[float]
     factors: FrozenMap[float]
-    outputs: FrozenMap[tuple[str, ...]]
-    output_units: FrozenMap[str]
-    times: FrozenMap[Array]
-    gradients: FrozenMap[Array]
-    compared: FrozenMap[np.ndarray[Any, np.dtype[np.bool_]]]
+    runs: FrozenMap[Simulation]
+    compared: FrozenMap[NDArray[np.bool_]]
     notes: FrozenMap[str]
+
+    def _run(self, experiment: str) -> Simulation:
+        require_known("experiment", [experiment], self.runs, "")
+        return self.runs[experiment]
 
     def of(self, experiment: str, output: str, parameter: str, *, normalised: bool = False) -> Array:
         """Return one derivative over time, (n,), in units or times the parameter's factor."""
-        place, column = self._place(experiment, output, parameter)
-        found = self.gradients[experiment][:, place, column]
-        return found * self.factors[parameter] if normalised else found
-
-    def _place(self, experiment: str, output: str, parameter: str) -> tuple[int, int]:
-        require_known("experiment", [experiment], self.gradients, "")
-        require_known("output", [output], self.outputs[experiment], "")
+        gradient = self._run(experiment).gradient(output)
         require_known("parameter", [parameter], self.parameters, "")
-        return self.outputs[experiment].index(output), self.parameters.index(parameter)
+        found = gradient[:, self.parameters.index(parameter)]
+        return found * self.factors[parameter] if normalised else found
 
     @property
     def _scale(self) -> Array:
@@ -115,27 +111,20 @@ class Sensitivities(Shown):
 
     def array(self, experiment: str, *, normalised: bool = False) -> xarray.DataArray:
         """One experiment's derivatives with labelled axes time, output, parameter."""
-        require_known("experiment", [experiment], self.gradients, "")
-        gradient = self.gradients[experiment]
-        return _labelled(
-            gradient * self._scale if normalised else gradient,
-            "normalised sensitivity" if normalised else "sensitivity",
-            time=self.times[experiment],
-            output=list(self.outputs[experiment]),
-            parameter=list(self.parameters),
-        )
+        found = self._run(experiment).sensitivities
+        return (found * self._scale).rename("normalised sensitivity") if normalised else found
 
     @cached_property
     def table(self) -> FrozenMap[FrozenMap[FrozenMap[tuple[float, float]]]]:
         """(rms, peak) of the normalised sensitivity over the compared rows, by experiment, output and parameter."""
         found = {}
-        for e, gradient in self.gradients.items():
-            scaled = gradient[self.compared[e]] * self._scale
+        for e, run in self.runs.items():
+            scaled = run.gradients[self.compared[e]] * self._scale
             rms, peak = np.sqrt((scaled**2).mean(axis=0)), np.abs(scaled).max(axis=0)
             found[e] = FrozenMap(
                 {
                     o: FrozenMap({p: (float(rms[i, k]), float(peak[i, k])) for k, p in enumerate(self.parameters)})
-                    for i, o in enumerate(self.outputs[e])
+                    for i, o in enumerate(run.trajectory.names)
                 }
             )
         return FrozenMap(found)
@@ -145,8 +134,8 @@ class Sensitivities(Shown):
         """The RMS and the peak of the normalised sensitivities, over experiment, output and parameter; nan: no output."""
         import xarray
 
-        outputs = list(dict.fromkeys(o for names in self.outputs.values() for o in names))
-        axes = {"experiment": list(self.gradients), "output": outputs, "parameter": list(self.parameters)}
+        outputs = list(dict.fromkeys(o for lines in self.table.values() for o in lines))
+        axes = {"experiment": list(self.runs), "output": outputs, "parameter": list(self.parameters)}
         values = np.full((2, *(len(a) for a in axes.values())), np.nan)
         for i, e in enumerate(self.table):
             for o, line in self.table[e].items():
@@ -163,7 +152,7 @@ class Sensitivities(Shown):
                 p: {"value": self.values[p], "factor": self.factors[p], "unit": u}
                 for p, u in zip(self.parameters, self.parameter_units, strict=True)
             },
-            "output_units": dict(self.output_units),
+            "output_units": {o: r.trajectory.unit(o) for r in self.runs.values() for o in r.trajectory.names},
             "norms": {
                 e: {o: {p: {"rms": r, "peak": k} for p, (r, k) in line.items()} for o, line in lines.items()}
                 for e, lines in self.table.items()
@@ -173,21 +162,20 @@ class Sensitivities(Shown):
 
     def plot(self, experiment: str | None = None, output: str | None = None, ax: Any = None) -> Any:
         """Axes with one output's normalised derivatives in one experiment (default: the first), a curve a parameter."""
-        name = next(iter(self.gradients)) if experiment is None else experiment
-        require_known("experiment", [name], self.gradients, "")
-        shown = self.outputs[name][0] if output is None else output
+        name = next(iter(self.runs)) if experiment is None else experiment
+        table = self._run(name).trajectory
+        shown = table.names[0] if output is None else output
         axes = axes_of(ax)
         for p in self.parameters:
-            axes.plot(self.times[name], self.of(name, shown, p, normalised=True), label=p)
-        unit = self.output_units.get(shown, "")
-        axes.set_ylabel(f"normalised derivative of {shown}" + (f", {unit}" if unit else ""))
+            axes.plot(table.time, self.of(name, shown, p, normalised=True), label=p)
+        axes.set_ylabel(with_unit(f"normalised derivative of {shown}", table.unit(shown)))
         axes.set_xlabel("time, s")
         axes.set_title(name)
         axes.legend(fontsize=8)
         return axes
 
     def _screen(self) -> Iterator[str | Table]:
-        count = len(self.gradients)
+        count = len(self.runs)
         yield f"Trajectories of {self.model}: normalised sensitivities in {count} experiment{'s' if count > 1 else ''}"
         lines = (
             (e, o, p, f"{rms:.4g}", f"{peak:.4g}")
@@ -218,29 +206,16 @@ def trajectory_sensitivities(
         raise StudyError("sensitivities need an experiment and there is none", expected="at least one experiment")
     names = tuple(model.parameters if parameters is None else parameters)
     at, scale = factors(model, names, values or {}, ranges or {})
-    shown, times, gradients, compared, notes = {}, {}, {}, {}, {}
+    runs: dict[str, Simulation] = {}
     for e in experiments:
-        if e.name in gradients:
+        if e.name in runs:
             raise StudyError("two experiments of one name", got=e.name, expected="distinct names")
-        shown[e.name] = tuple(outputs or e.outputs or model.outputs)
-        run = simulate(model, e, values, names, outputs=shown[e.name])
-        times[e.name], gradients[e.name], compared[e.name] = e.time, run.gradients, e.compared
-        if all(u.is_constant for u in e.inputs.values()):
-            notes[e.name] = "no input moves: only the steady state is seen"
-    units = {o: model.outputs[o].unit if o in model.outputs else "" for names_ in shown.values() for o in names_}
-    return Sensitivities(
-        model.name,
-        names,
-        tuple(model.parameters[p].unit for p in names),
-        at,
-        scale,
-        FrozenMap(shown),
-        FrozenMap(units),
-        FrozenMap(times),
-        FrozenMap(gradients),
-        FrozenMap(compared),
-        FrozenMap(notes),
-    )
+        runs[e.name] = simulate(model, e, values, names, outputs=tuple(outputs or e.outputs or model.outputs))
+    still = [e.name for e in experiments if all(u.is_constant for u in e.inputs.values())]
+    notes = dict.fromkeys(still, "no input moves: only the steady state is seen")
+    compared = FrozenMap({e.name: e.compared for e in experiments})
+    units = tuple(model.parameters[p].unit for p in names)
+    return Sensitivities(model.name, names, units, at, scale, FrozenMap(runs), compared, FrozenMap(notes))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -27,6 +27,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import Method, simulate
 
+Complex = NDArray[np.complex128]
 MOST = 10_000_000
 
 
@@ -62,9 +63,7 @@ def grid(name: str, low: float, high: float, points: int) -> Samples:
 
 def log_grid(name: str, low: float, high: float, points: int) -> Samples:
     """Values from low to high, both included, each the same factor above the last; low is above 0."""
-    _range(name, low, high, points)
-    if not low > 0:
-        raise StudyError("a log scale needs a range above 0", where=f"sweep of {name}", got=f"{low:g}")
+    _range(name, low, high, points, log=True)
     values = np.geomspace(low, high, points)
     values[[0, -1]] = low, high
     return Samples((name,), values[:, None], "log")
@@ -82,23 +81,22 @@ def latin_hypercube(
 
     log: parameters whose slices are equal in their logarithm. The same seed gives the same points.
     """
-    random = np.random.default_rng(seed)
-    columns = []
+    from scipy.stats import qmc
+
     for name, (low, high) in bounds.items():
-        _range(name, low, high, points)
-        share = (random.permutation(points) + random.random(points)) / points
-        if name in log:
-            if not low > 0:
-                raise StudyError("a log scale needs a range above 0", where=f"sweep of {name}", got=f"{low:g}")
-            column = low * (high / low) ** share
-        else:
-            column = low + share * (high - low)
+        _range(name, low, high, points, log=name in log)
+    shares = qmc.LatinHypercube(d=len(bounds), seed=np.random.default_rng(seed)).random(points).T if bounds else ()
+    columns = []
+    for (name, (low, high)), share in zip(bounds.items(), shares, strict=True):
+        column = low * (high / low) ** share if name in log else low + share * (high - low)
         columns.append(np.clip(column, low, high))
     table = np.column_stack(columns) if columns else np.empty((0, 0))
     return Samples(tuple(bounds), table, "latin-hypercube")
 
 
-def _range(name: str, low: float, high: float, points: int) -> None:
+def _range(name: str, low: float, high: float, points: int, *, log: bool = False) -> None:
+    if log and not low > 0:
+        raise StudyError("a log scale needs a range above 0", where=f"sweep of {name}", got=f"{low:g}")
     if not (np.isfinite([low, high]).all() and low < high and points >= 2):
         raise StudyError(
             "a sweep's range is wrong",
@@ -185,8 +183,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class PointTask:
-    """The work of a point, the same in every process: called with (k,) values it returns its numbers, (n,), or the reason
-    where there are none.
+    """The work of a point, the same in every process.
 
     values: parameters and inputs held at other than the model's values. references: what is compared, in order.
     poles: how many poles are wanted (0: none). omega, inputs, outputs: of the frequency response (empty: none).
@@ -214,20 +211,17 @@ class PointTask:
             runs,
         )
 
-    def __call__(self, point: Array) -> Array | str:
-        """Return the numbers of a point, see `parts`, or the reason where a run fails."""
+    def __call__(self, point: Array) -> tuple[Array, Complex, Complex] | str:
+        """Return RMSE (references,), poles (modes,) in 1/s and response (frequencies, outputs, inputs) at a point, (k,).
+
+        The reason where a run fails.
+        """
         given = FrozenMap({**self.values, **dict(zip(self.names, map(float, point), strict=True))})
         try:
-            numbers = np.concatenate([self._errors(given), self._linear(given).view(float)])
+            found = (self._errors(given), *self._linear(given))
         except HvdcIdentError as e:
             return str(e)
-        return numbers if np.isfinite(numbers).all() else "a result is not finite"
-
-    def parts(self, numbers: Array) -> tuple[Array, Array, Array]:
-        """Return a point's RMSE (references,), poles (modes,) in 1/s and response (frequencies, outputs, inputs) of its numbers."""
-        rmse, linear = np.split(numbers, [len(self.references)])
-        poles, response = np.split(linear.view(complex), [self.poles])
-        return rmse, poles, response.reshape(self.omega.size, len(self.outputs), len(self.inputs))
+        return found if all(np.isfinite(numbers).all() for numbers in found) else "a result is not finite"
 
     def _errors(self, given: FrozenMap[float]) -> Array:
         """Return the RMSE of each reference, (references,), in the outputs' units."""
@@ -242,15 +236,15 @@ class PointTask:
                 found[i] = np.sqrt(np.mean(difference * difference))
         return found
 
-    def _linear(self, given: FrozenMap[float]) -> np.ndarray[Any, np.dtype[np.complex128]]:
-        """Return the poles, sorted, then the response; nothing where neither is wanted."""
+    def _linear(self, given: FrozenMap[float]) -> tuple[Complex, Complex]:
+        """Return the poles, sorted, and the response; each empty where it is not wanted."""
+        poles, response = (np.empty(shape, dtype=complex) for shape in (0, (0, len(self.outputs), len(self.inputs))))
         if not self.poles and not self.omega.size:
-            return np.empty(0, dtype=complex)
+            return poles, response
         from hvdc_ident.linearize import find_operating_point, linearize
 
         at = find_operating_point(self.model, given)
         linear = linearize(self.model, at, inputs=self.inputs or None, outputs=self.outputs or None)
-        parts = []
         if self.poles:
             poles = np.asarray(linear.poles(), dtype=complex)
             if linear.delay_free is not None:  # infinitely many: the rightmost ones
@@ -259,10 +253,10 @@ class PointTask:
                 raise SimulationError(
                     "the number of poles changed", expected=str(self.poles), got=str(poles.size)
                 )  # e.g. a loop that becomes ill-posed
-            parts.append(poles[np.lexsort((poles.imag, poles.real))])
+            poles = poles[np.lexsort((poles.imag, poles.real))]
         if self.omega.size:
-            parts.append(np.asarray(linear.response(self.omega), dtype=complex).ravel())
-        return np.concatenate(parts)
+            response = np.asarray(linear.response(self.omega), dtype=complex)
+        return poles, response
 
 
 def simulated(model: AnyModel, experiment: Experiment, given: Any, outputs: tuple[str, ...], method: Method) -> Array:
@@ -367,7 +361,7 @@ def _method(model: AnyModel, experiments: tuple[Experiment, ...], base: FrozenMa
     """The integrator of every point: the one that serves at the base values."""
     first = experiments[0]
     try:
-        found = simulate(model, first, base, outputs=first.outputs or None).statistics.method
+        found = simulate(model, first, base).statistics.method
     except (ComputationError, SteadyStateError):
         return "rosenbrock"
     return "nonstiff" if found == "explicit" else "rosenbrock"

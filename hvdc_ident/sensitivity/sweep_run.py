@@ -9,7 +9,6 @@ import csv
 import io
 import itertools
 import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
@@ -28,7 +27,6 @@ from hvdc_ident.sensitivity.sweep_points import (
     Against,
     AxesLike,
     Points,
-    PointTask,
     Quantities,
     Samples,
     Want,
@@ -257,36 +255,6 @@ class SweepResult(Shown):
 # --- run ---
 
 
-CHUNK = 2048  # points made or written at a time
-REPORTED = 0.1  # s between two reports of progress
-
-
-@dataclass
-class _Table:
-    """Results as they come in; rows stand where their points stand."""
-
-    task: PointTask
-    points: Points
-    failed: dict[int, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        n, t = len(self.points), self.task
-        self.rmse = np.full((n, len(t.references)), np.nan)
-        self.poles = np.full((n, t.poles), np.nan, dtype=complex)
-        size = (t.omega.size, len(t.outputs), len(t.inputs)) if t.omega.size else (0, 0, 0)
-        self.response = np.full((n, *size), np.nan, dtype=complex)
-
-    def fill(self, outcome: Outcome) -> None:
-        """Put the outcome of a point in its row."""
-        index, found = outcome.index, outcome.value
-        if outcome.failure or isinstance(found, str):
-            self.failed[index] = outcome.failure or found
-            return
-        self.rmse[index], self.poles[index], response = self.task.parts(found)
-        if self.task.omega.size:
-            self.response[index] = response
-
-
 def sweep(
     model: AnyModel,
     experiments: Sequence[Experiment],
@@ -321,14 +289,21 @@ def sweep(
     quantities = want if isinstance(want, Quantities) else Quantities(want)
     check(model, experiments, points, base, quantities.names)
     task = task_of(model, tuple(experiments), points.names, base, against, outputs, quantities)
-    table = _Table(task, points)
-    counter = _Counter(progress, len(points))
-    items = Made(partial(_row, points), range(len(points)))
+    count = len(points)
+    rmse = np.full((count, len(task.references)), np.nan)
+    poles = np.full((count, task.poles), np.nan, dtype=complex)
+    response = np.full((count, task.omega.size, len(task.outputs), len(task.inputs)), np.nan, dtype=complex)
+    failed: dict[int, str] = {}
+    items = Made(partial(_row, points), range(count))
     found = map(Outcome, itertools.count(), map(task, items)) if executor is None else outcomes(executor, task, items)
-    for outcome in found:
-        table.fill(outcome)
-        counter.step()
-    counter.close()
+    for done, outcome in enumerate(found, start=1):
+        k, value = outcome.index, outcome.value
+        if outcome.failure or isinstance(value, str):
+            failed[k] = outcome.failure or value
+        else:
+            rmse[k], poles[k], response[k] = value
+        if progress:
+            progress(done, count, "points")
     known: dict[str, Any] = {**model.inputs, **model.parameters}
     return SweepResult(
         model=model.name,
@@ -338,12 +313,12 @@ def sweep(
         series_units=tuple(model.outputs[r.output].unit if r.output in model.outputs else "" for r in task.references),
         against=against if isinstance(against, str) else against.name,
         base=FrozenMap({n: float(base.get(n, known[n].value)) for n in points.names}),
-        rmse=table.rmse,
-        poles=table.poles,
+        rmse=rmse,
+        poles=poles,
         omega=task.omega,
-        response=table.response,
+        response=response,
         channels=(task.inputs, task.outputs) if task.omega.size else ((), ()),
-        failed=dict(sorted(table.failed.items())),
+        failed=dict(sorted(failed.items())),
         wanted=tuple(quantities.names),
     )
 
@@ -352,20 +327,3 @@ def _row(points: Points, index: int) -> Array:
     """Return the values of a point, (k,)."""
     return points.rows(index, index + 1)[0]
 
-
-class _Counter:
-    """Count of the points done, reported as progress now and then."""
-
-    def __init__(self, progress: Progress | None, total: int) -> None:
-        self.progress, self.total, self.done, self.last = progress, total, 0, 0.0
-
-    def step(self) -> None:
-        self.done += 1
-        now = time.perf_counter()
-        if self.progress and now - self.last > REPORTED:
-            self.last = now
-            self.progress(self.done, self.total, "points")
-
-    def close(self) -> None:
-        if self.progress:
-            self.progress(self.total, self.total, "points")

@@ -230,7 +230,8 @@ def _no_start(study: Study, experiment: Experiment, values: Mapping[str, float])
 
 def _starts_elsewhere(study: Study, experiment: Experiment) -> bool:
     """Return whether an experiment can begin at one of the points from which a multistart searches the candidates' ranges."""
-    from hvdc_ident.fit.search import STARTS, starting_points
+    from hvdc_ident.fit.fit_parameter import starting_points
+    from hvdc_ident.fit.search import STARTS
 
     candidates = tuple(study.candidates.values())
     points = starting_points(candidates, (), STARTS - 1, seed=0)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,8 +34,12 @@ if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
 
+@lru_cache(maxsize=1)
 def problem_of(study: Study) -> Problem:
-    """Return the fit of all candidates to the study's recordings and measured frequency responses."""
+    """Return the fit of all candidates to the study's recordings and measured frequency responses.
+
+    Of one study it is made once, for the model runs each record whose input is a recorded one.
+    """
     simulator, experiments = fitted_records(study)
     return Problem(simulator, experiments, tuple(study.candidates.values()))
 
@@ -62,11 +66,10 @@ def as_reported(study: Study) -> bool:
     return plain and not priors(study.settings, study.experiments)
 
 
-def groups_of(study: Study, problem: Problem) -> list[Group]:
-    """The groups of the individual mode with the parameters that are fitted; those with none are left out."""
-    free = [f.name for f in problem.free]
+def groups_of(study: Study, names: Collection[str]) -> list[Group]:
+    """Return the groups of the individual mode with those of their parameters that are named; those with none are left out."""
     groups = [
-        Group(tuple(n for n in g.parameters if n in free), tuple(g.outputs or ()), tuple(g.experiments or ()))
+        Group(tuple(n for n in g.parameters if n in names), tuple(g.outputs or ()), tuple(g.experiments or ()))
         for g in asked_of(study).groups
     ]
     return [g for g in groups if g.parameters]
@@ -119,12 +122,12 @@ def fitted(
         "executor": executor,
         "progress": progress,
     }
-    individual = asked.mode == "individual"
-    groups = groups_of(study, problem) if individual else []
-    if individual:
+    names = [f.name for f in problem.free]
+    groups = groups_of(study, names)
+    if groups:
         result = fit_individually(problem, groups, **common, begun=begun)
     else:
-        result = fit(problem, **common, begun=begun([f.name for f in problem.free]))
+        result = fit(problem, **common, begun=begun(names))
     if result.status == "failed" or len(problem.fitted_experiments) < 2:
         return result
     return replace(result, per_experiment=_one_by_one(problem, groups, result, asked.whiten, executor, progress))

@@ -12,13 +12,14 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import Experiment, InputSignal, experiment
+from hvdc_ident.data import Array, Experiment, InputSignal, experiment
 from hvdc_ident.fit import FitParameter, Problem, fit, fit_each
-from hvdc_ident.fit.bootstrap import cluster_sandwich
 from hvdc_ident.fit.partial_fits import half_width, spread
+from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
+from hvdc_ident.sensitivity import normalised
 from hvdc_ident.simulate import ModelSimulator, simulate
 from hvdc_ident.study.examples import Campaign, Noise, recorded
 
@@ -181,6 +182,24 @@ def simultaneous(experiments: Sequence[Experiment], *, executor: Any = None) -> 
     groups = [[e.name for e in alike if c.setpoint in e.inputs] for c in CONTROLLERS.values()]
     runs = {names[0].split("-")[1]: names for names in zip(*groups, strict=True)}
     return fit_each(Problem(link(), tuple(alike), free(GAINS)), runs=runs, executor=executor)
+
+
+def cluster_sandwich(blocks: Sequence[ResidualBlock]) -> tuple[Array, int]:
+    """Return the covariance of the unknowns, (p, p), from the scatter of the experiments' scores, and its dof, n - 1.
+
+    (J'J)^-1 (sum g_e g_e') (J'J)^-1 n/(n - 1), with g_e the gradient of experiment e alone at the common optimum
+    (Liang and Zeger 1986); intervals use Student's t. It holds with model error and with correlated samples, for whole
+    experiments are the independent units.
+    """
+    names = list(dict.fromkeys(b.experiment for b in blocks))
+    n, p = len(names), blocks[0].jacobian.shape[1]
+    scores, matrix = np.zeros((n, p)), np.zeros((p, p))
+    for b in blocks:
+        scores[names.index(b.experiment)] += b.jacobian.T @ b.residual
+        matrix += b.jacobian.T @ b.jacobian
+    scaled, d = normalised(matrix)
+    inverse = np.linalg.pinv(scaled, hermitian=True) / np.outer(d, d)
+    return inverse @ (scores.T @ scores) @ inverse * (n / (n - 1.0)), n - 1
 
 
 def together(experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:

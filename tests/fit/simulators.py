@@ -9,10 +9,19 @@ import numpy as np
 
 from hvdc_ident.data import Array, Experiment, Trajectory, experiment, trajectory
 from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit import FitParameter
 from hvdc_ident.parameters import Parameter
 
 Formula = Callable[[Array, dict[str, float]], tuple[Array, dict[str, Array]]]
 """From the times and all parameters: an output, and its derivative by each parameter."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """A sum of squares given by a function: theta to r, (n,), and dr/dtheta, (n, p)."""
+
+    unknowns: tuple[FitParameter, ...]
+    residual: Callable[[Array], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)

@@ -66,5 +66,5 @@ def test_one_report_in_json_with_advice_for_who_needs_it() -> None:
 
 def test_groups_hold_every_candidate_once() -> None:
     model, data, free = case()
-    with pytest.raises(StudyError, match="every candidate once"):
+    with pytest.raises(StudyError, match="every free parameter once"):
         identifiability_by_group(model, data, free, GROUPS[:1])

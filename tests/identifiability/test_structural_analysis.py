@@ -14,7 +14,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.simulator import sensitivity_error
 from hvdc_ident.identifiability import identifiability
-from hvdc_ident.identifiability.structural import held_of, rank_analysis, structural_analysis
+from hvdc_ident.identifiability.structural import held_of, structural_analysis
 from hvdc_ident.model import Delay, Model, Sampled
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.simulate import ModelSimulator
@@ -82,7 +82,7 @@ def test_the_report_says_local_where_it_is() -> None:
 def test_numbers_and_equations_agree() -> None:
     model = pi_loop()
     problem = problem_on(model, ["y"])
-    by_equations, by_numbers = structural_analysis(model, problem), rank_analysis(problem)
+    by_equations, by_numbers = structural_analysis(model, problem), structural_analysis(None, problem)
     assert by_equations.method == "Taylor series at random points" and not by_equations.local
     assert by_equations.admissible == by_numbers.admissible and len(by_numbers.admissible) == 3
     assert {c.members for c in by_equations.combinations} == {c.members for c in by_numbers.combinations}
@@ -105,7 +105,7 @@ def test_both_routes_hold_the_last_listed_that_will_do(order) -> None:
     data = on_model(SPRING, "e", {"u": PUSH}, ["y"], 1e-3, rows=121)
     free = tuple(FitParameter(n, SPRING.values[n], SPRING.values[n] / 3, SPRING.values[n] * 3) for n in order)
     problem = Problem(ModelSimulator(SPRING), (data,), free)
-    by_equations, by_numbers = structural_analysis(SPRING, problem), rank_analysis(problem)
+    by_equations, by_numbers = structural_analysis(SPRING, problem), structural_analysis(None, problem)
     assert by_equations.method == "Taylor series at random points" and by_numbers.method == "numerical, local"
     assert by_equations.admissible == by_numbers.admissible == order[:2]
 
@@ -152,11 +152,11 @@ def test_differences_with_their_error_stated_see_what_exact_sensitivities_see() 
     assert sensitivity_error(exact) == 1e-6 and sensitivity_error(rough) == 1e-4
     free = (FitParameter("a", 2, 0.5, 5), FitParameter("b", 3, 0.5, 5), FitParameter("c", 1, -5, 5))
     data = measured(exact, {"a": 2.5}, 0.01)
-    found = rank_analysis(Problem(rough, (data,), free))
+    found = structural_analysis(None, Problem(rough, (data,), free))
     assert found.points == 6 and found.admissible == ("a", "c") and "good to 0.0001" in found.note
     assert found.combinations[0].seen == ("a*b",)
     silent = Differences(exact, sensitivity_error=0.0)
-    assert rank_analysis(Problem(silent, (data,), free)).combinations == ()
+    assert structural_analysis(None, Problem(silent, (data,), free)).combinations == ()
     report = identifiability(rough, [data], free, starts=2)
     assert {n: v.verdict for n, v in report.parameters.items()} == {
         "a": "structurally-unidentifiable",
@@ -170,11 +170,11 @@ def test_points_that_cannot_be_simulated_are_counted() -> None:
     data = measured(exact, {"a": 2.5}, 0.01)
     free = (FitParameter("a", 2, 0.5, 5), FitParameter("b", 3, 0.5, 5), FitParameter("c", 1, -5, 5))
     exact.fails = lambda p: p["c"] > 0
-    found = rank_analysis(Problem(exact, (data,), free))
+    found = structural_analysis(None, Problem(exact, (data,), free))
     assert 0 < found.points < 5 and f"{5 - found.points} of 5 random points could not be simulated" in found.note
     assert found.combinations[0].seen == ("a*b",)
     exact.fails = lambda p: True
-    nothing = rank_analysis(Problem(exact, (data,), free))
+    nothing = structural_analysis(None, Problem(exact, (data,), free))
     assert nothing.status == "not decided" and nothing.admissible == ("a", "b", "c")
     with pytest.raises(SimulationError):
         identifiability(exact, [data], free, starts=1)

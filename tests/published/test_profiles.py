@@ -11,11 +11,13 @@ from math import log, sqrt
 import numpy as np
 import pytest
 from scipy.optimize import brentq, minimize_scalar
+from scipy.stats import chi2
 
+from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter
-from hvdc_ident.fit.descent import LeastSquares
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.fit.profile_path import ProfileOptions
+from tests.fit.simulators import LeastSquares
 
 EXACT = ProfileOptions(tolerance=1e-10)
 
@@ -90,7 +92,7 @@ def test_at_a_bound_the_limit_is_one_sided() -> None:
 
     found = profiles(LeastSquares(unknowns, line), np.zeros(1), options=EXACT).by_name["x"]
     assert found.one_sided and found.lower.status == "open-at-bound"
-    assert found.upper.limit == pytest.approx(sqrt(1 + 2 * 1.353) - 1, rel=1e-9)
+    assert found.upper.limit == pytest.approx(sqrt(1 + chi2.ppf(0.90, 1)) - 1, rel=1e-9)
 
 
 def test_a_crossing_that_leans_on_a_search_bound_does_not_count() -> None:
@@ -127,3 +129,19 @@ def test_many_parameters_cost_few_evaluations() -> None:
     for i, p in enumerate(found.by_name.values()):
         assert p.ci95[1] == pytest.approx(sqrt(2 * 1.92 * inverse[i, i]), rel=1e-3)
         assert p.evaluations <= 16
+
+
+def test_a_profile_follows_a_valley_off_which_nothing_can_be_simulated():
+    """The tangent leaves b = sin 3a at once: each step begins with some that fail, and the ends are those of the parabola."""
+
+    def valley(theta):
+        a, b = theta
+        off = b - np.sin(3.0 * a)
+        if abs(off) > 0.02:
+            raise SimulationError("off the valley")
+        return np.array([(a - 5.0) / 0.8, 100.0 * off]), np.array([[1.25, 0.0], [-300.0 * np.cos(3.0 * a), 100.0]])
+
+    unknowns = (FitParameter("a", 5.0, 0.0, 10.0), FitParameter("b", 0.6, -2.0, 2.0))
+    found = profiles(LeastSquares(unknowns, valley), np.array([5.0, np.sin(15.0)]), ["a"]).by_name["a"]
+    half = 0.8 * np.sqrt(2.0 * 1.92)
+    assert found.ci95 == pytest.approx((5.0 - half, 5.0 + half), rel=1e-3)

@@ -14,7 +14,7 @@ import pytest
 from hvdc_ident.data import InputSignal
 from hvdc_ident.expression import parse
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.identifiability.structural import StructuralAnalysis, rank_analysis
+from hvdc_ident.identifiability.structural import StructuralAnalysis, structural_analysis
 from hvdc_ident.model import Delay, Model, Output, State
 from hvdc_ident.simulate import ModelSimulator
 from tests.identifiability.cases import on_model
@@ -45,7 +45,7 @@ def seen(m: Model) -> StructuralAnalysis:
     """The structure that runs at random points within a factor of 2 show."""
     free = tuple(FitParameter(n, v, v / 2, v * 2) for n, v in m.values.items())
     record = on_model(m, "e", {"u": MOVE}, list(m.outputs), 1e-3)
-    return rank_analysis(Problem(ModelSimulator(m), (record,), free))
+    return structural_analysis(None, Problem(ModelSimulator(m), (record,), free))
 
 
 SCALAR = model(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import qr
 
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import (
@@ -54,6 +55,13 @@ def test_pivoting_keeps_the_earlier_of_equals() -> None:
     assert set(independent(j.T @ j)) == {0, 2}
     j[:, 0] = 0.0
     assert set(independent(j.T @ j)) == {1, 2}
+
+
+def test_the_order_is_that_of_a_qr_with_pivoting() -> None:
+    """The order by SciPy's QR of the columns; of columns as long as each other, to a thousandth, the earlier listed comes first."""
+    columns = np.random.default_rng(4).standard_normal((30, 5)) * [3.0, 1.0, 10.0, 0.3, 30.0]
+    assert pivoted_order(columns.T @ columns) == tuple(qr(columns, mode="r", pivoting=True)[1])
+    assert pivoted_order(np.diag([1.0, 4.0, 4.003])) == (1, 2, 0)
 
 
 def test_null_directions_are_sparse_and_leave_zero_columns_out() -> None:

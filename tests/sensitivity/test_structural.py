@@ -174,7 +174,12 @@ def test_sums_of_products_are_found() -> None:
     model = make({"x": "-(a*b + c)*x + d*u"}, {"y": "x"}, "a b c d")
     result = ask(model, inputs=steps("u"))
     assert result.identifiable == ("d",)
-    assert result.combinations[0].words == "only c + a*b is seen"
+    found = result.combinations[0]
+    assert found.words == "only c + a*b is seen" and not found.relative
+    # Along each of the two directions that are not seen, a*b + c does not change: its slopes are b, a and 1.
+    unseen = np.array(found.directions)
+    assert found.members == ("a", "b", "c") and np.linalg.matrix_rank(unseen) == 2
+    assert unseen @ [model.values["b"], model.values["a"], 1.0] == pytest.approx([0.0, 0.0])
 
 
 def test_what_has_no_simple_form_is_named_plainly() -> None:

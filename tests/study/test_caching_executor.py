@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from hvdc_ident.errors import ComputationError
 from hvdc_ident.fit import FitParameter
-from hvdc_ident.fit.descent import LeastSquares
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.study.executors import LocalPool
 from hvdc_ident.study.store import CachingExecutor, packed, unpacked
+from tests.fit.simulators import LeastSquares
 
 
 class Shelf(dict):

@@ -221,7 +221,6 @@ def test_standard_deviations_of_every_row_weigh_as_scipy_weighs_them(tmp_path: P
     assert found.estimates["J"].value == pytest.approx(value[0], rel=1e-6)
     assert found.estimates["J"].std_raw == pytest.approx(np.sqrt(covariance[0, 0]), rel=1e-3)
     assert found.chi2_per_dof == pytest.approx(1.0, abs=0.25)
-    assert found.goodness["outputs"]["w"]["d"]["rmse_per_sigma"] == pytest.approx(1.0, abs=0.12)
     assert found.goodness["outputs"]["w"]["d"]["in_band"] > 0.9
 
 

@@ -17,15 +17,13 @@ import pytest
 
 import hvdc_ident
 from hvdc_ident.discrepancy.hypothesis import Refit
-from hvdc_ident.fit.bootstrap import _refit
 from hvdc_ident.fit.optimiser import Optimiser
 from hvdc_ident.fit.partial_fits import _alone
 from hvdc_ident.fit.profile import _descend
 from hvdc_ident.immutable import FrozenMap
 
 BOUND = {
-    "refit": _refit,  # partial(_refit, ...)
-    "one": _alone,  # partial(_alone, ...)
+    "partial(_alone, whiten=whiten)": _alone,
     "partial(method.run, problem)": Optimiser.run,
     "partial(_descend, objective)": _descend,
 }

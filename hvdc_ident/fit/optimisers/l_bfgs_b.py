@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.optimiser import BudgetSpentError, OptimiserResult, OptimiserRun
+from hvdc_ident.fit.optimiser import OptimiserResult, OptimiserRun
 from hvdc_ident.fit.problem import Problem
 
 NAME = "l-bfgs-b"
@@ -30,41 +30,27 @@ class LBfgsB:
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
         """Return the end of the run from `start`."""
+        return OptimiserRun(problem, start, self.max_evaluations).result(self._minimised)
+
+    def _minimised(self, run: OptimiserRun) -> tuple[bool, str]:
         from scipy.optimize import minimize
 
-        run = OptimiserRun(problem, start, self.max_evaluations)
-        low, high = problem.coordinates.bounds
-        try:
-            first, _ = run.value_and_gradient(run.x0)
-            if run.cost is None:
-                return run.ended(False, "")
-            scale = 1.0 / max(first, 1e-300)  # the method's tolerances are absolute ones
+        low, high = run.problem.coordinates.bounds
+        first, _ = run.value_and_gradient(run.x0)
+        scale = 1.0 / max(first, 1e-300)  # the method's tolerances are absolute ones
 
-            def scaled(x: Array) -> tuple[float, Array]:
-                value, gradient = run.value_and_gradient(x)
-                return scale * value, scale * gradient
+        def scaled(x: Array) -> tuple[float, Array]:
+            value, gradient = run.value_and_gradient(x)
+            return scale * value, scale * gradient
 
-            end = minimize(
-                scaled,
-                run.x0,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=list(zip(low, high, strict=True)),
-                options={
-                    "ftol": self.cost,
-                    "gtol": self.gradient,
-                    "maxcor": self.memory,
-                    "maxfun": 10 * self.max_evaluations,
-                    "maxiter": 10 * self.max_evaluations,
-                },
-            )
-        except BudgetSpentError:
-            return run.spent()
+        # The run counts its own evaluations, and ends the method where it has had enough.
+        most = 10 * self.max_evaluations
+        options = {"ftol": self.cost, "gtol": self.gradient, "maxcor": self.memory, "maxfun": most, "maxiter": most}
+        bounds = list(zip(low, high, strict=True))
+        end = minimize(scaled, run.x0, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         # A slope that is rounding inside the bounds: the line search then ends as abnormal, at an optimum.
         flat = np.abs(np.clip(end.x - end.jac, low, high) - end.x).max() < FLAT
-        if not end.success and not flat:
-            return run.refused(str(end.message))
-        return run.ended(True, str(end.message))
+        return bool(end.success or flat), str(end.message)
 
 
 OPTIMISER = LBfgsB

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.optimiser import BudgetSpentError, OptimiserResult, OptimiserRun
+from hvdc_ident.fit.optimiser import OptimiserResult, OptimiserRun
 from hvdc_ident.fit.problem import Problem
 
 NAME = "least-squares"
@@ -28,29 +28,18 @@ class LeastSquaresTrf:
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
         """Return the end of the run from `start`."""
+        return OptimiserRun(problem, start, self.max_evaluations).result(self._minimised)
+
+    def _minimised(self, run: OptimiserRun) -> tuple[bool, str]:
         from scipy.optimize import least_squares
 
-        run = OptimiserRun(problem, start, self.max_evaluations)
-        low, high = problem.coordinates.bounds
+        low, high = run.problem.coordinates.bounds
         inside = np.clip(run.x0, low + 1e-9 * (1.0 + np.abs(low)), high - 1e-9 * (1.0 + np.abs(high)))
-        try:
-            run.value_and_gradient(inside)
-            if run.cost is None:
-                return run.ended(False, "")
-            end = least_squares(
-                run.residual,
-                inside,
-                run.jacobian,
-                (low, high),
-                method="trf",
-                x_scale="jac",
-                ftol=self.cost,
-                xtol=self.step,
-                gtol=self.gradient,
-            )
-        except BudgetSpentError:
-            return run.spent()
-        return run.ended(end.status > 0, end.message.replace("`", "").rstrip("."))
+        tolerances = {"ftol": self.cost, "xtol": self.step, "gtol": self.gradient}
+        end = least_squares(
+            run.residual, inside, run.jacobian, (low, high), method="trf", x_scale="jac", **tolerances
+        )  # fmt: skip
+        return end.status > 0, end.message.replace("`", "").rstrip(".")
 
 
 OPTIMISER = LeastSquaresTrf

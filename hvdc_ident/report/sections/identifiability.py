@@ -95,7 +95,6 @@ def _structure(structural: dict[str, Any]) -> str:
 def _verdicts(found: dict[str, Any], parameters: dict[str, Any]) -> str:
     ratio = (found.get("pilot") or {}).get("chi2_per_dof") if found.get("misspecified") else None
     interval = "95 % interval" if ratio is None else f"95 % interval (χ²/dof {number(ratio, 3)})"
-    drawn_anew = any(v.get("ci95_experiments") for v in parameters.values())
     rows = []
     for name, v in parameters.items():
         cells = {
@@ -103,12 +102,9 @@ def _verdicts(found: dict[str, Any], parameters: dict[str, Any]) -> str:
             "verdict": text(v.get("verdict", "")),
             "value": estimate(v.get("value"), v.get("ci95"))[0],
             interval: estimate(v.get("value"), v.get("ci95"))[1],
-            "experiments drawn anew": estimate(v.get("value"), v.get("ci95_experiments"))[1],
             "unit": text(v.get("unit", "")),
             "why": text(v.get("reason", "")),
         }
-        if not drawn_anew:
-            del cells["experiments drawn anew"]
         rows.append(cells)
     header = list(rows[0])
     words = [i for i, h in enumerate(header) if h in ("parameter", "verdict", "unit", "why")]
@@ -156,7 +152,7 @@ def _pictures(found: dict[str, Any]) -> str:
 
 def _experiments(found: dict[str, Any]) -> str:
     experiments = found.get("experiments") or {}
-    names: list[str] = [n for line in list(experiments.values())[:1] for n in line.get("information") or {}]
+    names = list(dict.fromkeys(n for line in experiments.values() for n in line.get("information") or {}))
     if not names:
         return ""
     rows = [[text(e), *(_percent(line["information"].get(n, 0.0)) for n in names)] for e, line in experiments.items()]

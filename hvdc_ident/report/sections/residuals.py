@@ -1,4 +1,4 @@
-"""Section on the residuals, compared with noise: goodness of fit, whiteness, correlation with the inputs."""
+"""Section on the residuals: the share of the variance explained, whiteness, correlation with the inputs."""
 
 from __future__ import annotations
 
@@ -39,22 +39,10 @@ def _render(results: Results) -> str:
     diagnosis = results.get("discrepancy")
     with_effect = diagnosis.get("residual_tests_after") or {}
     if not with_effect or values_that_count(fit, diagnosis).name != "effect":
-        return _goodness(fit) + tested(tests, fit) + told
+        return tested(tests, fit) + told
     return (
         f"<h3>With the effect, at the values that count</h3>{tested(with_effect, {})}"
-        f"<h3>Fitted without it</h3>{_goodness(fit)}{tested(tests, fit)}{told}"
-    )
-
-
-def _goodness(fit: dict[str, Any]) -> str:
-    g = fit.get("goodness") or {}
-    if g.get("p") is None:
-        return f"<p>No test of the fit as a whole: {text(g['reason'])}.</p>" if g.get("reason") else ""
-    against = "an estimated noise (F test)" if g.get("noise_dof") else "the given noise (χ² test)"
-    verdict = "the misfit is what this noise makes" if g["p"] >= LOW else "the misfit is more than this noise makes"
-    return (
-        f"<p>All residuals together against {against}: χ² {number(g['chi2'], 4)} with {number(g['dof'], 4)} independent "
-        f"samples to spare, p = {number(g['p'], 2)}: {verdict}.</p>"
+        f"<h3>Fitted without it</h3>{tested(tests, fit)}{told}"
     )
 
 

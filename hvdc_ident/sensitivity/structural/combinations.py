@@ -11,31 +11,40 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import combinations, combinations_with_replacement
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity.information import leading
 from hvdc_ident.text import listed
 
 
 @dataclass(frozen=True)
-class StructuralCombination:
+class Combination:
     """Parameters of which only combinations are seen.
 
-    members: their names. seen: the combinations that hold all that is seen of them; empty where none is simple, or where
-    nothing is seen of them at all. words: the sentence for the report. free: how many of the members can be given any
-    value, the others then following. directions: (free, members) null directions at the model's values, the largest entry
-    1: of the relative changes where `relative`, else of the changes themselves; empty where they are not known.
+    members: their names, in the order listed. seen: the combinations that hold all that is seen of them; empty where none is
+    simple, or where nothing is seen of them at all. words: the finding as a clause. free: how many of the members can be given
+    any value, the others then following. directions: (free, members) null directions at the model's values, the largest entry
+    1: of the relative changes where `relative`, else of the changes themselves; empty where they are not known. kind: "structural"
+    (no data could tell) or "practical" (these data do not). held: those put at their given value so that the others can be told.
     """
 
     members: tuple[str, ...]
     seen: tuple[str, ...]
     words: str
-    free: int
+    free: int = 1
     directions: tuple[tuple[float, ...], ...] = ()
     relative: bool = False
+    kind: Literal["structural", "practical"] = "structural"
+    held: tuple[str, ...] = ()
+
+    @property
+    def direction(self) -> FrozenMap[float]:
+        """One change of the members that leaves the outputs alone; empty where none is known."""
+        return FrozenMap(zip(self.members, self.directions[0], strict=True) if self.directions else ())
 
     def to_dict(self) -> dict[str, Any]:
         """The combination as plain values."""
@@ -47,6 +56,13 @@ class StructuralCombination:
             "directions": [list(d) for d in self.directions],
             "relative": self.relative,
         }
+
+
+def only_seen(members: Sequence[str], seen: Sequence[str]) -> str:
+    """Return in words that of some parameters only these combinations are seen; nothing, where there are none."""
+    if not seen:
+        return f"nothing is seen of {listed(members)}"
+    return f"only {listed(seen)} {'is' if len(seen) == 1 else 'are'} seen"
 
 
 MOST = 2000
@@ -143,7 +159,7 @@ def combinations_seen(
     values: Sequence[float],
     more: Callable[[], Point | None] = lambda: None,
     error: float = EXACT,
-) -> tuple[StructuralCombination, ...]:
+) -> tuple[Combination, ...]:
     """Return what is seen of the parameters that the directions tie together, one combination for each group.
 
     points: they agree in their groups. values: of the parameters, where the combinations' null directions are given. more:
@@ -177,10 +193,10 @@ def _combination(
     values: Sequence[float],
     more: Callable[[], Point | None],
     error: float,
-) -> StructuralCombination:
+) -> Combination:
     own = tuple(names[k] for k in members)
     if len(members) == 1:
-        return StructuralCombination(own, (), f"nothing is seen of {own[0]}", 1, ((1.0,),))
+        return Combination(own, (), only_seen(own, ()), 1, ((1.0,),))
     n, free = len(members), len(points[0].among(members).directions)
     found = None
     for coefficients in (n, n * (n + 3) // 2) if n <= FEW else (n,):
@@ -192,11 +208,10 @@ def _combination(
     if found is None:
         number = "one combination" if n - free == 1 else f"{n - free} combinations"
         words = f"only {number} of {listed(own)} {'is' if n - free == 1 else 'are'} seen"
-        return StructuralCombination(own, (), words, free)
+        return Combination(own, (), words, free)
     seen = tuple(i.text(own) for i in found)
     directions, relative = _null_directions(found, [values[k] for k in members])
-    words = f"only {listed(seen)} {'is' if len(seen) == 1 else 'are'} seen"
-    return StructuralCombination(own, seen, words, free, directions, relative)
+    return Combination(own, seen, only_seen(own, seen), free, directions, relative)
 
 
 def _null_directions(found: Sequence[Invariant], values: Sequence[float]) -> tuple[tuple[tuple[float, ...], ...], bool]:

@@ -21,8 +21,8 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity.structural.combinations import (
     EXACT,
+    Combination,
     Point,
-    StructuralCombination,
     combinations_seen,
     held_of,
 )
@@ -102,7 +102,7 @@ class StructuralResult:
     method: str = ""
     identifiable: tuple[str, ...] = ()
     unidentifiable: tuple[str, ...] = ()
-    combinations: tuple[StructuralCombination, ...] = ()
+    combinations: tuple[Combination, ...] = ()
     rank: int = 0
     unseen: Array = field(default_factory=lambda: np.zeros((0, 0)))
     seconds: float = 0.0

@@ -10,7 +10,6 @@ from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
     from hvdc_ident.executor import Executor, Progress
-    from hvdc_ident.fit import Group
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
 
@@ -41,7 +40,7 @@ def judged(
 ) -> IdentifiabilityReport:
     """Return the report on the study's candidates. The study has data and candidates (`fitting.need`)."""
     from hvdc_ident.identifiability import identifiability, identifiability_by_group
-    from hvdc_ident.study.recorded_inputs import fitted_records
+    from hvdc_ident.study.fitting import groups_of, problem_of
 
     pair = study.settings.identifiability.pair if study.settings.identifiability else None
     common: dict[str, Any] = {
@@ -51,10 +50,10 @@ def judged(
         "progress": progress,
         "pair": (pair[0], pair[1]) if pair else None,
     }
-    simulator, experiments = fitted_records(study)
-    subject = simulator if study.responses else study.model
-    asked = (subject, experiments, tuple(study.candidates.values()))
-    groups = groups_of(study)
+    problem = problem_of(study)
+    subject = problem.simulator if study.responses else study.model
+    asked = (subject, problem.experiments, problem.free)
+    groups = groups_of(study, study.candidates)
     return identifiability_by_group(*asked, groups, **common) if groups else identifiability(*asked, **common)
 
 
@@ -67,17 +66,15 @@ def _starts(study: Study) -> int | None:
 def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     """Tell and keep the local analysis at the given values, where the search will take longer than `SOON`."""
     from hvdc_ident.errors import SimulationError
-    from hvdc_ident.fit import Problem
     from hvdc_ident.identifiability.pilot_fit import cramer_rao_bounds
     from hvdc_ident.processes import available_cores
-    from hvdc_ident.study.recorded_inputs import fitted_records
+    from hvdc_ident.study.fitting import problem_of
     from hvdc_ident.study.study import candidate_lines
     from hvdc_ident.text import duration
 
-    simulator, experiments = fitted_records(study)
     options.progress(0, 1, "first answer: the model and its derivatives at the given values")
     try:
-        first = cramer_rao_bounds(Problem(simulator, experiments, tuple(study.candidates.values())))
+        first = cramer_rao_bounds(problem_of(study))
     except SimulationError as error:
         options.announce([f"There is no first answer at the given values: {error}"])
         return
@@ -91,14 +88,6 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     options.announce([*first.lines, about])
     message = "this is the first answer, from the curvature at the given values: the stage has not come to its end"
     options.keep({"message": message, "first": first.to_dict(), "candidates": candidate_lines(study)})
-
-
-def groups_of(study: Study) -> list[Group]:
-    """The groups that the fit takes one after the other; none where it takes all together."""
-    from hvdc_ident.fit import Group
-
-    asked = study.settings.fit.groups if study.settings.fit else []
-    return [Group(tuple(g.parameters), tuple(g.outputs or ()), tuple(g.experiments or ())) for g in asked]
 
 
 def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
