@@ -65,7 +65,7 @@ CASES = {
         ("wndow", "experiment 'd'", "did you mean 'window'"), _append("wndow = [0, 1]\n")
     ),
     "missing schema": Case(("schema",), _replace("schema = 1\n", "")),
-    "another schema": Case(("schema", "expected 1, got 2"), _replace("schema = 1", "schema = 2")),
+    "another schema": Case(("schema", "expected schema = 1, got 2"), _replace("schema = 1", "schema = 2")),
     "missing model": Case(("'model' is missing",), _replace('[model]\nsource = "vsc-hvdc-link"\n', "")),
     "unknown model": Case(("vsc-hvdc-lnk", "did you mean 'vsc-hvdc-link'"), _replace("hvdc-link", "hvdc-lnk")),
     "missing model file": Case(("no model file 'm.toml'", "model.source"), _replace("vsc-hvdc-link", "m.toml")),
@@ -85,7 +85,7 @@ CASES = {
     ),
     "unknown parameter": Case(("no parameter 'KIPP'", "'KIP'"), _replace("KIP =", "KIPP =")),
     "an input as parameter": Case(("'Pref2' is an input", "values"), _replace("KIP =", "Pref2 =")),
-    "bounds that miss the start": Case(("KIP", "min 60"), _replace("min = 5", "min = 60")),
+    "bounds that miss the start": Case(("KIP", "min is not below max: min = 60, max = 50"), _replace("min = 5", "min = 60")),
     "bounds beyond the model's": Case(("parameters.KIP", "the model's own"), _replace("min = 5", "min = -5")),
     "infinite start": Case(("parameters.KIP.start", "finite number", "inf"), _replace("start = 25", "start = inf")),
     "text as number": Case(("parameters.KIP.start", "a number"), _replace("start = 25", 'start = "25"')),
