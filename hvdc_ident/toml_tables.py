@@ -6,6 +6,7 @@ imports pydantic: it is imported where a file is read, not with the package.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import tomllib
@@ -124,6 +125,8 @@ def parsed(text: str, what: str, where: str, error: type[InputError], hint: str 
         if path and re.match(r"Invalid hex value|Unescaped|Escaped character is not", str(e)):
             why = f"\\ begins an escape sequence in double quotes: {why}"
             hint = f"'{path[1]}' in single quotes, or \"{path[1].replace(chr(92), '/')}\""
+        elif word := re.search(r"=\s*([^\s\"'#{}\[\],]*[A-Za-z./-][^\s\"'#{}\[\],]*)", line):
+            hint = f'text in quotes: "{word[1]}"'
     except RecursionError:
         line, why = "", "nested too deeply"
     except ValueError as e:  # a number of thousands of digits, a date that does not exist
@@ -200,6 +203,8 @@ def _told(problem: Mapping[str, Any], loc: Sequence[int | str]) -> tuple[str, st
         case "string_pattern_mismatch" if "\\w" not in ctx["pattern"] and re.search(r"[\t\n\r\f\b]", str(found)):
             hint = "a path in single quotes or with /: in double quotes \\t is a tab and \\n a line break"
             return "a value that does not fit", "a name without control characters", got, hint
+    if kind == "float_type" and hasattr(found, "isoformat"):  # a date or time of day of TOML
+        return "a value of the wrong kind", "a number", got, "a time in s, as the time in the data counts"
     if kind in EXPECTED:
         return (
             f"a value {'that does not fit' if kind == 'finite_number' else 'of the wrong kind'}",
@@ -264,5 +269,5 @@ def shown(value: Any) -> str:
         return str(value)
     if isinstance(value, Mapping):
         return "a table"
-    text = f'"{value}"' if isinstance(value, str) else str(value)
+    text = json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
     return text if len(text) <= 60 else text[:57] + "..."

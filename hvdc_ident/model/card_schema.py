@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator
 
-from hvdc_ident.toml_tables import TomlTable, key, optional, wrong
+from hvdc_ident.toml_tables import Name, TomlTable, key, optional, wrong
 
 
 def _text_or_number(value: Any) -> Any:
@@ -145,7 +145,7 @@ class ParameterisationEntry(TomlTable):
 class ComponentEntry(TomlTable):
     """[components.NAME]: a model that this one is made of."""
 
-    source: str = key("A component of the shelf, or the path of a model card.", 'source = "genrou"')
+    source: Name = key("A component of the shelf, or the path of a model card.", 'source = "genrou"')
     parameters: dict[str, Expression] = optional(
         "Values of the component's parameters that differ from its card's: numbers, or expressions of this model's names. A name "
         'alone, as in R = "Rg", makes it that parameter of this model: components share it.',

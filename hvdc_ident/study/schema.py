@@ -7,6 +7,7 @@ A key may stand on a line longer than the formatter's: the tables are read like 
 from __future__ import annotations
 
 import math
+from datetime import date
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, StringConstraints, model_validator
@@ -73,6 +74,11 @@ def _as_list(value: Any) -> Any:
 def _whitening(value: Any) -> Any:
     """The way of whitening; true and false are words for two of them."""
     return {True: "pre-event", False: "no"}[value] if isinstance(value, bool) else value
+
+
+def _date_text(value: Any) -> Any:
+    """A date of TOML as text."""
+    return value.isoformat() if isinstance(value, date) else value
 
 
 def _rising(ends: list[float]) -> list[float]:
@@ -622,7 +628,8 @@ class LetterTable(TomlTable):
     to: Line = optional("Addressee: the owner of the model.", 'to = "Converter Works, Modelling"', default="")
     plant: Line = optional("The plant that was recorded.", 'plant = "Link North, station 1"', default="")
     version: Line = optional("Version of the model.", 'version = "3.2"', default="")
-    date: Line = optional("Date of the letter. If left out, today.", 'date = "2026-11-25"', default="")
+    date: Annotated[Line, BeforeValidator(_date_text, json_schema_input_type=str)] = optional(
+        "Date of the letter. If left out, today.", 'date = "2026-11-25"', default="")
 
 
 class StudyFile(TomlTable):

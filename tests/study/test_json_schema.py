@@ -185,6 +185,12 @@ def test_values_that_the_reader_refuses_are_refused(line: str) -> None:
     assert not _accepts("study", study)
 
 
+def test_the_date_of_a_letter_may_be_a_date_of_toml() -> None:
+    study = tomllib.loads('schema = 1\n[model]\nsource = "m.toml"\n[letter]\ndate = 2026-11-25\n')
+    letter = checked(study, "study.toml").letter
+    assert letter is not None and letter.date == "2026-11-25"
+
+
 def _misspelt(table: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The table once with each of its keys, at any depth, misspelt."""
     for key, value in table.items():
