@@ -10,7 +10,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, TypeVar, Union
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError, model_validator
@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticCustomError, PydanticUndefined
 from typing_extensions import TypeAliasType
 
-from hvdc_ident.errors import InputError, UnknownNameError, nearest
+from hvdc_ident.errors import InputError, UnknownNameError, nearest, require_known
 
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 Item = TypeVar("Item")
@@ -26,15 +26,26 @@ ByName: Any = TypeAliasType("ByName", dict[Name, Union[Item, "ByName[Item]"]], t
 """Items by name, in which TOML nests the names of a component: gen.H is H in a table gen."""
 
 
-def key(text: str, example: str, unit: str = "", *, default: Any = PydanticUndefined, alias: str | None = None) -> Any:
-    """Return the field of a key that has to be given: its meaning, an example as TOML, its unit."""
-    extra: dict[str, Any] | None = {"unit": unit} if unit else None
-    return Field(default, alias=alias, description=text, examples=[example], json_schema_extra=extra)
+def key(
+    text: str,
+    example: str,
+    unit: str = "",
+    *,
+    default: Any = PydanticUndefined,
+    alias: str | None = None,
+    of: str = "",
+) -> Any:
+    """Return the field of a key that has to be given: its meaning, an example as TOML, its unit.
+
+    of: the kind of names that the key holds, for `check_names`.
+    """
+    extra: dict[str, Any] = {k: v for k, v in (("unit", unit), ("of", of)) if v}
+    return Field(default, alias=alias, description=text, examples=[example], json_schema_extra=extra or None)
 
 
-def optional(text: str, example: str, unit: str = "", *, default: Any = None, alias: str | None = None) -> Any:
-    """Return the field of a key that may be left out."""
-    return key(text, example, unit, default=default, alias=alias)
+def optional(text: str, example: str, unit: str = "", *, default: Any = None, **more: Any) -> Any:
+    """Return the field of a key that may be left out. more: as of `key`."""
+    return key(text, example, unit, default=default, **more)
 
 
 class TomlTable(BaseModel):
@@ -73,7 +84,25 @@ def wrong(expected: str, what: str = "a value of the wrong kind", hint: str = ""
     return PydanticCustomError("wrong", "wrong", {"what": what, "expected": expected, "hint": hint})
 
 
-# --- names with dots ---
+# --- names ---
+
+
+def check_names(table: TomlTable, known: Mapping[str, Collection[str]], place: str) -> None:
+    """Raise UnknownNameError for the first name in a table, or in one inside it, that is not known.
+
+    known: by kind of names, as keys state it by `of`; names of a kind that is not listed are left alone. place: what stands
+    before a key.
+    """
+    for name, field in type(table).model_fields.items():
+        value, inner = getattr(table, name), f"{place}{field.alias or name}"
+        extra = field.json_schema_extra
+        kind = extra.get("of") if isinstance(extra, dict) else None
+        if isinstance(kind, str) and kind in known:
+            require_known(kind, [value] if isinstance(value, str) else value, known[kind], inner)
+        for number, item in enumerate(value if isinstance(value, list) else [value], start=1):
+            if isinstance(item, TomlTable):
+                called = f" '{item.name}'" if hasattr(item, "name") else f" number {number}"
+                check_names(item, known, f"{inner}{called if isinstance(value, list) else ''}.")
 
 
 def by_name(item: Any, *own: str) -> BeforeValidator:

@@ -51,7 +51,7 @@ def schema_text(name: str) -> str:
             unit = f" Unit: {key.unit}." if key.unit else ""
             own = table["properties"][key.name]
             own["description"] = f"{key.text}{unit} Example: {key.example}"
-            for word in ("title", "examples", "unit", *(() if key.default else ("default",))):
+            for word in ("title", "examples", "unit", "of", *(() if key.default else ("default",))):
                 own.pop(word, None)
         table.pop("description", None)
         table["title"] = f"[{path}]" if path else f"{name.replace('-', ' ')} of hvdc_ident"

@@ -309,33 +309,33 @@ class ExperimentTable(TomlTable):
         'role = "holdout"', default="fit")
     inputs: Columns = optional(
         "The model's inputs that the recording holds: a list of names, or a table from names to columns. Other inputs keep their values.",
-        'inputs = ["Vdcref1", "Pref2"]', default={})
+        'inputs = ["Vdcref1", "Pref2"]', default={}, of="input")
     outputs: Columns = key("The model's outputs that are compared: a list of names, or a table from names to columns.",
-        'outputs = {Irorder1 = "I:REG:1"}')
+        'outputs = {Irorder1 = "I:REG:1"}', of="output")
     noise: Annotated[dict[Name, Noise], by_name(NotNegative | NoiseTable, "column")] = optional(
         "Standard deviation of the noise of an output, or the column that holds one for each row. If left out, estimated before the event.",
-        "noise = {Irorder1 = 1e-4}", "the model's", default={})
+        "noise = {Irorder1 = 1e-4}", "the model's", default={}, of="measured output")
     event: FiniteFloat | None = optional("Instant at which an input first moves. If left out, found from the inputs.", "event = 0.1", "s")
     window: Range | None = optional(
         "First and last instant that are compared. If left out, the whole recording.", "window = [0.0, 0.8]", "s")
     values: Numbers = optional("Inputs that are constant in this experiment at other than the model's values.",
-        "values = {Pref2 = 0.5}", "the model's", default={})
+        "values = {Pref2 = 0.5}", "the model's", default={}, of="input")
     trim: Columns = optional(
         "Inputs that stand at the level of a recorded output before the event: the references of a plant that is played back are "
         "found from them.",
-        'trim = {P0 = "P", Q0 = "Q"}', default={})
+        'trim = {P0 = "P", Q0 = "Q"}', default={}, of="input")
     columns: Annotated[dict[Name, ColumnTable], by_name(ColumnTable)] = optional(
         "By signal of the model: its column in the file and the conversion to the model's unit.",
-        'columns = {Irorder1 = {name = "I:REG:1", unit = "kA", scale = 5.54}}', default={})
+        'columns = {Irorder1 = {name = "I:REG:1", unit = "kA", scale = 5.54}}', default={}, of="signal of the experiment")
     nuisance: list[Name] = optional(
         "Unknowns of this recording that are estimated beside the parameters: \"time-shift\" is a clock offset, an input's name the "
         "offset of that input, a state's name its start value.",
-        'nuisance = ["time-shift", "Pref2"]', default=[])
+        'nuisance = ["time-shift", "Pref2"]', default=[], of="nuisance")
     drive: Columns = optional("Play-in: signals that follow their recorded columns instead of their equations.",
-        'drive = {Vac1 = "V1"}', default={})
+        'drive = {Vac1 = "V1"}', default={}, of="insertion point")
     instrument: Annotated[dict[Name, InstrumentTable], by_name(InstrumentTable)] = optional(
         "By output: the recording chain, applied to the simulated output.",
-        "instrument = {P2 = {window-mean = 0.02, delay = 0.001}}", default={})
+        "instrument = {P2 = {window-mean = 0.02, delay = 0.001}}", default={}, of="measured output")
     phases: list[PhasesTable] = optional("Quantities that are computed from recorded phases: one table for each set.",
         "[[experiment.phases]]", default=[])
     phasors: list[PhasorsTable] = optional("Quantities that are computed from recorded magnitudes and angles: one table for each set.",
@@ -357,11 +357,11 @@ class TrimTable(TomlTable):
 
     outputs: Annotated[dict[Name, FiniteFloat], Field(min_length=1), by_name(FiniteFloat)] = key(
         "Values that outputs are to have at the operating point.",
-        "trim = {outputs = {P2 = 0.6}}", "the model's")
+        "trim = {outputs = {P2 = 0.6}}", "the model's", of="output")
     inputs: Numbers = optional("Values of other inputs at the operating point.",
-        "trim = {outputs = {P2 = 0.6}, inputs = {Qref1 = 0.1}}", "the model's", default={})
+        "trim = {outputs = {P2 = 0.6}, inputs = {Qref1 = 0.1}}", "the model's", default={}, of="input")
     free: Names | None = optional("Inputs or parameters that are adjusted. If left out, the inputs that affect the outputs.",
-        'trim = {outputs = {P2 = 0.6}, free = ["Pref2"]}')
+        'trim = {outputs = {P2 = 0.6}, free = ["Pref2"]}', of="input or parameter")
 
 
 class ReduceTable(TomlTable):
@@ -382,16 +382,16 @@ class ReduceTable(TomlTable):
 class PlantTable(TomlTable):
     """[linearize] plant: the signals that go into the plant and those the controller measures on it."""
 
-    inputs: NameOrNames = key("The signals that enter the plant.", 'plant = {inputs = "Irorder1", outputs = "Vdc1_m"}')
+    inputs: NameOrNames = key("The signals that enter the plant.", 'plant = {inputs = "Irorder1", outputs = "Vdc1_m"}', of="signal")
     outputs: NameOrNames = key("The signals of the plant that the controller measures.",
-        'plant = {inputs = "Irorder1", outputs = "Vdc1_m"}')
+        'plant = {inputs = "Irorder1", outputs = "Vdc1_m"}', of="signal")
 
 
 class PortTable(TomlTable):
     """[[linearize.port]]: where an impedance is seen, d and q or one dc signal each; band: Hz."""
 
     name: FileName = key("Name of the port in results and file names.", 'name = "dc-1"')
-    source: Axes = key("The signal that is perturbed; two for d and q.", 'source = "Iload1"')
+    source: Axes = key("The signal that is perturbed; two for d and q.", 'source = "Iload1"', of="insertion point")
     voltage: Axes = key("Expression of the voltage; two for d and q.", 'voltage = "Vdc1"')
     current: Axes = key("Expression of the current towards the part whose impedance is wanted; two for d and q.", 'current = "-Iload1"')
     angle: Name = optional("Expression of the angle of the model's frame ahead of the network's.", 'angle = "theta1"', "rad", default="0")
@@ -412,7 +412,8 @@ class PortTable(TomlTable):
 class LocusTable(TomlTable):
     """[linearize] locus: the eigenvalues along values of one parameter or input, each at its own operating point."""
 
-    parameter: Name = key("The parameter or input that is varied.", 'locus = {parameter = "KPVDC", min = 1, max = 100}')
+    parameter: Name = key("The parameter or input that is varied.", 'locus = {parameter = "KPVDC", min = 1, max = 100}',
+        of="input or parameter")
     min: FiniteFloat = key("Lowest value.", 'locus = {parameter = "KPVDC", min = 1, max = 100}', "the parameter's")
     max: FiniteFloat = key("Highest value.", 'locus = {parameter = "KPVDC", min = 1, max = 100}', "the parameter's")
     points: Annotated[int, Field(ge=2, le=100_000)] = optional("Number of values.",
@@ -429,22 +430,23 @@ class LocusTable(TomlTable):
 class LinearizeTable(TomlTable):
     """[linearize]: between which inputs and outputs, where, and what is wanted of the linear model."""
 
-    inputs: Names | None = optional("Inputs of the linear model. If left out, all.", 'inputs = ["Vdcref1"]')
-    outputs: Names | None = optional("Outputs of the linear model. If left out, all.", 'outputs = ["Irorder1"]')
+    inputs: Names | None = optional("Inputs of the linear model. If left out, all.", 'inputs = ["Vdcref1"]', of="input")
+    outputs: Names | None = optional("Outputs of the linear model. If left out, all.", 'outputs = ["Irorder1"]', of="output")
     at: Literal["steady", "start"] = optional("Where: the steady state, or the start values of the states as they stand.",
         'at = "start"', default="steady")
     side: Literal["refuse", "below", "above"] = optional(
         "Of a limit that the operating point lies on: the derivative below or above it. Such a point is refused unless one is named.",
         'side = "below"', default="refuse")
     trim: TrimTable | None = optional("The operating point by values of outputs.", "trim = {outputs = {P2 = 0.6}}")
-    break_at: NameOrNames | None = optional("Signals at which loops are opened for their margins.", 'break_at = ["Irorder1"]')
+    break_at: NameOrNames | None = optional("Signals at which loops are opened for their margins.", 'break_at = ["Irorder1"]', of="signal")
     plant: PlantTable | None = optional("The signals between plant and controller, for the coprime factor margin.",
         'plant = {inputs = "Irorder1", outputs = "Vdc1_m"}')
     reduce: ReduceTable | None = optional("A model of lower order by balanced truncation.", "reduce = {order = 2}")
     compare: Name | None = optional("Another model, shipped or a path, to which gap and nu-gap are computed.", 'compare = "vsc-hvdc-avm"')
     scale: Sizes = optional("By input or output: the size that counts as 1 in norms, gaps and the reduction.",
-        "scale = {Vdcref1 = 0.02}", "the signal's", default={})
-    formula: Names | None = optional("Parameters that stay symbols in the transfer functions.", 'formula = ["KPVDC", "KIVDC"]')
+        "scale = {Vdcref1 = 0.02}", "the signal's", default={}, of="input or output of [linearize]")
+    formula: Names | None = optional("Parameters that stay symbols in the transfer functions.", 'formula = ["KPVDC", "KIVDC"]',
+        of="parameter")
     locus: LocusTable | None = optional("Eigenvalues along values of a parameter or input.",
         'locus = {parameter = "KPVDC", min = 1, max = 100}')
     port: list[PortTable] = optional("Where impedances are seen: one table for each.", "[[linearize.port]]", default=[])
@@ -457,9 +459,10 @@ class ResponseTable(TomlTable):
     data: Name = key("The measured response: a text table, a Touchstone file, or a recording in time.", 'data = "scan.csv"')
     role: Role = optional('"fit" to estimate from it; "holdout" to validate the estimates with it.',
         'role = "holdout"', default="fit")
-    input: Name | None = optional("The input of the model that was perturbed.", 'input = "Vdcref1"')
-    output: Name | None = optional("The output of the model that responded.", 'output = "Vdc1"')
-    port: Name | None = optional("Instead of input and output: the port of [[linearize.port]] at which it was measured.", 'port = "dc-1"')
+    input: Name | None = optional("The input of the model that was perturbed.", 'input = "Vdcref1"', of="input")
+    output: Name | None = optional("The output of the model that responded.", 'output = "Vdc1"', of="output or signal")
+    port: Name | None = optional("Instead of input and output: the port of [[linearize.port]] at which it was measured.", 'port = "dc-1"',
+        of="port of [[linearize.port]]")
     kind: Literal["impedance", "admittance"] = optional("Whether a port's response is its impedance or its admittance.",
         'kind = "admittance"', default="impedance")
     columns: dict[Name, Name] = optional("By channel (dd, dq, qd, qq at a port of two axes): its column in the file.",
@@ -477,7 +480,7 @@ class ResponseTable(TomlTable):
     relative_noise: Positive | None = optional("The same as a share of the modulus.", "relative_noise = 0.01")
     band: Band | None = optional("Lowest and highest frequency that are compared.", "band = [0.5, 200]", "Hz")
     values: Numbers = optional("Values of inputs at the operating point of the measurement.",
-        "values = {Pref2 = 0.5}", "the model's", default={})
+        "values = {Pref2 = 0.5}", "the model's", default={}, of="input")
     trim: TrimTable | None = optional("The operating point of the measurement by values of outputs.", "trim = {outputs = {P2 = 0.6}}")
 
     @model_validator(mode="after")
@@ -495,7 +498,7 @@ class ResponseTable(TomlTable):
 class SweepTable(TomlTable):
     """[[sweep]]: the values of one parameter, listed or spread over a range."""
 
-    parameter: Name = key("The parameter that is varied. Bounds in [parameters] do not limit it.", 'parameter = "KIVDC"')
+    parameter: Name = key("The parameter that is varied. Bounds in [parameters] do not limit it.", 'parameter = "KIVDC"', of="parameter")
     min: FiniteFloat | None = optional("Lowest value.", "min = 250", "the parameter's")
     max: FiniteFloat | None = optional("Highest value.", "max = 1500", "the parameter's")
     points: Annotated[int, Field(ge=2, le=1_000_000)] | None = optional("Number of values.", "points = 51")
@@ -531,7 +534,7 @@ class ScreeningTable(TomlTable):
     method: Literal["morris", "sobol"] = optional("Elementary effects of Morris, or indices of Sobol.",
         'method = "sobol"', default="morris")
     parameters: Names | None = optional("Parameters that are screened over their bounds. If left out, all in [parameters].",
-        'parameters = ["KPVDC", "KIVDC"]')
+        'parameters = ["KPVDC", "KIVDC"]', of="candidate")
     trajectories: Annotated[int, Field(ge=2, le=100_000)] = optional("Number of trajectories of Morris.", "trajectories = 20", default=20)
     samples: Annotated[int, Field(ge=2, le=1_048_576)] = optional("Number of base samples of Sobol, a power of 2.",
         "samples = 256", default=256)
@@ -543,15 +546,15 @@ class IdentifiabilityTable(TomlTable):
     """[identifiability]: asks for the stage. pair: two candidates whose common profile is wanted, on a grid."""
 
     pair: Two | None = optional(
-        "Two parameters whose joint profile likelihood is computed on a grid.", 'pair = ["KPVDC", "KIVDC"]')
+        "Two parameters whose joint profile likelihood is computed on a grid.", 'pair = ["KPVDC", "KIVDC"]', of="candidate")
 
 
 class GroupTable(TomlTable):
     """One group of [fit] groups: these parameters against these outputs of these experiments (all where left out)."""
 
-    parameters: Names = key("Parameters that this group estimates.", 'parameters = ["KPVDC", "KIVDC"]')
-    outputs: Names | None = optional("Outputs that it compares. If left out, all.", 'outputs = ["Irorder1"]')
-    experiments: Names | None = optional("Experiments that it uses. If left out, all.", 'experiments = ["step-up"]')
+    parameters: Names = key("Parameters that this group estimates.", 'parameters = ["KPVDC", "KIVDC"]', of="candidate")
+    outputs: Names | None = optional("Outputs that it compares. If left out, all.", 'outputs = ["Irorder1"]', of="measured output")
+    experiments: Names | None = optional("Experiments that it uses. If left out, all.", 'experiments = ["step-up"]', of="experiment")
 
 
 Whitening = Annotated[Literal["no", "pre-event", "residual"],
@@ -564,9 +567,10 @@ class FitTable(TomlTable):
     mode: Literal["simultaneous", "individual"] = optional("All parameters together, or one group after another.",
         'mode = "individual"', default="simultaneous")
     groups: list[GroupTable] = optional('The groups of mode "individual": one controller each.', "[[fit.groups]]", default=[])
-    optimiser: Name = optional("trust-region, least-squares or l-bfgs-b.", 'optimiser = "least-squares"', default="trust-region")
+    optimiser: Name = optional("trust-region, least-squares or l-bfgs-b.", 'optimiser = "least-squares"', default="trust-region",
+        of="optimiser")
     loss: Name = optional("Weight of large residuals: linear (least squares), or a robust loss such as huber.",
-        'loss = "huber"', default="linear")
+        'loss = "huber"', default="linear", of="loss")
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = optional(
         "Runs of the optimiser from different starts. If left out, 8; more follow, up to 64, where one start alone reached the "
         "lowest cost, or where the lowest is more than the known noise and others ended higher.",
@@ -596,14 +600,15 @@ class DiagnoseTable(TomlTable):
     """[diagnose]: which effects to try and where, and what is of no interest."""
 
     effects: Annotated[Literal["all"] | list[Name], BeforeValidator(_effect_names)] = optional(
-        'The effects that are tried: "all", or a list of names of the catalogue.', 'effects = ["lag", "delay", "limit"]', default="all")
+        'The effects that are tried: "all", or a list of names of the catalogue.', 'effects = ["lag", "delay", "limit"]', default="all",
+        of="effect")
     places: Names | None = optional("The insertion points that are tried, by name or pattern. If left out, all.",
         'places = ["avr.*", "gov.*"]')
     tolerance: Sizes = optional(
         "By output: the error below which a gap is of no interest. If left out, a tenth of the noise or a hundredth of the range, "
         "whichever is larger.",
-        "tolerance = {Vm = 0.002}", "the output's", default={})
-    material: Sizes = optional("Earlier name of `tolerance`.", "material = {P2 = 0.005}", "the output's", default={})
+        "tolerance = {Vm = 0.002}", "the output's", default={}, of="measured output")
+    material: Sizes = optional("Earlier name of `tolerance`.", "material = {P2 = 0.005}", "the output's", default={}, of="measured output")
     most: Annotated[int, Field(ge=1)] = optional("Largest number of effects that are sought beside each other.", "most = 1", default=3)
     thorough: bool = optional("True refits also the effects that promise little, if no other comes near the noise.",
         "thorough = true", default=False)
