@@ -11,19 +11,26 @@ import math
 import re
 import tomllib
 from collections.abc import Collection, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, TypeVar, Union
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, ClassVar, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, StringConstraints, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    StringConstraints,
+    ValidationError,
+    model_validator,
+)
 from pydantic.fields import FieldInfo
-from pydantic_core import PydanticCustomError, PydanticUndefined
-from typing_extensions import TypeAliasType
+from pydantic_core import CoreSchema, PydanticCustomError, PydanticUndefined, core_schema
 
 from hvdc_ident.errors import InputError, UnknownNameError, nearest, require_known
 
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
-Item = TypeVar("Item")
-ByName: Any = TypeAliasType("ByName", dict[Name, Union[Item, "ByName[Item]"]], type_params=(Item,))  # type: ignore
-"""Items by name, in which TOML nests the names of a component: gen.H is H in a table gen."""
 
 
 def key(
@@ -105,13 +112,34 @@ def check_names(table: TomlTable, known: Mapping[str, Collection[str]], place: s
                 check_names(item, known, f"{inner}{called if isinstance(value, list) else ''}.")
 
 
-def by_name(item: Any, *own: str) -> BeforeValidator:
-    """Return the validator of a table of items that makes `gen.H` of H in a table gen.
+THE_TABLE = {"$comment": "the table itself"}
+"""In the JSON Schema of `ByName`: the table of names itself, whose place only the schema of the whole file tells."""
 
-    own: keys by which a table is an item. Where items are tables, one that holds anything but tables is an item too.
+
+@dataclass(frozen=True)
+class ByName:
+    """Marks a table of items by name, in which TOML nests the names of components: `gen.H` is H in a table gen.
+
+    own: keys by which a table is an item. tables: whether items are tables, so that one that holds anything but tables is an
+    item too.
     """
-    tables = isinstance(item, type) and issubclass(item, BaseModel)
-    return BeforeValidator(lambda value: with_dots(value, own, tables), json_schema_input_type=ByName[item])
+
+    own: tuple[str, ...] = ()
+    tables: bool = False
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        flat = partial(with_dots, own=self.own, tables=self.tables)
+        return core_schema.no_info_before_validator_function(flat, handler(source))
+
+    def __get_pydantic_json_schema__(self, inner: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        schema = handler(inner)
+        nested: dict[str, Any] = {"type": "object", "minProperties": 1}
+        if self.own:
+            nested["not"] = {"anyOf": [{"required": [k]} for k in self.own]}
+        if self.tables:
+            nested["additionalProperties"] = {"type": "object"}
+        (pattern, item), *_ = schema["patternProperties"].items()
+        return {**schema, "patternProperties": {pattern: {"if": nested, "then": THE_TABLE, "else": item}}}
 
 
 def with_dots(value: Any, own: Sequence[str] = (), tables: bool = False) -> Any:

@@ -13,7 +13,7 @@ from typing import Any
 from hvdc_ident.files import write_text
 from hvdc_ident.model.card_schema import CardFile
 from hvdc_ident.study.schema import StudyFile
-from hvdc_ident.toml_tables import TomlTable
+from hvdc_ident.toml_tables import THE_TABLE, TomlTable
 
 FOLDER = "schema"
 """Folder beside a study in which `write_schemas` puts the schemas."""
@@ -47,7 +47,7 @@ def schema_text(name: str) -> str:
     """Return the text of the JSON Schema of a file, one of FILES."""
     schema = FILES[name].model_json_schema()
     for path, table in _tables(schema).items():
-        for key in _keys(table, schema["$defs"]):
+        for key in _keys(table):
             unit = f" Unit: {key.unit}." if key.unit else ""
             own = table["properties"][key.name]
             own["description"] = f"{key.text}{unit} Example: {key.example}"
@@ -55,13 +55,14 @@ def schema_text(name: str) -> str:
                 own.pop(word, None)
         table.pop("description", None)
         table["title"] = f"[{path}]" if path else f"{name.replace('-', ' ')} of hvdc_ident"
-    return json.dumps({"$schema": _DRAFT, **_without_null(schema)}, indent=1, ensure_ascii=False) + "\n"
+    placed = _with_places(_without_null(schema), schema["$defs"])
+    return json.dumps({"$schema": _DRAFT, **placed}, indent=1, ensure_ascii=False) + "\n"
 
 
 def reference(name: str) -> dict[str, list[Key]]:
     """Return the keys of every table of a file, one of FILES, by the table's path in it ("" for the top)."""
     schema = FILES[name].model_json_schema()
-    return {path: _keys(table, schema["$defs"]) for path, table in _tables(schema).items()}
+    return {path: _keys(table) for path, table in _tables(schema).items()}
 
 
 def _tables(schema: dict[str, Any]) -> dict[str, dict[str, Any]]:
@@ -71,7 +72,7 @@ def _tables(schema: dict[str, Any]) -> dict[str, dict[str, Any]]:
     def visit(path: str, table: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
         yield path, table
         for key, value in table["properties"].items():
-            for definition, named in _definitions_in(value, definitions):
+            for definition, named in _definitions_in(value):
                 if definition not in seen:
                     seen.add(definition)
                     inner = ".".join(filter(None, (path, key, "NAME" if named else "")))
@@ -80,22 +81,19 @@ def _tables(schema: dict[str, Any]) -> dict[str, dict[str, Any]]:
     return dict(visit("", schema))
 
 
-def _definitions_in(value: Any, definitions: dict[str, Any], named: bool = False) -> Iterator[tuple[str, bool]]:
+def _definitions_in(value: Any, named: bool = False) -> Iterator[tuple[str, bool]]:
     """Yield the tables that a value may hold, and whether they have names, as the values of a table do."""
-    if name := _target(value):
-        if "properties" in definitions[name]:
-            yield name, named
-        else:  # items by name, which may nest
-            yield from _definitions_in(_without(definitions[name], name), definitions, named)
+    if "$ref" in value:
+        yield value["$ref"].rpartition("/")[2], named
     for branch in value.get("anyOf", ()):
-        yield from _definitions_in(branch, definitions, named)
+        yield from _definitions_in(branch, named)
     if "items" in value:
-        yield from _definitions_in(value["items"], definitions, named)
+        yield from _definitions_in(value["items"], named)
     if item := _item(value):
-        yield from _definitions_in(item, definitions, True)
+        yield from _definitions_in(item, True)
 
 
-def _keys(table: dict[str, Any], definitions: dict[str, Any]) -> list[Key]:
+def _keys(table: dict[str, Any]) -> list[Key]:
     required = table.get("required", ())
     return [
         Key(
@@ -105,7 +103,7 @@ def _keys(table: dict[str, Any], definitions: dict[str, Any]) -> list[Key]:
             unit=own.get("unit", ""),
             required=name in required,
             default="" if _is_absent(own.get("default")) else json.dumps(own["default"], ensure_ascii=False),
-            kind=_kind(own, definitions),
+            kind=_kind(own),
         )
         for name, own in table["properties"].items()
     ]
@@ -116,40 +114,28 @@ def _is_absent(default: Any) -> bool:
     return default is None or default in ({}, [], "") or default in (math.inf, -math.inf)
 
 
-def _target(schema: dict[str, Any]) -> str:
-    """Return the name of the definition that a schema refers to; empty where it does not."""
-    return str(schema.get("$ref", "")).rpartition("/")[2]
-
-
 def _item(schema: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the schema of the values of a table with free keys; None for another."""
+    """Return the schema of the values of a table with free keys, were none nested; None for another."""
     found = schema.get("additionalProperties") or next(iter(schema.get("patternProperties", {}).values()), None)
-    return found if isinstance(found, dict) else None
+    return found.get("else", found) if isinstance(found, dict) else None
 
 
-def _without(schema: dict[str, Any], name: str) -> dict[str, Any]:
-    """Return the definition of a table that nests itself, without its own name among its items."""
-    (pattern, item), *_ = schema["patternProperties"].items()
-    return {**schema, "patternProperties": {pattern: {"anyOf": [b for b in item["anyOf"] if _target(b) != name]}}}
-
-
-def _kind(schema: dict[str, Any], definitions: dict[str, Any]) -> str:
+def _kind(schema: dict[str, Any]) -> str:
     """Return the type of a key in words."""
-    if name := _target(schema):
-        named = definitions[name]
-        return "table" if "properties" in named else _kind(_without(named, name), definitions)
+    if "$ref" in schema:
+        return "table"
     if "const" in schema:
         return json.dumps(schema["const"])
     if "enum" in schema:
         return " or ".join(json.dumps(v) for v in schema["enum"])
     if "anyOf" in schema:
         branches = (s for s in schema["anyOf"] if s.get("type") != "null")
-        return " or ".join(dict.fromkeys(_kind(s, definitions) for s in branches))
+        return " or ".join(dict.fromkeys(_kind(s) for s in branches))
     if schema.get("type") == "array":
-        return f"list of {_plural(_kind(schema.get('items', {}), definitions))}"
+        return f"list of {_plural(_kind(schema.get('items', {})))}"
     if schema.get("type") == "object":
         item = _item(schema)
-        return f"table of {_plural(_kind(item, definitions))}" if item else "table"
+        return f"table of {_plural(_kind(item))}" if item else "table"
     words = {"string": "text", "number": "number", "integer": "whole number", "boolean": "true or false"}
     limits = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
     ranges = "".join(f" {word} {schema[name]:.10g}" for name, word in limits.items() if name in schema)
@@ -169,3 +155,21 @@ def _without_null(schema: Any) -> Any:
     result = {k: _without_null(v) for k, v in schema.items()}
     branches = result.get("anyOf")
     return {**result.pop("anyOf")[0], **result} if isinstance(branches, list) and len(branches) == 1 else result
+
+
+def _with_places(schema: Any, definitions: dict[str, Any], place: str = "#", table: str = "#") -> Any:
+    """Return a schema in which a table of names refers to itself by its place, and shows editors the keys of its items.
+
+    definitions: of the whole. Editors complete what stands in `properties`, and do not look into `else`.
+    """
+    if schema == THE_TABLE:
+        return {"$ref": table}
+    if isinstance(schema, list):
+        return [_with_places(s, definitions, f"{place}/{k}", table) for k, s in enumerate(schema)]
+    if not isinstance(schema, dict):
+        return schema
+    if "patternProperties" in schema:
+        table = place
+    result = {k: _with_places(v, definitions, f"{place}/{k}", table) for k, v in schema.items()}
+    item = schema.get("else", {}).get("$ref", "").rpartition("/")[2]
+    return {"properties": _without_null(definitions[item]["properties"]), **result} if item else result

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, StringConstraints, model_validator
 
-from hvdc_ident.toml_tables import ByName, Name, TomlTable, by_name, key, optional, with_dots, wrong
+from hvdc_ident.toml_tables import ByName, Name, TomlTable, key, optional, with_dots, wrong
 
 
 def _column_by_name(value: Any) -> Any:
@@ -109,9 +109,10 @@ Two = Annotated[list[Name], Field(min_length=2, max_length=2)]
 Three = Annotated[list[Name], Field(min_length=3, max_length=3)]
 Range = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 Band = Annotated[list[NotNegative], Field(min_length=2, max_length=2), AfterValidator(_rising)]
-Columns = Annotated[dict[Name, Name], BeforeValidator(_column_by_name, json_schema_input_type=Names | ByName[Name])]
-Numbers = Annotated[dict[Name, FiniteFloat], by_name(FiniteFloat)]
-Sizes = Annotated[dict[Name, Positive], by_name(Positive)]
+Texts = Annotated[dict[Name, Name], ByName()]
+Columns = Annotated[dict[Name, Name], BeforeValidator(_column_by_name, json_schema_input_type=Names | Texts)]
+Numbers = Annotated[dict[Name, FiniteFloat], ByName()]
+Sizes = Annotated[dict[Name, Positive], ByName()]
 Interpolation = Literal["hold", "linear"]
 Role = Literal["fit", "holdout"]
 Spacing = Literal["linear", "log"]
@@ -297,7 +298,7 @@ class NoiseTable(TomlTable):
 
 Noise = Annotated[float | NoiseTable, BeforeValidator(_known_noise)]
 Interpolations = Annotated[Interpolation | dict[Name, Interpolation],
-    BeforeValidator(_known_interpolation, json_schema_input_type=Interpolation | ByName[Interpolation])]
+    BeforeValidator(_known_interpolation, json_schema_input_type=Interpolation | Annotated[dict[Name, Interpolation], ByName()])]
 
 
 class ExperimentTable(TomlTable):
@@ -312,7 +313,7 @@ class ExperimentTable(TomlTable):
         'inputs = ["Vdcref1", "Pref2"]', default={}, of="input")
     outputs: Columns = key("The model's outputs that are compared: a list of names, or a table from names to columns.",
         'outputs = {Irorder1 = "I:REG:1"}', of="output")
-    noise: Annotated[dict[Name, Noise], by_name(NotNegative | NoiseTable, "column")] = optional(
+    noise: Annotated[dict[Name, Noise], ByName(own=("column",))] = optional(
         "Standard deviation of the noise of an output, or the column that holds one for each row. If left out, estimated before the event.",
         "noise = {Irorder1 = 1e-4}", "the model's", default={}, of="measured output")
     event: FiniteFloat | None = optional("Instant at which an input first moves. If left out, found from the inputs.", "event = 0.1", "s")
@@ -324,7 +325,7 @@ class ExperimentTable(TomlTable):
         "Inputs that stand at the level of a recorded output before the event: the references of a plant that is played back are "
         "found from them.",
         'trim = {P0 = "P", Q0 = "Q"}', default={}, of="input")
-    columns: Annotated[dict[Name, ColumnTable], by_name(ColumnTable)] = optional(
+    columns: Annotated[dict[Name, ColumnTable], ByName(tables=True)] = optional(
         "By signal of the model: its column in the file and the conversion to the model's unit.",
         'columns = {Irorder1 = {name = "I:REG:1", unit = "kA", scale = 5.54}}', default={}, of="signal of the experiment")
     nuisance: list[Name] = optional(
@@ -333,7 +334,7 @@ class ExperimentTable(TomlTable):
         'nuisance = ["time-shift", "Pref2"]', default=[], of="nuisance")
     drive: Columns = optional("Play-in: signals that follow their recorded columns instead of their equations.",
         'drive = {Vac1 = "V1"}', default={}, of="insertion point")
-    instrument: Annotated[dict[Name, InstrumentTable], by_name(InstrumentTable)] = optional(
+    instrument: Annotated[dict[Name, InstrumentTable], ByName(tables=True)] = optional(
         "By output: the recording chain, applied to the simulated output.",
         "instrument = {P2 = {window-mean = 0.02, delay = 0.001}}", default={}, of="measured output")
     phases: list[PhasesTable] = optional("Quantities that are computed from recorded phases: one table for each set.",
@@ -355,7 +356,7 @@ class ExperimentTable(TomlTable):
 class TrimTable(TomlTable):
     """[linearize] trim: the values that outputs are to have at the operating point, and the inputs that are set for it."""
 
-    outputs: Annotated[dict[Name, FiniteFloat], Field(min_length=1), by_name(FiniteFloat)] = key(
+    outputs: Annotated[dict[Name, FiniteFloat], Field(min_length=1), ByName()] = key(
         "Values that outputs are to have at the operating point.",
         "trim = {outputs = {P2 = 0.6}}", "the model's", of="output")
     inputs: Numbers = optional("Values of other inputs at the operating point.",
@@ -644,7 +645,7 @@ class StudyFile(TomlTable):
     name: Name | None = optional("Name of the study in the report and the results. If left out, the name of the file.",
         'name = "vdc-steps"')
     model: ModelTable = key("The model and what differs from it.", 'model = {source = "vsc-hvdc-link"}')
-    parameters: Annotated[dict[Name, ParameterTable], by_name(ParameterTable, "prior")] = optional(
+    parameters: Annotated[dict[Name, ParameterTable], ByName(own=("prior",), tables=True)] = optional(
         "The parameters that may be estimated, by name. All others keep the model's values.", "[parameters]", default={})
     experiment: list[ExperimentTable] = optional("The recordings: one table for each.", "[[experiment]]", default=[])
     response: list[ResponseTable] = optional("Measured frequency responses: one table for each.", "[[response]]", default=[])

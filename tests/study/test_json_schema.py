@@ -57,7 +57,7 @@ def _accepts(name: str, table: dict[str, Any]) -> bool:
 def test_schemas_are_schemas_that_describe_every_key(name: str) -> None:
     schema = VALIDATORS[name].schema
     jsonschema.Draft202012Validator.check_schema(schema)
-    for table in (schema, *(d for n, d in schema["$defs"].items() if not n.startswith("ByName"))):
+    for table in (schema, *schema["$defs"].values()):
         assert all(p["description"].count("Example: ") == 1 for p in table["properties"].values())
 
 
@@ -160,6 +160,15 @@ def test_names_of_components_may_be_nested_wherever_a_table_is_by_name() -> None
         assert not _accepts("study", study)
         with pytest.raises(InputError):
             checked(study, "study.toml")
+
+
+@pytest.mark.parametrize("line", ["K = {mn = 5}", "gen.K = {mn = 5}", "gen = {avr = {K = {start = 1, mn = 5}}}"])
+def test_an_editor_is_told_which_key_is_unknown_and_which_there_are(line: str) -> None:
+    study = tomllib.loads(f'schema = 1\n[model]\nsource = "plant.toml"\n[parameters]\n{line}\n')
+    (error,) = VALIDATORS["study"].iter_errors(study)
+    assert "'mn' was unexpected" in error.message
+    ((_, item),) = VALIDATORS["study"].schema["properties"]["parameters"]["patternProperties"].items()
+    assert item["properties"] == VALIDATORS["study"].schema["$defs"]["ParameterTable"]["properties"]
 
 
 def test_a_component_needs_no_more_than_its_source() -> None:
