@@ -19,6 +19,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    FiniteFloat,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
     StringConstraints,
@@ -31,6 +32,8 @@ from pydantic_core import CoreSchema, PydanticCustomError, PydanticUndefined, co
 from hvdc_ident.errors import InputError, UnknownNameError, nearest, require_known
 
 Name = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
+
+NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 
 
 def key(
@@ -212,9 +215,18 @@ EXPECTED = {
     "int_type": "a whole number",
     "bool_type": "true or false",
     "list_type": "a list: [...]",
-    "dict_type": "a table: {name = ...}",
+    "dict_type": "a table: {{name = ...}}",
     "finite_number": "a finite number",
+    "greater_than": "a number above {gt:g}",
+    "greater_than_equal": "a number of at least {ge:g}",
+    "less_than_equal": "a number of at most {le:g}",
+    "literal_error": "one of {expected}",
+    "too_short": "{min_length} or more entries",
+    "too_long": "{max_length} entries or fewer",
+    "string_too_short": "a name",
+    "string_too_long": "at most {max_length} characters",
 }
+"""What was expected, by pydantic's kind of error and in its numbers."""
 
 
 def validated(kind: type[Table], table: dict[str, Any], where: str, error: type[InputError]) -> Table:
@@ -229,7 +241,7 @@ def validated(kind: type[Table], table: dict[str, Any], where: str, error: type[
         order = {"unknown_key": 0, "missing_key": 1}
         problem: Any = min(e.errors(include_url=False), key=lambda p: order.get(p["type"], 2))
     loc = [part for part in problem["loc"] if not _is_branch(part)]
-    what, expected, got, hint = _told(problem, loc)
+    what, expected, got, hint = _told(problem)
     inner, _, rest = what.partition(": ")
     if problem["type"] == "value_error" and rest and inner.replace("-", "_").isidentifier():
         what, loc = rest, loc if loc and inner == loc[-1] else [*loc, inner]
@@ -238,63 +250,33 @@ def validated(kind: type[Table], table: dict[str, Any], where: str, error: type[
     raise kind_of_error(what, where=place, expected=expected, got=got, hint=hint) from None
 
 
-def _told(problem: Mapping[str, Any], loc: Sequence[int | str]) -> tuple[str, str, str, str]:
+def _told(problem: Mapping[str, Any]) -> tuple[str, str, str, str]:
     """Return what is wrong, what was expected, what was found and what to try."""
     kind, found, ctx = problem["type"], problem["input"], problem.get("ctx") or {}
-    got = shown(found)
-    match kind:
-        case "unknown_key":
-            near = nearest(ctx["key"], ctx["known"])
-            hint = f"did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
-            known = f"one of {', '.join(ctx['known'])}" if ctx["known"] else "no keys at all"
-            return f"unknown key '{ctx['key']}'", known, "", ctx["hint"] or hint
-        case "missing_key":
-            return f"'{ctx['key']}' is missing", ctx["example"], "", ""
-        case "value_error":
-            text, _, hint = str(ctx["error"]).partition(". Try: ")
-            return text, "", "", hint
-        case "wrong":
-            return ctx["what"], ctx["expected"], got, ctx["hint"]
-        case "string_too_short":
-            got = "an empty text"
-        case "string_pattern_mismatch" if "\\w" not in ctx["pattern"] and re.search(r"[\t\n\r\f\b]", str(found)):
-            hint = "a path in single quotes or with /: in double quotes \\t is a tab and \\n a line break"
-            return "a value that does not fit", "a name without control characters", got, hint
+    if kind == "unknown_key":
+        near = nearest(ctx["key"], ctx["known"])
+        meant = f"did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
+        return f"unknown key '{ctx['key']}'", f"one of {', '.join(ctx['known'])}", "", ctx["hint"] or meant
+    if kind == "missing_key":
+        return f"'{ctx['key']}' is missing", ctx["example"], "", ""
+    if kind == "value_error":
+        text, _, hint = str(ctx["error"]).partition(". Try: ")
+        return text, "", "", hint
+    if kind == "wrong":
+        return ctx["what"], ctx["expected"], shown(found), ctx["hint"]
+    what = "a value of the wrong kind" if kind.endswith("_type") else "a value that does not fit"
+    expected, hint = EXPECTED.get(kind, kind.replace("_", " ")).format(**ctx), ""
+    if kind == "literal_error":
+        expected = expected.replace(" or ", ", ")
     if kind == "float_type" and hasattr(found, "isoformat"):  # a date or time of day of TOML
-        return "a value of the wrong kind", "a number", got, "a time in s, as the time in the data counts"
-    if kind in EXPECTED:
-        return (
-            f"a value {'that does not fit' if kind == 'finite_number' else 'of the wrong kind'}",
-            EXPECTED[kind],
-            got,
-            "",
-        )
-    return "a value that does not fit", _wanted(kind, ctx), got, ""
-
-
-def _wanted(kind: str, ctx: Mapping[str, Any]) -> str:
-    match kind:
-        case "literal_error":
-            return f"one of {ctx['expected']}".replace(" or ", ", ")
-        case "greater_than":
-            return f"a number above {ctx['gt']:g}"
-        case "greater_than_equal":
-            return f"a number of at least {ctx['ge']:g}"
-        case "less_than_equal":
-            return f"a number of at most {ctx['le']:g}"
-        case "too_short":
-            return f"at least {ctx['min_length']} entries" if ctx["min_length"] > 1 else "at least one entry"
-        case "too_long":
-            return f"{ctx['max_length']} entries"
-        case "string_too_short":
-            return "a name"
-        case "string_too_long":
-            return f"at most {ctx['max_length']} characters"
-        case "string_pattern_mismatch" if "\\w" in ctx["pattern"]:
-            return "letters, digits, blanks and - + . _ only, for files are named after it"
-        case "string_pattern_mismatch":
-            return "a name without control characters"
-    return kind.replace("_", " ")
+        hint = "a time in s, as the time in the data counts"
+    if kind == "string_pattern_mismatch":
+        is_file = "\\w" in ctx["pattern"]
+        expected = "letters, digits, blanks and - + . _ only, for files are named after it"
+        expected = expected if is_file else "a name without control characters"
+        if not is_file and re.search(r"[\t\n\r\f\b]", found):
+            hint = "a path in single quotes or with /: in double quotes \\t is a tab and \\n a line break"
+    return what, expected, shown(found), hint
 
 
 def _is_branch(part: int | str) -> bool:

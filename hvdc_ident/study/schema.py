@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, FiniteFloat, StringConstraints, model_validator
 
-from hvdc_ident.toml_tables import ByName, Name, TomlTable, key, optional, with_dots, wrong
+from hvdc_ident.toml_tables import ByName, Name, NotNegative, TomlTable, key, optional, with_dots, wrong
 
 
 def _column_by_name(value: Any) -> Any:
@@ -100,7 +100,6 @@ Line = Annotated[str, StringConstraints(max_length=300, pattern=r"^[^\x00-\x1f\x
 FileName = Annotated[str, StringConstraints(min_length=1, max_length=100, pattern=r"^\w[\w .+-]*$")]
 Unit = Annotated[str, StringConstraints(max_length=50)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
-NotNegative = Annotated[FiniteFloat, Field(ge=0)]
 Names = Annotated[list[Name], Field(min_length=1)]
 NameOrNames = Annotated[Names, BeforeValidator(_as_list, json_schema_input_type=Name | Names)]
 OneOrThree = Annotated[list[Name], BeforeValidator(_one_or_three, json_schema_input_type=Name | Names)]
