@@ -15,11 +15,14 @@ LARGEST = 1_000_000  # bytes; a study of a thousand experiments has a third of i
 
 
 def is_study_file(path: Path) -> bool:
-    """Return whether a file is a study and no model card: TOML with a table [model]."""
+    """Return whether a file is a study and no model card: TOML with a table [model], or what was to be that."""
     try:
-        return isinstance(_toml(path.read_bytes(), path.name).get("model"), dict)
-    except (OSError, StudyError):
+        content = path.read_bytes()
+        return isinstance(_toml(content, path.name).get("model"), dict)
+    except OSError:
         return False
+    except StudyError:
+        return b"[model" in content
 
 
 def parse_study(content: bytes, path: Path) -> StudyFile:
