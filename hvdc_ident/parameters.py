@@ -30,12 +30,15 @@ class Parameter:
             object.__setattr__(self, name, float(getattr(self, name)))
         if math.isnan(self.value):
             raise ModelError("a parameter's value is not a number")
-        if not self.min <= self.max or math.isnan(self.scale) or self.scale < 0:
+        if not self.min <= self.max:
             raise ModelError(
-                "a parameter's bounds or scale are wrong",
-                expected="min <= max and scale >= 0",
-                got=f"min {self.min:g}, max {self.max:g}, scale {self.scale:g}",
+                "a parameter's bounds are in the wrong order",
+                expected="min <= max",
+                got=f"min {self.min:g}, max {self.max:g}",
+                hint=f"min = {self.max:g}, max = {self.min:g}",
             )
+        if math.isnan(self.scale) or self.scale < 0:
+            raise ModelError("a parameter's scale is wrong", expected="a number of at least 0", got=f"{self.scale:g}")
         if not self.min <= self.value <= self.max:
             raise ModelError(
                 "a parameter's value lies outside its own bounds",

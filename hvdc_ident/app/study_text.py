@@ -14,6 +14,7 @@ from typing import Any
 
 from hvdc_ident.errors import StudyError
 from hvdc_ident.model.card import toml_key, toml_string
+from hvdc_ident.toml_tables import parsed
 
 TABLES = ("inputs", "outputs", "columns")
 """Keys of an experiment that are tables; a list of names stands for a table of names that are their own columns."""
@@ -72,10 +73,7 @@ def toml_value(value: Any) -> str:
 
 
 def _read(text: str, where: str) -> dict[str, Any]:
-    try:
-        return tomllib.loads(text)
-    except ValueError as error:
-        raise StudyError(f"not valid TOML: {error}", where=where, hint="mend this line, then write again") from None
+    return parsed(text, "the study file", where, StudyError, "mend this line, then write again")
 
 
 def _statements(text: str, where: str) -> Iterator[Statement]:

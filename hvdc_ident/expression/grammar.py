@@ -109,10 +109,34 @@ def _stray(text: str, at: int) -> str:
         return "'.' stands between the parts of a name only, as in gen.H"
     if character == "^":
         return "'^' is no part of an expression; a power is written **"
-    if character in "&|!~=":
+    if character in "?&|!~":
+        return f"'{character}' is no part of an expression; {_instead(character, text)}"
+    if character == "=":
         return f"'{character}' is no part of an expression; a condition is one of {' '.join(COMPARISONS)}"
     shown = character if character.isprintable() and character.isascii() else f"U+{ord(character):04X}"
     return f"the character {shown} is no part of an expression"
+
+
+_WORDS = {
+    "if": "a if c else b is written where(c, a, b)",
+    "else": "a if c else b is written where(c, a, b)",
+    "?": "c ? a : b is written where(c, a, b)",
+    "and": "where(c and d, a, b) is written where(c, where(d, a, b), b)",
+    "or": "where(c or d, a, b) is written where(c, a, where(d, a, b))",
+    "not": "where(not c, a, b) is written where(c, b, a)",
+}
+"""What other languages choose by, and how it is written here."""
+_MARKS = {"?": "?", "&": "and", "|": "or", "!": "not", "~": "not"}
+_CHOICES = (r"(?P<a>.+?)\bif\b(?P<c>.+?)\belse\b(?P<b>.+)", r"(?P<c>.+?)\?(?P<a>.+?):(?P<b>.+)")
+
+
+def _instead(word: str, text: str) -> str:
+    """Return how a choice of another language is written: this one, where it is the whole text."""
+    for pattern in _CHOICES if len(text) <= 200 else ():
+        found = re.fullmatch(pattern, text.strip())
+        if found and not re.search(r"\b(if|and|or|not)\b|[?&|!]", "".join(found.groups())):
+            return f"write where({found['c'].strip()}, {found['a'].strip()}, {found['b'].strip()})"
+    return _WORDS[_MARKS.get(word, word)]
 
 
 class SyntaxTree:
@@ -160,11 +184,13 @@ class _Scan:
         self.open: list[_Level] = []
         self.depth = self.calls = 0
         self.compared = False
+        self.before = ""
 
     def run(self, found: list[Token]) -> None:
         """Raise an ExpressionError at the first token that cannot stand where it does."""
         before, value_due = Token("start", "", 0), True
         for token, following in pairwise((*found, found[-1])):
+            self.before = before.text
             if token.text == "(" and before.kind == "name":
                 self._open(token, call=True, lists=before.text == "table")
                 value_due = True
@@ -237,6 +263,11 @@ class _Scan:
         if token.text in ("[", "]"):
             self.source.fail(
                 f"a list stands in table only, as in table(x, [0, 1], [0, 2]), not '{token.text}'", token.position
+            )
+        word = "not" if self.before == "not" else token.text
+        if word in _WORDS:
+            self.source.fail(
+                f"'{word}' is no part of an expression; {_instead(word, self.source.text)}", token.position
             )
         shown = token.text if token.kind == "end" else f"'{token.text[:30]}'"
         self.source.fail(f"unexpected {shown}, expected {expected}", token.position)

@@ -45,12 +45,22 @@ class FitParameter:
             object.__setattr__(self, name, float(getattr(self, name)))
         if math.isnan(self.given):
             object.__setattr__(self, "given", self.start)
-        if not (self.min < self.max and self.min <= self.start <= self.max and math.isfinite(self.start)):
+        if not self.min < self.max:
+            turned = (
+                f"min = {self.max:g}, max = {self.min:g}" if self.max < self.min else "hold it if it is not to move"
+            )
             raise StudyError(
-                f"the start or the bounds of '{self.name}' are wrong",
-                expected="min < max and a finite start between them",
-                got=f"start {self.start:g}, min {self.min:g}, max {self.max:g}",
-                hint="hold the parameter if it is not to move",
+                f"the bounds of '{self.name}' hold no range",
+                expected="min < max",
+                got=f"min {self.min:g}, max {self.max:g}",
+                hint=turned,
+            )
+        if not (self.min <= self.start <= self.max and math.isfinite(self.start)):
+            raise StudyError(
+                f"the search for '{self.name}' begins outside its bounds",
+                expected=f"a finite start in [{self.min:g}, {self.max:g}]",
+                got=f"{self.start:g}",
+                hint="a start within the bounds, or wider bounds",
             )
 
     @classmethod
@@ -58,8 +68,17 @@ class FitParameter:
         """Return the unknown that a model's parameter is, given and started at its value; with some of the fields changed."""
         value = changes.get("given", parameter.value)
         fields = {"start": value, "given": value}
-        fields |= {"min": parameter.min, "max": parameter.max, "scale": parameter.scale}
-        return cls(name, **{**fields, **changes})
+        fields |= {"min": parameter.min, "max": parameter.max, "scale": parameter.scale, **changes}
+        low, high = fields["min"], fields["max"]
+        if "start" not in changes and low < high and not low <= value <= high:
+            side, bound = ("below min", "min") if value < low else ("above max", "max")
+            raise StudyError(
+                f"the search for '{name}' begins at the given value, {side} = {fields[bound]:g}",
+                expected=f"a start in [{low:g}, {high:g}]",
+                got=f"{value:g}",
+                hint=f"start = ... within the bounds, or {bound} = {value:g}",
+            )
+        return cls(name, **fields)
 
     def on_bound(self, value: float) -> bool:
         """Return whether a value lies on one of the bounds."""

@@ -5,28 +5,23 @@ Kinds of error and windows after IEC 61400-27-2.
 
 from __future__ import annotations
 
-import math
-import tomllib
-from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
 
 from hvdc_ident.errors import StudyError, require_known
 from hvdc_ident.immutable import FrozenMap
 
 WINDOWS = ("before", "during", "after")
-ERRORS = ("max", "mean", "mean_absolute")
-LENGTHS = ("before", "gap_before", "gap_start", "gap_end", "gap_cleared", "after", "settling")
 DEFAULT = "set-point-step-simulation"
+LARGEST = 1_000_000  # bytes of a file
 
 
 @dataclass(frozen=True)
 class ToleranceProfile:
     """A tolerance profile.
 
-    windows: lengths in s by name (`LENGTHS`), settling as a share. limits: by window and kind of error, in `unit`.
+    windows: lengths in s by name, settling as a share. limits: by window and kind of error, in `unit`.
     version, source, notes: where the numbers come from.
     """
 
@@ -67,43 +62,16 @@ def tolerance(name: str = DEFAULT, folder: Path | None = None) -> ToleranceProfi
 
 
 def _profile(content: bytes, where: str) -> ToleranceProfile:
-    try:
-        table = tomllib.loads(content.decode("utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as e:
-        raise StudyError("the tolerance profile is not TOML", where=where, got=str(e)) from None
-    _keys(table, ("schema", "name", "version", "title", "source", "notes", "windows", "limits"), where)
-    if table["schema"] != 1:
-        raise StudyError(
-            "this version of hvdc_ident does not read this schema",
-            where=where,
-            expected="1",
-            got=str(table["schema"]),
-            hint="schema = 1, or the version of hvdc_ident that the file was written for",
-        )
-    windows, limits = table["windows"], table["limits"]
-    _keys(windows, LENGTHS, f"{where}, windows")
-    _keys(limits, ("unit", *WINDOWS), f"{where}, limits")
-    for name in WINDOWS:
-        _keys(limits[name], ERRORS, f"{where}, limits.{name}")
-    texts = {k: str(table[k]) for k in ("name", "version", "title", "source", "notes")}
+    from hvdc_ident.fit.tolerance_file import ProfileFile
+    from hvdc_ident.toml_tables import decoded, parsed, require_schema, validated
+
+    what = "the tolerance profile"
+    table = parsed(decoded(content, what, where, LARGEST, StudyError), what, where, StudyError)
+    require_schema(table, 1, what, where, StudyError)
+    file = validated(ProfileFile, table, where, StudyError)
     return ToleranceProfile(
-        **texts,
-        windows=_numbers(windows, f"{where}, windows"),
-        limits=FrozenMap({n: _numbers(limits[n], f"{where}, limits.{n}") for n in WINDOWS}),
-        unit=str(limits["unit"]),
+        **{k: getattr(file, k) for k in ("name", "version", "title", "source", "notes")},
+        windows=FrozenMap(file.windows.model_dump()),
+        limits=FrozenMap({n: FrozenMap(getattr(file.limits, n).model_dump()) for n in WINDOWS}),
+        unit=file.limits.unit,
     )
-
-
-def _keys(table: Any, wanted: tuple[str, ...], where: str) -> None:
-    if not isinstance(table, Mapping) or set(table) != set(wanted):
-        got = ", ".join(table) if isinstance(table, Mapping) else type(table).__name__
-        raise StudyError("a tolerance profile's keys are wrong", where=where, expected=", ".join(wanted), got=got)
-
-
-def _numbers(table: Mapping[str, Any], where: str) -> FrozenMap[float]:
-    for name, value in table.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value >= 0):
-            raise StudyError(
-                f"'{name}' is wrong", where=where, expected="a finite number, not negative", got=repr(value)
-            )
-    return FrozenMap({k: float(v) for k, v in table.items()})

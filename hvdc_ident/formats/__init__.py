@@ -322,6 +322,9 @@ def _usable_file(path: str | os.PathLike[str]) -> Path:
     return file
 
 
+SPREADSHEETS = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods", ".numbers")
+
+
 def _format_of(path: Path) -> Format:
     known = formats().values()
     for module in known:
@@ -330,6 +333,14 @@ def _format_of(path: Path) -> Format:
     for module in known:  # damaged: the format its name promises has the better message
         if path.suffix.lower() in module.SUFFIXES:
             return module
+    if path.suffix.lower() in SPREADSHEETS:
+        raise WaveformError(
+            "a spreadsheet, which may hold anything anywhere, is no file of waveforms",
+            where=str(path),
+            expected="columns under their names, the first of them the time, as CSV or Parquet",
+            got=f"'{path.suffix}'",
+            hint="save the sheet as CSV (UTF-8), without other tables and notes beside the columns",
+        )
     listed = "; ".join(f"{m.NAME} ({', '.join(m.SUFFIXES)}): {m.SUMMARY}" for m in known)
     raise WaveformError(
         "the file is of no known waveform format",

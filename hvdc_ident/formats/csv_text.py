@@ -38,6 +38,9 @@ _MAX_COLUMNS = 100_000
 _MAX_LINE = 32 * 1024**2  # characters
 _SEPARATORS = (";", "\t", ",")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_DATED = re.compile(r":|[^\W\d_]{3}.*\d|\d[-/ ]\w+[-/ ]\d|\d{1,2}\.\d{1,2}\.\d{2,4}\b|\d{8}[T ]\d")
+"""What a date or time of day looks like, in whatever order."""
+_DATES = "as in 2026-11-21 10:15:00.020, 21/11/2026 10:15:00 or 21-Nov-2026 10:15:00"
 _MISSING = {
     "", "nan", "-nan", "+nan", "na", "n/a", "#n/a", "#na", "#nv", "#n/d", "null", "none", "<na>", "1.#qnan", "-1.#qnan",
     "1.#ind", "-1.#ind", "--", "---", "n. def.", "non numérique", "non un numero reale",
@@ -437,7 +440,7 @@ def _clock_time(clock: Clock, cell: str, layout: _Layout, line: int) -> float:
         raise WaveformError(
             f"{error} where the time stands",
             where=f"{layout.path}, line {line}, {layout.column(layout.time)}",
-            expected="as in 2026-11-21 10:15:00.020, 21/11/2026 10:15:00 or 21-Nov-2026 10:15:00",
+            expected=_DATES,
             got=f"'{_short(cell)}'",
             hint="write the time in seconds",
         ) from None
@@ -479,13 +482,13 @@ def _number(cell: str, layout: _Layout, line: int, column: int) -> float:
     what = "an empty cell" if not cell else "a value that is not finite" if lowered[:3] in ("nan", "inf") else "text"
     if _NUMBER.fullmatch(cell):
         what = "a number too large"
-    if column == layout.time and ":" in cell:
+    if column == layout.time and _DATED.search(cell):
         raise WaveformError(
             "the time is a date in no known form",
             where=f"{layout.path}, line {line}, {layout.column(column)}",
-            expected="as in 2026-11-21 10:15:00.020, 21/11/2026 10:15:00 or 21-Nov-2026 10:15:00; or a number",
+            expected=f"{_DATES}; or a number",
             got=f"'{_short(cell)}'",
-            hint="write the dates with the month as a number, or the time in seconds",
+            hint="write the dates as year-month-day hour:minute:second, or the time in seconds",
         )
     raise WaveformError(
         f"{what} where a number belongs",

@@ -83,12 +83,12 @@ def _section(items: object, section: str, place: str) -> FrozenMap[Any]:
 
 def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
     if isinstance(value, kind):
-        given = {n: getattr(value, n) for n in keys_of(kind)}
+        given = {n: getattr(value, n) for n in _keys_of(kind)}
     elif isinstance(value, Mapping):
         given = dict(value)
     else:
         given = {main: value}
-    required_keys(given, kind, place)
+    _require_keys(given, kind, place)
     converted = {k: _field(kind, k, v, place) for k, v in given.items()}
     if isinstance(value, kind) and all(converted[k] is v for k, v in given.items()):
         return value
@@ -98,9 +98,9 @@ def _made(kind: type[Any], main: str, value: object, place: str) -> Any:
         raise e.at(place) from None
 
 
-def required_keys(given: Mapping[str, object], kind: type[Any], place: str) -> None:
+def _require_keys(given: Mapping[str, object], kind: type[Any], place: str) -> None:
     """Refuse keys that are no fields of the class, and the lack of a field without a default."""
-    known = keys_of(kind)
+    known = _keys_of(kind)
     for key in given:
         if key not in known:
             raise unknown_name("key", str(key), known, where=place)
@@ -114,7 +114,7 @@ def _read(kind: type[Any]) -> FrozenMap[bool]:
     return FrozenMap({f.name: f.default is MISSING and f.default_factory is MISSING for f in fields(kind)})
 
 
-keys_of = cast("Callable[[type[Any]], FrozenMap[bool]]", cache(_read))
+_keys_of = cast("Callable[[type[Any]], FrozenMap[bool]]", cache(_read))
 """`_read`, once a class: it is asked for every value of every model that is made."""
 
 

@@ -21,19 +21,6 @@ RESERVED = ("outputs",)
 
 
 @dataclass(frozen=True)
-class ComponentEntry:
-    """A component as a card states it.
-
-    source: a name on the shelf or a card's path. parameters: values, numbers or expressions. names: what its variables are called in
-    the whole, as of a `Component`; a text stands for {"*": text}.
-    """
-
-    source: str
-    parameters: Mapping[str, float | str] = field(default_factory=FrozenMap)
-    names: str | Mapping[str, str] = field(default_factory=FrozenMap)
-
-
-@dataclass(frozen=True)
 class Component:
     """A model as a part of another: its equations, and values of some of its parameters, numbers or expressions of the whole's.
 
@@ -53,13 +40,6 @@ class Connection:
 
     value: sp.Expr
     start: float | None = None
-
-
-PARTS: Mapping[str, tuple[type[Any], str, str]] = {
-    "components": (ComponentEntry, "source", "component"),
-    "connections": (Connection, "value", "connection"),
-}
-"""Sections of a card that a model does not have: the class of an entry, the field a plain value stands for, what one is called."""
 
 
 def assembled(

@@ -259,7 +259,11 @@ def _line(name: str, given: Any, value: float) -> dict[str, Any]:
     low, high = map(float, pair)
     if not low < high:
         raise StudyError(
-            "bounds in the wrong order", where=f"parameters, '{name}'", expected="min < max", got=f"({low:g}, {high:g})"
+            "bounds in the wrong order",
+            where=f"parameters, '{name}'",
+            expected="min < max",
+            got=f"({low:g}, {high:g})",
+            hint=f"({high:g}, {low:g})" if high < low else "leave it out if it is not to move",
         )
     bounds = {k: v for k, v in (("min", low), ("max", high)) if np.isfinite(v)}
     return bounds if low <= value <= high else bounds | {"start": float(np.clip(0.5 * (low + high), low, high))}

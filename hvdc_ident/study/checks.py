@@ -7,7 +7,7 @@ place that decides whether a stage's JSON is plausible.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,7 @@ from hvdc_ident.errors import (
 )
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.study import schema
+from hvdc_ident.toml_tables import check_names
 
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment
@@ -32,47 +33,69 @@ if TYPE_CHECKING:
 
 def check_questions(study: Study, where: str) -> None:
     """Raise UnknownNameError or StudyError where a stage's table names what is not there."""
-    s, model = study.settings, study.model
-    names = [e.name for e in study.experiments]
-    measured = list(dict.fromkeys(o for e in study.experiments for o in e.outputs))
+    s = study.settings
     if s.linearize:
-        require_known("input", s.linearize.inputs, model.inputs, f"{where}, linearize.inputs")
-        require_known("output", s.linearize.outputs, model.outputs, f"{where}, linearize.outputs")
-        check_linear(study, where)
+        _check_kind_of_model(s.linearize, study.model, f"{where}, linearize")
     for line in s.sweep:
         _free_line(line.parameter, s.parameters, f"{where}, sweep", local=True)
-        require_known("parameter", [line.parameter], model.parameters, f"{where}, sweep")
-        _check_sweep(line, model, where)
+    groups = enumerate(s.fit.groups if s.fit else (), start=1)
+    asked = {f"fit.groups number {k}.parameters": g.parameters for k, g in groups}
+    asked["screening.parameters"] = (s.screening.parameters or []) if s.screening else []
+    asked["identifiability.pair"] = (s.identifiability.pair or []) if s.identifiability else []
+    for place, names in asked.items():
+        for name in names:
+            _free_line(name, s.parameters, f"{where}, {place}")
+    check_names(s.model_copy(update={"experiment": [], "response": []}), _known_names(study), f"{where}, ")
+    for line in s.sweep:
+        _check_sweep(line, study.model, where)
     if s.sweep:
         from hvdc_ident.study.stages.sweep import sweep_axes
 
         sweep_axes(s.sweep, 0, f"{where}, sweep")
-    if s.screening:
-        _all_candidates(s.screening.parameters, study, f"{where}, screening.parameters")
-    if s.identifiability:
-        _all_candidates(s.identifiability.pair, study, f"{where}, identifiability.pair")
-    for number, group in enumerate(s.fit.groups if s.fit else (), start=1):
-        place = f"{where}, fit.groups number {number}"
-        _all_candidates(group.parameters, study, f"{place}.parameters")
-        require_known("measured output", group.outputs, measured, f"{place}.outputs")
-        require_known(
-            "experiment", group.experiments, [*names, *(r.name for r in study.responses)], f"{place}.experiments"
-        )
+    if s.linearize:
+        _check_linear(s.linearize, study, f"{where}, linearize")
+    if s.fit:
+        from hvdc_ident.fit.tolerance_profile import tolerance
+
+        with located(f"{where}, fit.tolerance"):
+            tolerance(s.fit.tolerance, study.path.parent)
+
+
+def _known_names(study: Study) -> dict[str, Collection[str]]:
+    """Return by kind of names those that a stage's table may hold."""
+    s, model = study.settings, study.model
+    asked = s.linearize or schema.LinearizeTable()
+    known: dict[str, Collection[str]] = {
+        **names_of_model(model),
+        "insertion point": model.insertion_points,
+        "input or output of [linearize]": [*(asked.inputs or model.inputs), *(asked.outputs or model.outputs)],
+        "candidate": study.candidates,
+        "measured output": list(dict.fromkeys(o for e in study.experiments for o in e.outputs)),
+        "experiment": [*(e.name for e in study.experiments), *(r.name for r in study.responses)],
+    }
     if s.fit:
         from hvdc_ident.fit.likelihood import LOSSES
         from hvdc_ident.fit.optimisers import catalogue
-        from hvdc_ident.fit.tolerance_profile import tolerance
 
-        require_known("optimiser", [s.fit.optimiser], catalogue(), f"{where}, fit.optimiser")
-        require_known("loss", [s.fit.loss], LOSSES, f"{where}, fit.loss")
-        with located(f"{where}, fit.tolerance"):
-            tolerance(s.fit.tolerance, study.path.parent)
+        known |= {"optimiser": catalogue(), "loss": LOSSES}
     if s.diagnose:
-        require_known("measured output", s.diagnose.tolerances, measured, f"{where}, diagnose.tolerance")
-        if s.diagnose.effects != "all":
-            from hvdc_ident.effects import effects
+        from hvdc_ident.effects import effects
 
-            require_known("effect", s.diagnose.effects, ["all", *effects()], f"{where}, diagnose.effects")
+        known["effect"] = ["all", *effects()]
+    return known
+
+
+def names_of_model(model: AnyModel) -> dict[str, Collection[str]]:
+    """Return the names of a model by kind, as the keys of a study say which they hold."""
+    signals = [*model.states, *model.signals, *model.algebraic]
+    return {
+        "input": model.inputs,
+        "output": model.outputs,
+        "parameter": model.parameters,
+        "input or parameter": [*model.inputs, *model.parameters],
+        "signal": signals,
+        "output or signal": [*model.outputs, *(signals if isinstance(model, Model) else ())],
+    }
 
 
 def _check_sweep(line: schema.SweepTable, model: AnyModel, where: str) -> None:
@@ -87,13 +110,6 @@ def _check_sweep(line: schema.SweepTable, model: AnyModel, where: str) -> None:
                 expected=f"values in [{parameter.min:g}, {parameter.max:g}]",
                 got=f"{value:g}",
             )
-
-
-def _all_candidates(names: Iterable[str] | None, study: Study, where: str) -> None:
-    """Raise where a name is no candidate, with the reason where it stands in [parameters] all the same."""
-    for name in names or ():
-        _free_line(name, study.settings.parameters, where)
-        require_known("candidate", [name], study.candidates, where)
 
 
 def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str, *, local: bool = False) -> None:
@@ -112,16 +128,10 @@ def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str
     )
 
 
-def check_linear(study: Study, where: str) -> None:
-    """Raise StudyError or UnknownNameError where [linearize] names what the model lacks."""
-    asked, model = study.settings.linearize, study.model
-    if asked is None:
-        return
-    place = f"{where}, linearize"
-    inner = [*model.states]
-    if isinstance(model, Model):
-        inner += [*model.signals, *model.algebraic]
-    elif asked.break_at or asked.plant or asked.port or asked.formula or asked.locus:
+def _check_kind_of_model(asked: schema.LinearizeTable, model: AnyModel, place: str) -> None:
+    """Raise StudyError where [linearize] asks for what only equations tell."""
+    of_equations = (asked.break_at, asked.plant, asked.port, asked.formula, asked.locus)
+    if not isinstance(model, Model) and any(of_equations):
         raise StudyError(
             "loops, ports, loci and formulas need the model's equations",
             where=place,
@@ -129,39 +139,27 @@ def check_linear(study: Study, where: str) -> None:
             got="an FMU",
             hint="leave break_at, plant, port, locus and formula out",
         )
-    trim = asked.trim
-    if trim is not None:
-        require_known("output", trim.outputs, model.outputs, f"{place}.trim.outputs")
-        require_known("input", trim.inputs, model.inputs, f"{place}.trim.inputs")
-        require_known("input or parameter", trim.free, [*model.inputs, *model.parameters], f"{place}.trim.free")
-    require_known("signal", asked.break_at, inner, f"{place}.break_at")
-    if asked.plant:
-        require_known("signal", [*asked.plant.inputs, *asked.plant.outputs], inner, f"{place}.plant")
-    channels = [*(asked.inputs or model.inputs), *(asked.outputs or model.outputs)]
-    require_known("input or output of [linearize]", asked.scale, channels, f"{place}.scale")
-    require_known("parameter", asked.formula, model.parameters, f"{place}.formula")
-    if asked.locus:
-        moved = [*model.parameters, *model.inputs]
-        require_known("parameter or input", [asked.locus.parameter], moved, f"{place}.locus.parameter")
+
+
+def _check_linear(asked: schema.LinearizeTable, study: Study, place: str) -> None:
+    """Raise StudyError or UnknownNameError for ports that do not fit, and where the compared model lacks a name."""
     for port in asked.port:
         _check_port(port, study, f"{place}.port '{port.name}'")
     names = [p.name for p in asked.port]
     doubled = next((n for n in names if names.count(n) > 1), None)
     if doubled is not None:
         raise StudyError(f"two ports are called '{doubled}'", where=place)
-    if study.compared is not None:
-        require_known(
-            "input", asked.inputs or model.inputs, study.compared.inputs, f"{place}.compare '{study.compared.name}'"
-        )
-        require_known("output", asked.outputs or model.outputs, study.compared.outputs, f"{place}.compare")
+    other, model = study.compared, study.model
+    if other is not None:
+        require_known("input", asked.inputs or model.inputs, other.inputs, f"{place}.compare '{other.name}'")
+        require_known("output", asked.outputs or model.outputs, other.outputs, f"{place}.compare '{other.name}'")
 
 
 def _check_port(port: schema.PortTable, study: Study, where: str) -> None:
+    """Raise ExpressionError or UnknownNameError for an expression of a port that the model has no value for."""
     from hvdc_ident.expression import parse
 
     model = study.model
-    assert isinstance(model, Model)
-    require_known("signal", port.source, model.insertion_points, f"{where}, source")
     known = [*model.inputs, *model.states, *model.signals, *model.algebraic, *model.parameters]
     for key, texts in (("voltage", port.voltage), ("current", port.current), ("angle", [port.angle])):
         for text in texts:

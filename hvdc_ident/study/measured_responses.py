@@ -11,14 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.errors import (
-    LinearizationError,
-    SteadyStateError,
-    StudyError,
-    located,
-    require_known,
-    unknown_name,
-)
+from hvdc_ident.errors import LinearizationError, SteadyStateError, StudyError, located, unknown_name
 from hvdc_ident.files import digest
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.immutable import FrozenMap
@@ -31,9 +24,11 @@ from hvdc_ident.linearize import (
     response_at_tones,
     response_from_record,
 )
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
+from hvdc_ident.study.checks import names_of_model
 from hvdc_ident.text import figures
+from hvdc_ident.toml_tables import check_names
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
@@ -74,21 +69,9 @@ def read_responses(
 
 def _checked(table: schema.ResponseTable, settings: schema.StudyFile, model: AnyModel, place: str) -> Port | None:
     """The port, where it is one. Raises where the table names what is not there."""
-    require_known("input", table.values, model.inputs, f"{place}.values")
-    if table.trim is not None:
-        require_known("output", table.trim.outputs, model.outputs, f"{place}.trim.outputs")
-        require_known("input", table.trim.inputs, model.inputs, f"{place}.trim.inputs")
-        require_known("input or parameter", table.trim.free, [*model.inputs, *model.parameters], f"{place}.trim.free")
-    if table.port is None:
-        assert table.input is not None and table.output is not None
-        inner = [*model.signals, *model.algebraic, *model.states] if isinstance(model, Model) else []
-        require_known("input", [table.input], model.inputs, f"{place}.input")
-        require_known("output", [table.output], [*model.outputs, *inner], f"{place}.output")
-        return None
     ports = {p.name: p for p in (settings.linearize.port if settings.linearize else ())}
-    if table.port not in ports:
-        raise unknown_name("port of [[linearize.port]]", table.port, ports, where=f"{place}.port")
-    return port_of(ports[table.port])
+    check_names(table, {**names_of_model(model), "port of [[linearize.port]]": ports}, f"{place}.")
+    return port_of(ports[table.port]) if table.port is not None else None
 
 
 def _response(table: schema.ResponseTable, port: Port | None, path: Path) -> MeasuredResponse:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -41,6 +41,7 @@ from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
+from hvdc_ident.toml_tables import check_names
 
 TIME_SHIFT = "time-shift"
 
@@ -152,13 +153,6 @@ def with_noise(
 
 def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> None:
     """Raises where the table names what the model does not have."""
-    signals = [*table.inputs, *table.outputs, *table.drive]
-    require_known("input", table.inputs, model.inputs, f"{place}.inputs")
-    require_known("output", table.outputs, model.outputs, f"{place}.outputs")
-    require_known("insertion point", table.drive, model.insertion_points, f"{place}.drive")
-    require_known("measured output", table.noise, table.outputs, f"{place}.noise")
-    require_known("measured output", table.instrument, table.outputs, f"{place}.instrument")
-    require_known("signal of the experiment", table.columns, ["time", *signals], f"{place}.columns")
     if any(n in model.parameters and n not in model.inputs for n in table.values):
         raise StudyError(
             "a parameter among the inputs held constant",
@@ -166,12 +160,16 @@ def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> 
             expected="inputs",
             hint="[model.values] for parameters",
         )
-    require_known("input", table.values, model.inputs, f"{place}.values")
-    require_known("input", table.trim, model.inputs, f"{place}.trim")
+    known: dict[str, Collection[str]] = {
+        "input": model.inputs,
+        "output": model.outputs,
+        "insertion point": model.insertion_points,
+        "measured output": table.outputs,
+        "signal of the experiment": ["time", *table.inputs, *table.outputs, *table.drive],
+        "nuisance": [TIME_SHIFT, *model.inputs, *table.drive, *model.states],
+    }
+    check_names(table, known, f"{place}.")
     require_known("measured output", table.trim.values(), table.outputs, f"{place}.trim")
-    require_known(
-        "nuisance", table.nuisance, [TIME_SHIFT, *model.inputs, *table.drive, *model.states], f"{place}.nuisance"
-    )
     if isinstance(table.interpolation, dict):
         require_known("input", table.interpolation, [*table.inputs, *table.drive], f"{place}.interpolation")
     for kind, names in (("values", table.values), ("drive", table.drive), ("trim", table.trim)):

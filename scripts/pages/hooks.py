@@ -14,7 +14,7 @@ from mkdocs.structure.files import File, Files
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
-from hvdc_ident.study.json_schema import NAMES, schema_text  # noqa: E402
+from hvdc_ident.study.json_schema import FILES, schema_text  # noqa: E402
 from pages import effects, gallery, notebook, reference, results, shelf  # noqa: E402
 
 PAGES: dict[str, Callable[[], str]] = {
@@ -33,7 +33,7 @@ PAGES: dict[str, Callable[[], str]] = {
 def made() -> dict[str, str]:
     """Return the text of every file that is made, by its place in the site's sources."""
     pages = {place: make() for place, make in PAGES.items()}
-    pages |= {f"schema/{name}.json": schema_text(name) for name in NAMES}
+    pages |= {f"schema/{name}.json": schema_text(name) for name in FILES}
     return pages | gallery.pages() | notebook.pages()
 
 

@@ -17,7 +17,8 @@ from hvdc_ident.expression import BLOCKS, FUNCTIONS
 from hvdc_ident.fit.likelihood import LOSSES
 from hvdc_ident.fit.optimisers import catalogue
 from hvdc_ident.formats import formats
-from hvdc_ident.study.json_schema import Key, card_keys, study_keys
+from hvdc_ident.study.json_schema import Key
+from hvdc_ident.study.json_schema import reference as tables_of
 
 HERE = Path(__file__).resolve().parent
 EXAMPLE = re.compile(r"^### (\S+)\n```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -48,8 +49,9 @@ def study_file() -> str:
         "[JSON Schema](../schema/study.json), by which editors such as VS Code with Even Better TOML complete and check keys.",
         "",
     ]
-    for path, keys in study_keys().items():
-        lines += [*_heading(path), *_table(keys, path), ""]
+    tables = tables_of("study")
+    for path, keys in tables.items():
+        lines += [*_heading(path, tables), *_table(keys, path or "study"), ""]
         if path == "response.trim":
             lines += ["`trim` in [linearize] has the same keys.", ""]
         if path == "experiment.phasors.voltage":
@@ -84,18 +86,19 @@ def model_card() -> str:
         *(f"| `{name}({', '.join(b.arguments)})` | {_cell(b.summary)} |" for name, b in BLOCKS.items()),
         "",
     ]
-    for section, keys in card_keys().items():
-        title = "## Top level" if section == "card" else f"## [{section}]"
+    for path, keys in tables_of("model-card").items():
+        section = path.removesuffix(".NAME") or "card"
+        title = f"## [{section}]" if path else "## Top level"
         lines += [f"{title} {{: #{section} }}", "", *_table(keys, section), ""]
     return "\n".join(lines)
 
 
-def _heading(path: str) -> list[str]:
+def _heading(path: str, tables: Mapping[str, list[Key]]) -> list[str]:
     """Return the heading of a table as the file writes it: [[...]] where there may be several."""
-    if path == "study":
+    if not path:
         return ["## Top level {: #top }", ""]
     outer, _, own = path.rpartition(".")
-    is_list = any(k.name == own and k.kind == "list of tables" for k in study_keys().get(outer or "study", ()))
+    is_list = any(k.name == own and k.kind == "list of tables" for k in tables.get(outer, ()))
     depth = "###" if outer else "##"
     return [f"{depth} {f'[[{path}]]' if is_list else f'[{path}]'} {{: #{path.replace('.', '-')} }}", ""]
 

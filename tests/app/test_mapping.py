@@ -233,5 +233,5 @@ def test_a_recording_is_opened_with_a_study_to_be_made_beside_it(tmp_path: Path)
     assert found.renewed() is found
     desk.file.write_text("schema = 1\n[model", "utf-8")
     broken = found.renewed()
-    assert broken.study is found.study and "not TOML" in broken.why
+    assert broken.study is found.study and "the study file is not valid TOML" in broken.why
     assert opened(str(tmp_path / "step.csv")).file == tmp_path / "step-study-2" / "study.toml"

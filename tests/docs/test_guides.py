@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
-from hvdc_ident.study.json_schema import card_keys, study_keys
+from hvdc_ident.study.json_schema import FILES, reference
 
 ROOT = Path(__file__).resolve().parents[2]
 WITHOUT_BLOCKS = ("workbench.md", "index.md", "report.md")
@@ -50,6 +50,6 @@ def test_a_page_without_blocks_has_none(name: str) -> None:
 
 @pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda p: p.stem)
 def test_toml_blocks_are_toml_with_keys_that_are_read(page: Path) -> None:
-    known = {k.name for tables in (study_keys(), card_keys()) for keys in tables.values() for k in keys}
+    known = {k.name for file in FILES for keys in reference(file).values() for k in keys}
     for block in TOML.findall(page.read_text("utf-8")):
         assert set(tomllib.loads(block)) <= known, block

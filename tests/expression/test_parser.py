@@ -83,6 +83,13 @@ def test_symbols_are_real_and_numbers_are_the_doubles_of_python() -> None:
         ("x > 1", "a comparison is no value"),
         ("sin(x > 1)", "only be the condition"),
         ("x^2", "a power is written **"),
+        ("x if x > 0 else -x", "'if' is no part of an expression; write where(x > 0, x, -x), at character 3"),
+        ("max(x, y) if x > y else 2*y", "write where(x > y, max(x, y), 2*y)"),
+        ("x > 0 ? x : 0", "'?' is no part of an expression; write where(x > 0, x, 0)"),
+        ("2*(x if x > 0 else y if y > 0 else 0)", "a if c else b is written where(c, a, b)"),
+        ("where(x > 0 and y > 0, x, y)", "where(c and d, a, b) is written where(c, where(d, a, b), b)"),
+        ("where(x > 0 || y > 0, x, y)", "where(c or d, a, b) is written where(c, a, where(d, a, b))"),
+        ("where(not x > 0, x, y)", "where(not c, a, b) is written where(c, b, a)"),
         ("x.1", "expected an operator or the end"),
         ("x..y", "between the parts of a name only, as in gen.H"),
         ("[1, 2]", "a list stands in table only"),
@@ -103,6 +110,15 @@ def test_an_error_says_what_is_wrong(text: str, words: str) -> None:
         parse(text, where="model 'm', signal 's'")
     assert words in str(caught.value)
     assert str(caught.value).startswith("model 'm', signal 's': ")
+
+
+@pytest.mark.parametrize("x", [-1.5, 0.0, 2.0])
+@pytest.mark.parametrize("text", ["x if x > 0 else -x", "x**2 - 1 if x < 1 else 3 * x"])
+def test_what_is_written_instead_of_a_choice_is_that_choice(text: str, x: float) -> None:
+    with pytest.raises(ExpressionError) as caught:
+        parse(text)
+    instead = str(caught.value).partition("write ")[2].rpartition(", at character")[0]
+    assert float(parse(instead).subs(sp.Symbol("x", real=True), x)) == eval(text, {"x": x})
 
 
 def test_the_caret_stands_below_the_wrong_character_and_the_excerpt_is_short() -> None:

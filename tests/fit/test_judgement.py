@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal
-from hvdc_ident.errors import StudyError, UnknownNameError
+from hvdc_ident.errors import InputError, StudyError, UnknownNameError
 from hvdc_ident.fit import tolerance_profile
 from hvdc_ident.fit.assessment import Curve
 from hvdc_ident.fit.judgement import Count, event_end, judge
@@ -138,19 +138,19 @@ def test_a_profile_of_ones_own_is_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("schema = 1", "schema = 2", "does not read this schema"),
-        ("max = 0.08", "max = -0.08", "'max' is wrong"),
-        ("max = 0.08", 'max = "a"', "'max' is wrong"),
-        ("max = 0.08", "most = 0.08", "keys are wrong"),
-        ("[windows]", "[windows", "is not TOML"),
-        ("settling = 0.05", "settling = inf", "'settling' is wrong"),
+        ("schema = 1", "schema = 2", "expected schema = 1, got 2"),
+        ("max = 0.08", "max = -0.08", r"limits\.during\.max: .*expected a number of at least 0, got -0.08"),
+        ("max = 0.08", 'max = "a"', r"limits\.during\.max: .*expected a number, got \"a\""),
+        ("max = 0.08", "most = 0.08", "limits.during: unknown key 'most'"),
+        ("[windows]", "[windows", "not valid TOML"),
+        ("settling = 0.05", "settling = inf", r"windows\.settling: .*expected a finite number, got inf"),
     ],
 )
 def test_a_profile_that_is_wrong_is_refused(tmp_path, old, new, message):
     text = (files("hvdc_ident.fit") / "tolerances" / "set-point-step-simulation.toml").read_text(encoding="utf-8")
     assert old in text
     (tmp_path / "bad.toml").write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(StudyError, match=message):
+    with pytest.raises(InputError, match=message):
         tolerance("bad.toml", tmp_path)
 
 

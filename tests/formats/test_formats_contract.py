@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,16 @@ def test_a_sample_cut_off_is_refused_or_shorter(sample: Path) -> None:
             assert str(sample) in str(error)
         else:
             assert np.isfinite(found.values).all()
+
+
+def test_a_spreadsheet_is_called_one_and_not_searched_for_columns(tmp_path: Path) -> None:
+    path = tmp_path / "record.xlsx"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("xl/workbook.xml", "<workbook/>")
+    with pytest.raises(
+        WaveformError, match=r"record.xlsx: a spreadsheet.*CSV.*got '.xlsx'. Try: save the sheet as CSV"
+    ):
+        read_waveforms(path)
 
 
 def test_recognises_nothing_in_noise(module: Format, tmp_path: Path) -> None:

@@ -18,6 +18,31 @@ def put(folder: Path, text: str) -> Path:
     return folder / "x.csv"
 
 
+@pytest.mark.parametrize(
+    "date",
+    [
+        "27/Nov/2026:10:00:{:02d}",
+        "Fri Nov 27 10:00:{:02d} 2026",
+        "20261127 1000{:02d}",
+        "27-11-2026 10.00.{:02d}",
+        "2026-331 10:00:{:02d}",
+    ],
+)
+def test_a_date_in_another_form_is_called_one_with_the_forms_that_are_read(tmp_path: Path, date: str) -> None:
+    rows = "".join(f"{date.format(k)};{k}\n" for k in range(30))
+    with pytest.raises(WaveformError) as caught:
+        read_waveforms(put(tmp_path, f"time;y\n{rows}"))
+    said = str(caught.value)
+    assert "x.csv, line 2, column 1 ('time'): the time is a date in no known form; expected as in 2026-11-21" in said
+    assert f"got '{date.format(0)}'" in said and "Try: write the dates as year-month-day" in said
+
+
+def test_a_word_among_times_is_no_date(tmp_path: Path) -> None:
+    rows = "".join(f"{k};{k}\n" for k in range(30))
+    with pytest.raises(WaveformError, match=r"line 32.*text where a number belongs.*got 'end'"):
+        read_waveforms(put(tmp_path, f"time;y\n{rows}end;3\n"))
+
+
 COUNTS = [1_689_000_000_123_456_789 + k * 137 for k in range(40)]
 """Nanoseconds since 1970, 137 ns apart: 256 ns are the spacing of doubles there."""
 

@@ -65,7 +65,7 @@ CASES = {
         ("wndow", "experiment 'd'", "did you mean 'window'"), _append("wndow = [0, 1]\n")
     ),
     "missing schema": Case(("schema",), _replace("schema = 1\n", "")),
-    "another schema": Case(("schema", "expected 1, got 2"), _replace("schema = 1", "schema = 2")),
+    "another schema": Case(("schema", "expected schema = 1, got 2"), _replace("schema = 1", "schema = 2")),
     "missing model": Case(("'model' is missing",), _replace('[model]\nsource = "vsc-hvdc-link"\n', "")),
     "unknown model": Case(("vsc-hvdc-lnk", "did you mean 'vsc-hvdc-link'"), _replace("hvdc-link", "hvdc-lnk")),
     "missing model file": Case(("no model file 'm.toml'", "model.source"), _replace("vsc-hvdc-link", "m.toml")),
@@ -85,7 +85,9 @@ CASES = {
     ),
     "unknown parameter": Case(("no parameter 'KIPP'", "'KIP'"), _replace("KIP =", "KIPP =")),
     "an input as parameter": Case(("'Pref2' is an input", "values"), _replace("KIP =", "Pref2 =")),
-    "bounds that miss the start": Case(("KIP", "min 60"), _replace("min = 5", "min = 60")),
+    "bounds that miss the start": Case(
+        ("KIP", "min is not below max: min = 60, max = 50"), _replace("min = 5", "min = 60")
+    ),
     "bounds beyond the model's": Case(("parameters.KIP", "the model's own"), _replace("min = 5", "min = -5")),
     "infinite start": Case(("parameters.KIP.start", "finite number", "inf"), _replace("start = 25", "start = inf")),
     "text as number": Case(("parameters.KIP.start", "a number"), _replace("start = 25", 'start = "25"')),
@@ -125,6 +127,32 @@ CASES = {
         ),
     ),
     "not toml": Case(("TOML", "line"), _append("\n[[[")),
+    "a Windows path in double quotes": Case(
+        ("line 9", "\\ begins an escape sequence", 'got data = "C:\\Users', '"C:/Users/me/d.csv"', "single quotes"),
+        _replace('"d.csv"', r'"C:\Users\me\d.csv"'),
+    ),
+    "a Windows path whose escapes are valid": Case(
+        ("experiment 'd'.data", r'got "C:\temp\new.csv"', "single quotes or with /"),
+        _replace('"d.csv"', r'"C:\temp\new.csv"'),
+    ),
+    "text without quotes": Case(('got role = fit. Try: text in quotes: "fit"',), _append("role = fit\n")),
+    "a date without quotes": Case(('Try: text in quotes: "25.11.2026"',), _append("[letter]\ndate = 25.11.2026\n")),
+    "a time of day for a number": Case(
+        ("experiment 'd'.event", "expected a number, got 10:00:01", "s, as the time in the data"),
+        _append("event = 10:00:01\n"),
+    ),
+    "a range the wrong way": Case(
+        ("sweep number 1", "max is not above min", "Try: min = 1, max = 2"),
+        _append('[[sweep]]\nparameter = "KIP"\nmin = 2\nmax = 1\npoints = 3\n'),
+    ),
+    "lmfit's word for a start": Case(
+        ("parameters.KIP: unknown key 'value'", "start = ... for where the search begins"),
+        _replace("start = 25", "value = 25"),
+    ),
+    "a given value below the bounds": Case(
+        ("parameters.KIP", "begins at the given value, below min = 5", "got 4", "start = ..."),
+        _replace("start = 25", "given = 4"),
+    ),
     "toml nested for ever": Case(("TOML",), _append("x = " + "[" * 5000)),
     "study not text": Case(("UTF-8",), lambda s: s.encode() + b"\xff\xfe\x00"),
     "study too large": Case(("too large",), lambda s: s + "#" * 1_100_000),

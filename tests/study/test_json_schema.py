@@ -7,7 +7,7 @@ import json
 import re
 import tomllib
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.model.card import parse_card, write_card
+from hvdc_ident.model.check import SECTIONS
 from hvdc_ident.models import load_model, shipped_models
 from hvdc_ident.study import json_schema
 from hvdc_ident.study.examples import write_demo, write_starter
@@ -45,14 +46,14 @@ def _shipped() -> tuple[dict[str, str], dict[str, str]]:
 STUDIES, CARDS = _shipped()
 
 
-VALIDATORS = {n: jsonschema.Draft202012Validator(json.loads(json_schema.schema_text(n))) for n in json_schema.NAMES}
+VALIDATORS = {n: jsonschema.Draft202012Validator(json.loads(json_schema.schema_text(n))) for n in json_schema.FILES}
 
 
 def _accepts(name: str, table: dict[str, Any]) -> bool:
     return VALIDATORS[name].is_valid(table)
 
 
-@pytest.mark.parametrize("name", json_schema.NAMES)
+@pytest.mark.parametrize("name", json_schema.FILES)
 def test_schemas_are_schemas_that_describe_every_key(name: str) -> None:
     schema = VALIDATORS[name].schema
     jsonschema.Draft202012Validator.check_schema(schema)
@@ -60,26 +61,24 @@ def test_schemas_are_schemas_that_describe_every_key(name: str) -> None:
         assert all(p["description"].count("Example: ") == 1 for p in table["properties"].values())
 
 
-def test_every_key_of_the_readers_has_a_text_and_no_other() -> None:
-    texts = json_schema.key_texts("study")
-    tables = {path or "study": table for path, table in json_schema.study_tables().items()}
-    assert {p: {f.alias or n for n, f in t.model_fields.items()} for p, t in tables.items()} == {
-        p: set(keys) for p, keys in texts.items()
-    }
-    texts = json_schema.key_texts("model-card")
-    assert {s: {f.name for f in fields(kind)} for s, (kind, _, _) in json_schema.CARD.items()} == {
-        s: set(keys) for s, keys in texts.items() if s != "card"
-    }
-    assert set(texts["card"]) == {"schema", "name", "description", "record", "also", *json_schema.CARD}
+@pytest.mark.parametrize("section", SECTIONS)
+def test_a_card_has_the_fields_of_the_model_that_it_becomes(section: str) -> None:
+    (keys,) = (k for path, k in json_schema.reference("model-card").items() if path == f"{section}.NAME")
+    kind = SECTIONS[section][0]
+    assert {k.name: k.required for k in keys} == {f.name: f.default is MISSING for f in fields(kind)}
+    stated = {k.name: json.loads(k.default) for k in keys if k.default}
+    assert stated == {f.name: f.default for f in fields(kind) if f.name in stated}
 
 
-@pytest.mark.parametrize("kind", ["study", "model-card"])
+@pytest.mark.parametrize("kind", json_schema.FILES)
 def test_examples_of_keys_are_toml_that_names_the_key(kind: str) -> None:
-    for table, keys in json_schema.key_texts(kind).items():
-        for key, text in keys.items():
-            assert set(text) <= {"text", "unit", "example"} and text["text"].endswith("."), (table, key)
-            tomllib.loads(text["example"])
-            assert re.search(rf"\b{re.escape(key)}\b", text["example"]) or table in ("signals", "outputs"), (table, key)
+    for table, keys in json_schema.reference(kind).items():
+        for key in keys:
+            assert key.text.endswith("."), (table, key)
+            tomllib.loads(key.example)
+            assert re.search(rf"\b{re.escape(key.name)}\b", key.example) or table in ("signals.NAME", "outputs.NAME"), (
+                key
+            )
 
 
 @pytest.mark.parametrize("name", STUDIES)
@@ -111,12 +110,65 @@ def test_cards_are_accepted_and_misspelt_keys_refused(name: str) -> None:
     assert _accepts("model-card", card)
     for key in card:
         assert not _accepts("model-card", {f"{k}x" if k == key else k: v for k, v in card.items()})
-    for section in json_schema.CARD:
+    for section in (*SECTIONS, "components", "connections"):
         for item, keys in card.get(section, {}).items():
             for key in keys if isinstance(keys, dict) else ():
                 wrong = copy.deepcopy(card)
                 wrong[section][item][f"{key}x"] = wrong[section][item].pop(key)
                 assert not _accepts("model-card", wrong), (section, item, key)
+
+
+NESTED = """
+schema = 1
+[model]
+source = "plant.toml"
+[model.values]
+gen.H = 3.0
+[parameters]
+net.R = {min = 0.0, max = 0.1}
+gen = {Xd = {start = 1.8}, avr = {K = {given = 200, prior = {mean = 200, std = 20}}}}
+[[experiment]]
+name = "step"
+data = "step.csv"
+inputs = {gen = {u = "Vf"}}
+outputs = {gen = {P = "MW", Q = "MVAr"}}
+noise = {gen = {P = 0.1, Q = {column = "sd"}}}
+columns = {gen = {P = {unit = "MW", base = 100}}}
+instrument = {gen = {P = {delay = 0.001}}}
+interpolation = {gen = {u = "linear"}}
+[linearize]
+scale = {gen = {u = 0.02}}
+[diagnose]
+tolerance = {gen = {P = 0.5}}
+"""
+
+
+def test_names_of_components_may_be_nested_wherever_a_table_is_by_name() -> None:
+    table = tomllib.loads(NESTED)
+    assert _accepts("study", table)
+    file = checked(copy.deepcopy(table), "study.toml")
+    assert list(file.parameters) == ["net.R", "gen.Xd", "gen.avr.K"] and file.parameters["gen.avr.K"].prior is not None
+    (e,) = file.experiment
+    assert dict(e.inputs) == {"gen.u": "Vf"} and dict(e.outputs) == {"gen.P": "MW", "gen.Q": "MVAr"}
+    assert e.noise["gen.P"] == 0.1 and e.noise["gen.Q"].column == "sd"  # type: ignore[union-attr]
+    assert e.columns["gen.P"].base == 100 and e.instrument["gen.P"].delay == 0.001
+    assert e.interpolation == {"gen.u": "linear"} and file.model.values == {"gen.H": 3.0}
+    assert file.linearize is not None and file.linearize.scale == {"gen.u": 0.02}
+    assert file.diagnose is not None and file.diagnose.tolerance == {"gen.P": 0.5}
+    for wrong in ("gen = {Xd = {strt = 1.8}}", "gen = {Xd = 1.8}", "gen = {avr = {K = {prior = {mean = 200}}}}"):
+        study = tomllib.loads(f'schema = 1\n[model]\nsource = "plant.toml"\n[parameters]\n{wrong}\n')
+        assert not _accepts("study", study)
+        with pytest.raises(InputError):
+            checked(study, "study.toml")
+
+
+@pytest.mark.parametrize("line", ["K = {mn = 5}", "gen.K = {mn = 5}", "gen = {avr = {K = {start = 1, mn = 5}}}"])
+def test_an_editor_is_told_which_key_is_unknown_and_which_there_are(line: str) -> None:
+    study = tomllib.loads(f'schema = 1\n[model]\nsource = "plant.toml"\n[parameters]\n{line}\n')
+    (error,) = VALIDATORS["study"].iter_errors(study)
+    assert "'mn' was unexpected" in error.message
+    ((_, item),) = VALIDATORS["study"].schema["properties"]["parameters"]["patternProperties"].items()
+    assert item["properties"] == VALIDATORS["study"].schema["$defs"]["ParameterTable"]["properties"]
 
 
 def test_a_component_needs_no_more_than_its_source() -> None:
@@ -140,6 +192,12 @@ def test_values_that_the_reader_refuses_are_refused(line: str) -> None:
     with pytest.raises(InputError):
         checked(copy.deepcopy(study), "study.toml")
     assert not _accepts("study", study)
+
+
+def test_the_date_of_a_letter_may_be_a_date_of_toml() -> None:
+    study = tomllib.loads('schema = 1\n[model]\nsource = "m.toml"\n[letter]\ndate = 2026-11-25\n')
+    letter = checked(study, "study.toml").letter
+    assert letter is not None and letter.date == "2026-11-25"
 
 
 def _misspelt(table: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -146,7 +146,23 @@ def test_a_shared_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ('[[sweep]]\nparameter = "KIVDC"\nvalues = [1]\nmin = 1', "either"),
         ('[fit]\nmode = "individual"\ngroups = [{parameters = ["KIP"]}]', "candidate 'KIP'"),
         ('[diagnose]\neffects = ["lga"]', "'lag'"),
-        ("[diagnose]\nmaterial = {P2 = 0.1}", "measured output 'P2'"),
+        ("[diagnose]\nmaterial = {P2 = 0.1}", r"diagnose\.material: no measured output 'P2'"),
+        ('[linearize]\nbreak_at = "Irorder9"', r"linearize\.break_at: no signal 'Irorder9'.*did you mean 'Irorder"),
+        ('[linearize]\nplant = {inputs = "x1", outputs = "I9"}', r"linearize\.plant\.inputs: no signal 'x1'"),
+        ("[linearize]\nscale = {Vdcref9 = 0.1}", r"linearize\.scale: no input or output of \[linearize\] 'Vdcref9'"),
+        ('[linearize]\nformula = ["KIVD"]', r"linearize\.formula: no parameter 'KIVD'.*did you mean 'KIVDC'"),
+        ('[linearize]\nlocus = {parameter = "KI", min = 1, max = 2}', r"linearize\.locus\.parameter: no input or parameter"),
+        ("[linearize]\ntrim = {outputs={P9 = 1.0}}", r"linearize\.trim\.outputs: no output 'P9'"),
+        (
+            '[[linearize.port]]\nname = "dc"\nsource = "I9"\nvoltage = "Vdc1"\ncurrent = "Vdc1"',
+            r"linearize\.port 'dc'\.source: no insertion point 'I9'",
+        ),
+        ('[screening]\nparameters = ["KIP"]', r"screening\.parameters: no candidate 'KIP'"),
+        ('[identifiability]\npair = ["KIP", "KIQ"]', r"identifiability\.pair: no candidate 'KIP'"),
+        (
+            '[fit]\nmode = "individual"\ngroups = [{parameters = ["KIP"], experiments = ["e"]}]\n[parameters]\nKIP = {}',
+            r"fit\.groups number 1\.experiments: no experiment 'e'",
+        ),
     ],
 )
 def test_later_stages_are_checked_as_well(tmp_path: Path, table: str, said: str) -> None:
