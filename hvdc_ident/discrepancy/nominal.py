@@ -149,10 +149,12 @@ def draws(
                 continue
             e = b.scaled(e)
         found.append(problem.treatment.applied(e, times[b.experiment][b.rows], b.output, b.experiment))
-    return _with_passed(problem, blocks, found, seed)
+    return _with_passed(problem, blocks, found, times, seed)
 
 
-def _with_passed(problem: Problem, blocks: Sequence[ResidualBlock], drawn: list[Array], seed: int) -> list[Array]:
+def _with_passed(
+    problem: Problem, blocks: Sequence[ResidualBlock], drawn: list[Array], times: Mapping[str, Array], seed: int
+) -> list[Array]:
     """Return draws of each output's own noise with those of what recorded inputs pass on, whitened together."""
     whole = list(drawn)
     for k, name in enumerate(problem.passed):
@@ -161,8 +163,9 @@ def _with_passed(problem: Problem, blocks: Sequence[ResidualBlock], drawn: list[
             continue
         beside, random = [blocks[i] for i in own], np.random.default_rng([seed, 5, k])
         rows = np.vstack([drawn[i] for i in own])
-        rows = rows + passed_draws(beside, problem.treatment, rows.shape[1], random)
-        rows = whitened_together(rows, beside, problem.treatment)
+        at = [times[name][b.rows] for b in beside]
+        rows = rows + passed_draws(beside, at, problem.treatment, rows.shape[1], random)
+        rows = whitened_together(rows, beside, at, problem.treatment)
         for i, part in zip(own, np.split(rows, np.cumsum([drawn[i].shape[0] for i in own])[:-1]), strict=True):
             whole[i] = part
     return whole

@@ -140,7 +140,8 @@ class Whitening:
     def __call__(self, y: Array) -> Array:
         """(rows, nc) of y (o, R, nc)."""
         rows = np.concatenate([self._rows(b, y[k, b.rows], time) for b, k, time in self.parts])
-        return whitened_together(rows, [b for b, _, _ in self.parts], self.treatment)
+        blocks, _, times = zip(*self.parts, strict=True)
+        return whitened_together(rows, blocks, times, self.treatment)
 
     def _rows(self, b: ResidualBlock, y: Array, time: Array) -> Array:
         if b.slope is not None:

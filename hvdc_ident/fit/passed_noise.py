@@ -28,7 +28,7 @@ SIZE = 2.0
 class PassedNoise:
     """What the noise of an experiment's recorded inputs makes of its outputs.
 
-    time: (n,) the experiment's rows, s; level: (n,) weights with which they make the level that the model starts from.
+    time: (n,) instants of the inputs' rows, s; level: (n,) weights with which they make the level that the model starts from.
     noise, held: of each input, and whether it holds its rows' values. spacing: s; steps: by output (inputs, m) the answers to a step of
     1 in each input, so far apart; rest: (inputs,) how much the start moves with the level of each, by 1. levels: outputs at whose level
     before the event the model starts.
@@ -56,38 +56,35 @@ class PassedNoise:
     def __hash__(self) -> int:
         return hash(self._said)
 
-    def answers(self, output: str) -> Array:
-        """Return (n, k) the deviations of an output at the rows, each an independent cause of standard deviation 1, in its unit."""
-        knots, row = np.unique(self.time, return_inverse=True)
-        weights = np.bincount(row, self.level)
-        behind = knots[:, None] - knots
+    def answers(self, output: str, at: Array) -> Array:
+        """Return (m, k) the deviations of an output at instants (m,), each an independent cause of standard deviation 1, in its unit."""
+        behind = at[:, None] - self.time
         found = []
         inputs = zip(self.noise, self.held, self.steps[output], self.rest[output], strict=True)
         for noise, held, step, rest in inputs:
-            played = _held(behind, step, self.spacing) if held else _joined(behind, step, self.spacing)
+            played = _held(behind, step, self.spacing) if held else _joined(behind, np.diff(self.time), step, self.spacing)
             played[:, 0] = 0.0  # the first row is the level
-            before = weights > 0.0
+            before = self.level > 0.0
             size = np.where(before, noise.before, noise.std)
-            found.append(played * size + np.outer(rest - played.sum(axis=1), weights * size))
+            found.append(played * size + np.outer(rest - played.sum(axis=1), self.level * size))
             found.append(noise.common * (rest - played[:, ~before].sum(axis=1, keepdims=True)))
-        return np.hstack(found)[row]
+        return np.hstack(found)
 
 
-def _joined(behind: Array, step: Array, spacing: float) -> Array:
-    """Return (n, n) the answers at the instants to 1 at each of them, joined by lines to 0 at its neighbours.
+def _joined(behind: Array, width: Array, step: Array, spacing: float) -> Array:
+    """Return (m, n) the answers to 1 at each row, joined by lines to 0 at its neighbours.
 
-    behind: (n, n) s from each instant, along the columns, to all.
+    behind: (m, n) s since each row; width: (n - 1,) s from row to row.
     """
     since = np.arange(step.size) * spacing
     ramp = np.concatenate([[0.0], np.cumsum(0.5 * (step[1:] + step[:-1]))]) * spacing
-    width = behind[1:, 0] - behind[:-1, 0]
     begun = np.interp(behind, since, ramp, left=0.0)
     risen = np.column_stack([(begun[:, :-1] - begun[:, 1:]) / width, np.zeros(behind.shape[0])])
     return np.asarray(np.diff(-risen, axis=1, prepend=0.0))
 
 
 def _held(behind: Array, step: Array, spacing: float) -> Array:
-    """Return (n, n) the answers at the instants to 1 from each of them to the next."""
+    """Return (m, n) the answers to 1 from each row to the next."""
     begun = np.interp(behind, np.arange(step.size) * spacing, step, left=0.0)
     return np.asarray(np.diff(-begun, axis=1, append=0.0))
 
@@ -101,11 +98,12 @@ def passed_noise(
     code is the fit's. Raises SimulationError where a run fails.
     """
     e, names = experiment, tuple(experiment.input_noise)
-    rows = before_event(e.time, np.zeros(e.time.size), e.event)
-    level = rows / rows.sum() if rows.any() else np.eye(1, e.time.size)[0]
-    width = float(np.median(np.diff(np.unique(e.time))))
+    time = np.unique(e.time)
+    rows = before_event(time, np.zeros(time.size), e.event)
+    level = rows / rows.sum() if rows.any() else np.eye(1, time.size)[0]
+    width = float(np.median(np.diff(time)))
     spacing = width / FINER
-    after = width + spacing * np.arange(int(np.ceil((e.time[-1] - e.time[0]) / spacing)) + 2)
+    after = width + spacing * np.arange(int(np.ceil((time[-1] - time[0]) / spacing)) + FINER)
     grid = np.concatenate([[0.0, width], after])
     still = {n: InputSignal.constant(float(s.values[0])) for n, s in e.inputs.items()}
     blank = Trajectory(grid, np.zeros((grid.size, len(e.outputs))), e.outputs)
@@ -124,7 +122,7 @@ def passed_noise(
             rests[o][k] = (down[o][0] - up[o][0]) / (high - low)
             steps[o][k] = 0.5 * ((up[o] - up[o][0]) - (down[o] - down[o][0]))[2:] / (high - low)
     return PassedNoise(
-        e.time, level, tuple(e.input_noise.values()), tuple(_holds(e.inputs[n]) for n in names), spacing,
+        time, level, tuple(e.input_noise.values()), tuple(_holds(e.inputs[n]) for n in names), spacing,
         FrozenMap(steps), FrozenMap(rests), e.levels,
     )  # fmt: skip
 

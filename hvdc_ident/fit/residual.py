@@ -266,16 +266,16 @@ def residual_blocks(
         )  # fmt: skip
         blocks.append(block)
         raw.append(slopes[:, k : k + len(eliminated)])
-    blocks = _whitened_together(blocks, treatment)
+    if experiment.name in treatment.passed:
+        blocks = _whitened_together(blocks, [experiment.time[b.rows] for b in blocks], treatment)
     return eliminate_initial_states(blocks, raw, slice(k, k + len(eliminated))) if eliminated else tuple(blocks)
 
 
-def _whitened_together(blocks: list[ResidualBlock], treatment: Treatment) -> list[ResidualBlock]:
-    if blocks[0].experiment not in treatment.passed:
-        return blocks
-    rows = whitened_together(
-        np.vstack([np.column_stack([b.residual, b.jacobian]) for b in blocks]), blocks, treatment
-    )
+def _whitened_together(
+    blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: Treatment
+) -> list[ResidualBlock]:
+    rows = np.vstack([np.column_stack([b.residual, b.jacobian]) for b in blocks])
+    rows = whitened_together(rows, blocks, times, treatment)
     parts = np.split(rows, np.cumsum([b.residual.size for b in blocks])[:-1])
     return [
         replace(b, residual=np.ascontiguousarray(part[:, 0]), jacobian=part[:, 1:])
@@ -283,22 +283,30 @@ def _whitened_together(blocks: list[ResidualBlock], treatment: Treatment) -> lis
     ]
 
 
-def whitened_together(rows: Array, blocks: Sequence[ResidualBlock], treatment: Treatment) -> Array:
+def whitened_together(
+    rows: Array, blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: Treatment
+) -> Array:
     """Return treated values of all blocks of an experiment, (N,) or (N, p), whitened by the noise that its inputs pass on, too.
 
-    Each row is freed of what those before it, of all outputs, tell of it.
+    times: by block, (m,) the instants of its rows. Each row is freed of what those before it, of all outputs, tell of it.
     """
     white = rows
-    for part in _parts(blocks, treatment):
+    for part in _parts(blocks, times, treatment):
         white = white.copy() if white is rows else white
         white[part.at] = solve_triangular(part.lower, rows[part.at], lower=True, check_finite=False)
     return white
 
 
-def passed_draws(blocks: Sequence[ResidualBlock], treatment: Treatment, count: int, random: np.random.Generator) -> Array:
+def passed_draws(
+    blocks: Sequence[ResidualBlock],
+    times: Sequence[Array],
+    treatment: Treatment,
+    count: int,
+    random: np.random.Generator,
+) -> Array:
     """Return (N, count) what draws of the noise that an experiment's inputs pass on add to the treated values of its blocks."""
     drawn = np.zeros((sum(b.residual.size for b in blocks), count))
-    for part in _parts(blocks, treatment):
+    for part in _parts(blocks, times, treatment):
         drawn[part.at] = part.caused @ random.standard_normal((part.caused.shape[1], count))
     return drawn
 
@@ -315,12 +323,13 @@ class _Part:
     lower: Array
 
 
-def _parts(blocks: Sequence[ResidualBlock], treatment: Treatment) -> tuple[_Part, ...]:
+def _parts(blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: Treatment) -> tuple[_Part, ...]:
     """Return the parts of an experiment's blocks; none where its inputs pass on no noise."""
     passed = treatment.passed.get(blocks[0].experiment)
     if passed is None:
         return ()
-    outputs = [(b.output, b.rows.tobytes(), b.sigma, None if b.profile is None else b.profile.tobytes()) for b in blocks]
+    profiles = [None if b.profile is None else b.profile.tobytes() for b in blocks]
+    outputs = [(b.output, t.tobytes(), b.sigma, p) for b, t, p in zip(blocks, times, profiles, strict=True)]
     return _parts_of(passed, tuple(outputs), treatment)
 
 
@@ -328,16 +337,16 @@ def _parts(blocks: Sequence[ResidualBlock], treatment: Treatment) -> tuple[_Part
 def _parts_of(
     passed: PassedNoise, outputs: tuple[tuple[str, bytes, float, bytes | None], ...], treatment: Treatment
 ) -> tuple[_Part, ...]:
-    """Return the parts. outputs: of each block its output, rows, standard deviation and profile."""
+    """Return the parts. outputs: of each block its output, the instants of its rows, standard deviation and profile."""
     answers, places = [], []
-    for k, (output, rows, sigma, profile) in enumerate(outputs):
-        at = np.frombuffer(rows, dtype=np.intp)
-        level = np.zeros((at.size, len(outputs)))  # each by itself
+    for k, (output, instants, sigma, profile) in enumerate(outputs):
+        time = np.frombuffer(instants)
+        level = np.zeros((time.size, len(outputs)))  # each by itself
         level[:, k] = OPEN * sigma if output in passed.levels else 0.0
-        caused = np.hstack([passed.answers(output)[at], level])
+        caused = np.hstack([passed.answers(output, time), level])
         caused = per_deviation(caused, sigma, None if profile is None else np.frombuffer(profile))
-        answers.append(treatment.applied(caused, passed.time[at], output, "the noise of inputs"))
-        places.append(at if treatment.band is None else np.zeros(answers[-1].shape[0], dtype=np.intp))
+        answers.append(treatment.applied(caused, time, output, "the noise of inputs"))
+        places.append(time if treatment.band is None else np.zeros(answers[-1].shape[0]))
     whole, order = np.vstack(answers), np.argsort(np.concatenate(places), kind="stable")
     found = []
     for at in np.array_split(order, -(-order.size // MOST)):

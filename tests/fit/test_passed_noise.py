@@ -67,22 +67,25 @@ def recorded(rows: np.ndarray, outputs: dict[str, np.ndarray], noise: dict[str, 
 
 
 @pytest.mark.parametrize("interpolation", ["linear", "hold"])
-@pytest.mark.parametrize("gaps", [False, True])
-def test_the_answers_are_those_to_single_rows(interpolation, gaps):
-    """The model is linear: a row that is off moves the outputs by what a run with that row off says, the start included."""
+@pytest.mark.parametrize(("gaps", "late"), [(False, 0.0), (True, 0.0), (False, 0.02)])
+def test_the_answers_are_those_to_single_rows(interpolation, gaps, late):
+    """The model is linear: a row that is off moves the outputs by what a run with that row off says, the start included; at instants
+    between the rows, too, where the outputs have a clock of their own."""
     time = np.delete(TIME, [7, 40, 41, 90]) if gaps else TIME
+    at = np.concatenate([time[:1], time[1:] - late, time[-1:]]) if late else time
     rng = np.random.default_rng(1)
     rows = voltage(time) + 1e-3 * rng.standard_normal(time.size)
     e = of_rows(rows, interpolation, time, measured=trajectory(time, {"y": 0 * time, "z": 0 * time}))
     problem = Problem(simulator(), (e,), (FitParameter("K", K, 5.0, 80.0),))
-    plain = hi.simulate(simulator().model, e, rtol=1e-10)
+    blank = {"time": at, "measured": None}
+    plain = hi.simulate(simulator().model, e.with_(**blank), rtol=1e-10)
     for output in ("y", "z"):
-        answers = problem.passed["experiment"].answers(output)
+        answers = problem.passed["experiment"].answers(output, at)
         size = np.abs(answers).max()
         for k in (0, 3, 19, 20, 45, time.size - 1):
             off = rows.copy()
             off[k] += NOISE["v"]
-            run = hi.simulate(simulator().model, of_rows(off, interpolation, time), rtol=1e-10)
+            run = hi.simulate(simulator().model, of_rows(off, interpolation, time).with_(**blank), rtol=1e-10)
             assert answers[:, k] == pytest.approx(run[output] - plain[output], abs=2e-3 * size), k
 
 
@@ -96,7 +99,7 @@ def test_rounded_rows_before_an_event_have_their_error_in_common():
     assert found.before < 0.5 * step and found.std == pytest.approx(np.hypot(found.common, found.before))
     e = of_rows(rows, measured=trajectory(TIME, {"y": 0 * TIME}), input_noise={"v": found})
     passed = Problem(simulator(), (e,), (FitParameter("K", K, 5.0, 80.0),)).passed["experiment"]
-    common = passed.answers("y")[:, -1]
+    common = passed.answers("y", TIME)[:, -1]
     lower = of_rows(rows - found.common * (TIME >= EVENT))
     moved = hi.simulate(simulator().model, lower, rtol=1e-10)["y"] - hi.simulate(simulator().model, of_rows(rows), rtol=1e-10)["y"]
     assert common == pytest.approx(moved, abs=2e-3 * np.abs(moved).max())
@@ -144,7 +147,7 @@ def test_draws_of_noise_are_white_once_whitened():
     e = measured(np.random.default_rng(3), 5e-3)
     problem = Problem(simulator(), (e,), (FitParameter("K", K, 5.0, 80.0),))
     blocks = problem.blocks(problem.start)
-    added = passed_draws(blocks, problem.treatment, 4000, np.random.default_rng(0))
+    added = passed_draws(blocks, [TIME], problem.treatment, 4000, np.random.default_rng(0))
     assert added.std() > 2.0  # of the noise of y itself
     own = {"y": replace(noise_of([e])["y"], std=5e-3, freedom=0, model=(), step=0.0)}
     (drawn,) = draws(problem, blocks, own, [np.zeros(TIME.size)], 4000, 0)
