@@ -9,6 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hvdc_ident.data.noise import InputNoise
 from hvdc_ident.data.signals import InputSignal, input_signal
 from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
 from hvdc_ident.display import Shown, Table
@@ -45,6 +46,8 @@ class Experiment(Shown):
     nuisance: unknowns of this experiment alone, estimated with it: "time-shift", or the name of an input
     (its offset), a state (its start) or a parameter (a value of its own). search: of such parameters where
     a fit begins and its bounds, (start, min, max); of one not named they are the model's.
+    input_noise: noise of recorded inputs, by name; what it makes of the outputs is noise of theirs. levels: outputs at whose level
+    before the event the model starts.
     domain: "time"; or "frequency", where `time` holds frequencies in Hz and the outputs are real and imaginary parts of
     measured responses, which a simulator of its own answers (`fit.frequency_data`).
 
@@ -75,6 +78,8 @@ class Experiment(Shown):
     starts: FrozenMap[float] = field(default_factory=FrozenMap)
     noise_profile: FrozenMap[Array] = field(default_factory=FrozenMap)
     search: FrozenMap[tuple[float, float, float]] = field(default_factory=FrozenMap)
+    input_noise: FrozenMap[InputNoise] = field(default_factory=FrozenMap)
+    levels: tuple[str, ...] = ()
     domain: Literal["time", "frequency"] = "time"
 
     def __init__(

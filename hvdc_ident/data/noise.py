@@ -69,6 +69,24 @@ class NoiseEstimate:
     source: str = ""
 
 
+@dataclass(frozen=True)
+class InputNoise:
+    """The noise of a recorded input, in its unit.
+
+    std: standard deviation of each row. before: of the rows before the event by themselves, common: of the error that all of those
+    have in common, as rows have that are rounded to one step.
+    """
+
+    std: float
+    before: float
+    common: float = 0.0
+
+    @property
+    def any(self) -> bool:
+        """True where there is some."""
+        return max(self.std, self.before, self.common) > 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class QuietRows:
     """The rows of a record before its event that are at rest.
@@ -108,6 +126,16 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> N
     std, freedom = FirstOrder.of(records).level
     # Noise slower than any that is compared has its own scatter at least: a line and correlation hide some of it, and add none.
     return NoiseEstimate(max(std, white_std(records)), freedom, ESTIMATED)
+
+
+def input_noise(time: ArrayLike, values: ArrayLike, event: float | None) -> InputNoise:
+    """Return the noise that the record of an input shows, as `noise_estimate` finds it."""
+    found, v = noise_estimate(time, values, event), np.asarray(values, dtype=float)
+    if found.source != ROUNDED:
+        return InputNoise(found.std, found.std)
+    step = resolution(v)
+    flicker = step * flicker_of([v], step)
+    return InputNoise(math.hypot(step / math.sqrt(12.0), flicker), flicker, step / math.sqrt(12.0))
 
 
 def before_event(time: Array, values: Array, event: float | None) -> NDArray[np.bool_]:

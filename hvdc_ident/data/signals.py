@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -96,10 +96,30 @@ class InputSignal:
         share = np.where(t1 > t0, np.clip((t - t0) / np.where(t1 > t0, t1 - t0, 1.0), 0.0, 1.0), 0.0)
         return np.where(right == 0, self.values[0], self.values[i] + share * (self.values[j] - self.values[i]))
 
+    def begun_at(self, level: float) -> InputSignal:
+        """Return the signal with another first value: that until its first jump where it holds it, else at its first instant alone."""
+        if self.times.size == 1:
+            return self
+        held = self.times.size > 2 and self.times[1] == self.times[2] and self.values[0] == self.values[1]
+        first = 2 if held else 1
+        return replace(self, values=np.concatenate([np.full(first, level), self.values[first:]]))
+
     @property
     def jumps(self) -> Array:
         """(k,) instants at which the value changes at once, s."""
         return np.asarray(self.times[1:][(np.diff(self.times) == 0) & (np.diff(self.values) != 0)])
+
+    @property
+    def stops(self) -> Array:
+        """(k,) instants at which a step of an integrator has to end, s: the breaks, and every point of a noisy signal.
+
+        A step across corners sees the signal at a few instants between them, and its error is told by those. A signal is noisy where
+        its bends change from point to point by more than they are; those of a curve change by less from 6 points in a
+        period on.
+        """
+        bends = off_line(self.times, self.values)
+        noisy = bends.size > 2 and np.median(np.abs(np.diff(bends, 2))) > np.median(np.abs(bends))
+        return np.unique(np.concatenate([self.breaks, self.times[bends.nonzero()[0] + 1]])) if noisy else self.breaks
 
     @property
     def is_constant(self) -> bool:

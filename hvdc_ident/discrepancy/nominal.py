@@ -17,7 +17,7 @@ from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor
 from hvdc_ident.fit import FitParameter, Problem, Simulator, StartOutcome
 from hvdc_ident.fit.noise import GIVEN, OutputNoise, noise_of, stated_by
-from hvdc_ident.fit.residual import ResidualBlock
+from hvdc_ident.fit.residual import ResidualBlock, passed_draws, whitened_together
 from hvdc_ident.fit.simulator import approximate, observe
 from hvdc_ident.identifiability.gate import gate, gated, searched
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
@@ -143,13 +143,32 @@ def draws(
                 size = size * np.exp(n.error * spread)
             placed = y[:, None] + n.step * random.uniform(-0.5, 0.5, count)
             e = np.round((placed + size * e) / n.step) * n.step - placed
-            quantised = problem.treatment.quantised(b.output)
+            quantised = problem.treatment.quantised(b.output, b.experiment)
             if quantised is not None and b.profile is None:
                 found.append(quantised.residual(e)[0])
                 continue
             e = b.scaled(e)
         found.append(problem.treatment.applied(e, times[b.experiment][b.rows], b.output, b.experiment))
-    return found
+    return _with_passed(problem, blocks, found, times, seed)
+
+
+def _with_passed(
+    problem: Problem, blocks: Sequence[ResidualBlock], drawn: list[Array], times: Mapping[str, Array], seed: int
+) -> list[Array]:
+    """Return draws of each output's own noise with those of what recorded inputs pass on, whitened together."""
+    whole = list(drawn)
+    for k, name in enumerate(problem.passed):
+        own = [i for i, b in enumerate(blocks) if b.experiment == name]
+        if not own:
+            continue
+        beside, random = [blocks[i] for i in own], np.random.default_rng([seed, 5, k])
+        rows = np.vstack([drawn[i] for i in own])
+        at = [times[name][b.rows] for b in beside]
+        rows = rows + passed_draws(beside, at, problem.treatment, rows.shape[1], random)
+        rows = whitened_together(rows, beside, at, problem.treatment)
+        for i, part in zip(own, np.split(rows, np.cumsum([drawn[i].shape[0] for i in own])[:-1]), strict=True):
+            whole[i] = part
+    return whole
 
 
 def _coloured(white: Array, model: Array) -> Array:
@@ -186,14 +205,14 @@ def orthonormal(columns: Array) -> Array:
 
 def thinned(nominal: Nominal) -> Nominal:
     """Return the model at its optimum against means over neighbouring rows, about `ROWS` of each record; as it is where noise is
-    coloured, or a record is no course over time.
+    coloured or passed on by inputs, or a record is no course over time.
 
     Behind each break of an input, where things are quick, every row stays. What a mean over rows bends is taken from the
     model's own run, so that the residual is exactly the mean of the rows' residuals; white noise keeps its information.
     """
     problem = nominal.problem
     plain = all(e.domain == "time" and not e.nuisance for e in problem.fitted_experiments)
-    if problem.rho or problem.band is not None or not plain:
+    if problem.rho or problem.passed or problem.band is not None or not plain:
         return nominal
     blocks: dict[str, list[tuple[ResidualBlock, Array]]] = {}
     for b, run in zip(nominal.blocks, nominal.fitted(), strict=True):
@@ -324,7 +343,8 @@ def _runs(problem: Problem) -> dict[str, Mapping[str, Array]]:
     free = () if approximate(problem.simulator) else tuple(f.name for f in problem.free)
     found: dict[str, Mapping[str, Array]] = {}
     for e in problem.experiments:
-        if e.outputs and e.domain == "time":
+        # What a run makes of noisy inputs counts beside the noise of the outputs, which before the event are at rest.
+        if e.outputs and e.domain == "time" and not e.input_noise:
             with suppress(SimulationError):  # nothing is known of its motion then: the record has to be at rest
                 found[e.name] = observe(problem.simulator, e, problem.values(problem.start), free).values
     return found

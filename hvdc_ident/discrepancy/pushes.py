@@ -21,7 +21,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.nominal import F, Nominal
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.expression import symbol
-from hvdc_ident.fit.residual import ResidualBlock, Treatment
+from hvdc_ident.fit.residual import ResidualBlock, Treatment, whitened_together
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, fresh, rewritten
 from hvdc_ident.parameters import Input, Parameter
@@ -139,7 +139,9 @@ class Whitening:
 
     def __call__(self, y: Array) -> Array:
         """(rows, nc) of y (o, R, nc)."""
-        return np.concatenate([self._rows(b, y[k, b.rows], time) for b, k, time in self.parts])
+        rows = np.concatenate([self._rows(b, y[k, b.rows], time) for b, k, time in self.parts])
+        blocks, _, times = zip(*self.parts, strict=True)
+        return whitened_together(rows, blocks, times, self.treatment)
 
     def _rows(self, b: ResidualBlock, y: Array, time: Array) -> Array:
         if b.slope is not None:

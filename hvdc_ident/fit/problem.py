@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -19,6 +20,7 @@ from hvdc_ident.errors import SimulationError, StudyError, require_known
 from hvdc_ident.fit.fit_parameter import Coordinates, FitParameter
 from hvdc_ident.fit.likelihood import LOSSES, Loss, Prior, QuantisedNoise, prior_rows
 from hvdc_ident.fit.noise import GIVEN, sigmas, source_of
+from hvdc_ident.fit.passed_noise import PassedNoise, passed_noise
 from hvdc_ident.fit.residual import (
     Band,
     ComparedRecord,
@@ -30,7 +32,7 @@ from hvdc_ident.fit.residual import (
     with_best_start,
     with_steady_start,
 )
-from hvdc_ident.fit.simulator import Simulator, unknown_of, unknowns
+from hvdc_ident.fit.simulator import Simulator, approximate, unknown_of, unknowns
 from hvdc_ident.fit.whitening import AR
 from hvdc_ident.immutable import FrozenMap
 
@@ -51,6 +53,7 @@ class Problem:
     spectrum there. loss: what a residual costs. priors: by unknown ("EXPERIMENT:NUISANCE" for a nuisance).
     free_initial_states: whether the records, held-out ones too, begin elsewhere than at rest; the part that unknown starts of
     the states can make good is then taken out of residuals and jacobians.
+    passed: by experiment the noise that its recorded inputs pass on to its outputs; left out, that of this simulator at the first guess.
     Theta, wherever it appears, holds the unknowns in the order of `unknowns`, each in its own unit.
     Raises StudyError or UnknownNameError where the parts do not fit.
     """
@@ -69,6 +72,7 @@ class Problem:
     priors: FrozenMap[Prior] = field(default_factory=FrozenMap)
     free_initial_states: bool = False
     quantised_noise: FrozenMap[QuantisedNoise] = field(default_factory=FrozenMap)
+    passed: FrozenMap[PassedNoise] = field(default_factory=FrozenMap)
 
     def __post_init__(self) -> None:
         for name in ("experiments", "free"):
@@ -76,6 +80,16 @@ class Problem:
         for name in ("held", "why", "conditional_on", "rho", "weights", "priors", "quantised_noise"):
             object.__setattr__(self, name, FrozenMap(getattr(self, name)))
         self._check()
+        if noisy := [e for e in self.experiments if e.input_noise and e.outputs and e.name not in self.passed]:
+            object.__setattr__(self, "passed", self.passed | self._passed(noisy))
+
+    def _passed(self, experiments: Sequence[Experiment]) -> dict[str, PassedNoise]:
+        values, free = self.values(self.start), () if approximate(self.simulator) else tuple(f.name for f in self.free)
+        found = {}
+        for e in experiments:
+            with suppress(SimulationError):  # the fit says so where it is run
+                found[e.name] = passed_noise(self.simulator, e, values, free)
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the definition alone: another process works out what is cached anew."""
@@ -186,7 +200,7 @@ class Problem:
     def treatment(self) -> Treatment:
         """Treatment that turns misfits into residuals."""
         models = {o: (m,) if isinstance(m, float | int) else tuple(m) for o, m in self.rho.items()}
-        return Treatment(FrozenMap(models), self.guard, self.band, self.quantised_noise)
+        return Treatment(FrozenMap(models), self.guard, self.band, self.quantised_noise, self.passed)
 
     def blocks(
         self,

@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_triangular
 
 from hvdc_ident.data import GAP, Array, Experiment, Trajectory, segments
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.fit.likelihood import QuantisedNoise
+from hvdc_ident.fit.passed_noise import PassedNoise
 from hvdc_ident.fit.simulator import TIME_SHIFT, Simulator, observe, states_of
 from hvdc_ident.fit.whitening import AR, whitened
 from hvdc_ident.immutable import FrozenMap
@@ -28,6 +31,10 @@ TELLS = 1e-7
 LARGEST = 1e100
 """Residuals and derivatives beyond this leave the range of floats (1e308) once products of two are scaled and summed: no
 factorisation of them would end."""
+OPEN = 100.0
+"""Standard deviation of an output's level before the event, in those of its noise: what is known of the level, the rows tell."""
+MOST = 3000
+"""Rows that are whitened together; what longer records have in common beyond so many is left in them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,13 +184,15 @@ class Treatment:
 
     whitening: the noise model by output. guard: rows this close to a break of an input are left out, s. band: Hz; given,
     residuals are the misfit's spectrum within it; None, they are samples in time. quantised_noise: by output whose record is
-    rounded; its residuals are samples in time and not whitened.
+    rounded; its residuals are samples in time and not whitened. passed: by experiment the noise that its inputs pass on, which all its
+    outputs are whitened by together; it hides the steps of rounded records.
     """
 
     whitening: FrozenMap[AR] = field(default_factory=FrozenMap)
     guard: float = 0.0
     band: Band | None = None
     quantised_noise: FrozenMap[QuantisedNoise] = field(default_factory=FrozenMap)
+    passed: FrozenMap[PassedNoise] = field(default_factory=FrozenMap)
 
     def applied(self, signal: Array, time: Array, output: str, where: str) -> Array:
         """Return the signal over the compared instants, (m,) or (m, p), as a residual: (n,) or (n, p)."""
@@ -192,10 +201,11 @@ class Treatment:
             signal = whitened(signal, model, segments(time, where))
         return signal if self.band is None else transformed(signal, time, self.band, where)
 
-    def quantised(self, output: str) -> QuantisedNoise | None:
+    def quantised(self, output: str, experiment: str) -> QuantisedNoise | None:
         """Return the quantised noise of an output; None where there is none, in a spectrum, and where residuals are whitened."""
-        known = self.quantised_noise.get(output)
-        return None if self.band is not None or any(self.whitening.get(output, ())) else known
+        if self.band is not None or experiment in self.passed or any(self.whitening.get(output, ())):
+            return None
+        return self.quantised_noise.get(output)
 
 
 def residual_blocks(
@@ -236,7 +246,7 @@ def residual_blocks(
         y, dy = observed.values[output], observed.gradient[output]
         misfit = record.values - (y if record.whole else y[record.rows])
         slopes = -(dy if record.whole else dy[record.rows])
-        quantised = treatment.quantised(output) if record.profile is None else None
+        quantised = treatment.quantised(output, experiment.name) if record.profile is None else None
         if quantised is not None:
             residual, slope = quantised.residual(misfit)
             jacobian, spare = slopes * slope[:, None], quantised.spare
@@ -256,7 +266,94 @@ def residual_blocks(
         )  # fmt: skip
         blocks.append(block)
         raw.append(slopes[:, k : k + len(eliminated)])
+    if experiment.name in treatment.passed:
+        blocks = _whitened_together(blocks, [experiment.time[b.rows] for b in blocks], treatment)
     return eliminate_initial_states(blocks, raw, slice(k, k + len(eliminated))) if eliminated else tuple(blocks)
+
+
+def _whitened_together(
+    blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: Treatment
+) -> list[ResidualBlock]:
+    rows = np.vstack([np.column_stack([b.residual, b.jacobian]) for b in blocks])
+    rows = whitened_together(rows, blocks, times, treatment)
+    parts = np.split(rows, np.cumsum([b.residual.size for b in blocks])[:-1])
+    return [
+        replace(b, residual=np.ascontiguousarray(part[:, 0]), jacobian=part[:, 1:])
+        for b, part in zip(blocks, parts, strict=True)
+    ]
+
+
+def whitened_together(
+    rows: Array, blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: Treatment
+) -> Array:
+    """Return treated values of all blocks of an experiment, (N,) or (N, p), whitened by the noise that its inputs pass on, too.
+
+    times: by block, (m,) the instants of its rows. Each row is freed of what those before it, of all outputs, tell of it.
+    """
+    white = rows
+    for part in _parts(blocks, times, treatment):
+        white = white.copy() if white is rows else white
+        white[part.at] = solve_triangular(part.lower, rows[part.at], lower=True, check_finite=False)
+    return white
+
+
+def passed_draws(
+    blocks: Sequence[ResidualBlock],
+    times: Sequence[Array],
+    treatment: Treatment,
+    count: int,
+    random: np.random.Generator,
+) -> Array:
+    """Return (N, count) what draws of the noise that an experiment's inputs pass on add to the treated values of its blocks."""
+    drawn = np.zeros((sum(b.residual.size for b in blocks), count))
+    for part in _parts(blocks, times, treatment):
+        drawn[part.at] = part.caused @ random.standard_normal((part.caused.shape[1], count))
+    return drawn
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Rows of an experiment's blocks that are whitened together. at: (m,) their places, in the order of time.
+
+    caused: (m, k) what independent causes of standard deviation 1 make of them; lower: (m, m) the factor of their covariance.
+    """
+
+    at: NDArray[np.intp]
+    caused: Array
+    lower: Array
+
+
+def _parts(blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: Treatment) -> tuple[_Part, ...]:
+    """Return the parts of an experiment's blocks; none where its inputs pass on no noise."""
+    passed = treatment.passed.get(blocks[0].experiment)
+    if passed is None:
+        return ()
+    profiles = [None if b.profile is None else b.profile.tobytes() for b in blocks]
+    outputs = [(b.output, t.tobytes(), b.sigma, p) for b, t, p in zip(blocks, times, profiles, strict=True)]
+    return _parts_of(passed, tuple(outputs), treatment)
+
+
+@lru_cache(maxsize=4)
+def _parts_of(
+    passed: PassedNoise, outputs: tuple[tuple[str, bytes, float, bytes | None], ...], treatment: Treatment
+) -> tuple[_Part, ...]:
+    """Return the parts. outputs: of each block its output, the instants of its rows, standard deviation and profile."""
+    answers, places = [], []
+    for k, (output, instants, sigma, profile) in enumerate(outputs):
+        time = np.frombuffer(instants)
+        level = np.zeros((time.size, len(outputs)))  # each by itself
+        level[:, k] = OPEN * sigma if output in passed.levels else 0.0
+        caused = np.hstack([passed.answers(output, time), level])
+        caused = per_deviation(caused, sigma, None if profile is None else np.frombuffer(profile))
+        answers.append(treatment.applied(caused, time, output, "the noise of inputs"))
+        places.append(time if treatment.band is None else np.zeros(answers[-1].shape[0]))
+    whole, order = np.vstack(answers), np.argsort(np.concatenate(places), kind="stable")
+    found = []
+    for at in np.array_split(order, -(-order.size // MOST)):
+        covariance = whole[at] @ whole[at].T
+        covariance[np.diag_indices(at.size)] += 1.0
+        found.append(_Part(at, whole[at], cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)))
+    return tuple(found)
 
 
 def transformed(signal: Array, time: Array, band: Band, where: str) -> Array:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import sympy as sp
@@ -263,9 +264,21 @@ class Model(Shown):
             )
         )
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the definition alone, which travels to another process: symbols hash anew there."""
-        return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _unpacked, (self._packed,)
+
+    @cached_property
+    def _packed(self) -> bytes:
+        """The definition alone, which travels to another process: symbols hash anew there."""
+        return pickle.dumps({k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__})
+
+
+@lru_cache(maxsize=128)
+def _unpacked(packed: bytes) -> Model:
+    """Return the model of a packed definition: of hundreds of jobs on one model each brings it, and sympy simplifies it anew."""
+    model = object.__new__(Model)
+    model.__dict__.update(pickle.loads(packed))  # by this package, as all that workers are sent
+    return model
 
 
 class External(Protocol):

@@ -1,5 +1,6 @@
 """Plants of standard components: units at an infinite bus or at a recorded voltage, wired by the names of their signals."""
 
+from hvdc_ident.plants.places import block_signals
 from hvdc_ident.plants.records import RecordedUnit, machine_records, recorded_unit, with_unit_values
 from hvdc_ident.plants.unit import LEVELS, MACHINE, UnitPart, parts_of, shelf_model, unit_card
 
@@ -8,6 +9,7 @@ __all__ = [
     "MACHINE",
     "RecordedUnit",
     "UnitPart",
+    "block_signals",
     "machine_records",
     "parts_of",
     "recorded_unit",

@@ -314,17 +314,19 @@ class Engine:
 
 @lru_cache(maxsize=64)
 def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[Any, ...]:
-    """Return the tables that an integration reads of its inputs: start values, breaks, then the pieces of all of them and their points."""
+    """Return the tables that an integration reads of its inputs: start values, stops, then the pieces of all of them and their points."""
     # "At the first row" is what stood before anything happened: the value from the left.
     u = [
         float(i.values[0] if i.times.size == 1 or i.times[0] >= begin else i(np.nextafter(begin, -np.inf)))
         for i in inputs
     ]
-    breaks = np.array(sorted({b for i in inputs if i.breaks.size for b in i.breaks.tolist() if begin < b < end}))
+    at = np.unique(np.concatenate([np.empty(0), *(i.stops for i in inputs)]))
+    at = at[(begin < at) & (at < end)]
+    stops = np.vstack([at, np.isin(at, np.concatenate([np.empty(0), *(i.breaks for i in inputs)]))])
     pointer = np.cumsum([0, *(i.times.size for i in inputs)]).astype(np.int64)
     times = np.concatenate([i.times for i in inputs]) if inputs else np.empty(0)
     values = np.concatenate([i.values for i in inputs]) if inputs else np.empty(0)
-    return np.array(u), breaks, pointer, times, values
+    return np.array(u), stops, pointer, times, values
 
 
 ROOM = 128

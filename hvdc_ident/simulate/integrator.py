@@ -348,7 +348,7 @@ def end_segment(r):  # type: ignore[no-untyped-def]
         write_row(r, r.y)
     breaks, echo, jump = vector(r.breaks, r.n_breaks), vector(r.echo, r.echoes * line), vector(r.jump_p, width)
     r.order = 0.0
-    r.disturbed = r.i_break < r.n_breaks and breaks[r.i_break] <= r.t
+    r.disturbed = 0
     kept = 0
     for i in range(r.echoes):
         at = echo[i * line]
@@ -364,7 +364,10 @@ def end_segment(r):  # type: ignore[no-untyped-def]
     r.echoes = kept
     if r.echo_now and width:
         evaluate(r, r.do_f, r.y, r.f_before)
+    returns = vector(r.breaks + 8 * r.n_breaks, r.n_breaks)
     while r.i_break < r.n_breaks and breaks[r.i_break] <= r.t:
+        if returns[r.i_break] > 0.0:
+            r.disturbed = 1
         r.i_break += 1
     r.first = 0
 
@@ -487,9 +490,10 @@ def integrate(a):  # type: ignore[no-untyped-def]
     a: state, a RUN record as integers, with sizes, functions and method; on return it holds the counts. work, zeros, as
     many doubles as `arrange` asks for. span, start and end; on return its first is the time reached. tolerance: relative,
     absolute. y, the flat start vector, consistent to solver tolerance, w and p. constants: delay times, sampling periods
-    and compute times with their rows. breaks, then pointer, times and values of the inputs' pieces. t_out, out. scale of
-    each parameter. heads, (switches + 1, HEAD): functions and sizes of the slide on each switch, 0 where it is not compiled,
-    then those without a slide; in a they are large enough for all of them.
+    and compute times with their rows. breaks, (2, n): instants at which a step ends, and whether delays bring them back; then
+    pointer, times and values of the inputs' pieces. t_out, out. scale of each parameter. heads, (switches + 1, HEAD): functions
+    and sizes of the slide on each switch, 0 where it is not compiled, then those without a slide; in a they are large enough for
+    all of them.
     """
     r = record(address(a, 0))
     r.free = address(a, 1)
@@ -497,7 +501,7 @@ def integrate(a):  # type: ignore[no-untyped-def]
     r.start, r.end, r.rtol, r.atol = span[0], span[1], tolerance[0], tolerance[1]
     arrange(r)
     r.p, r.constants, r.scale = address(a, 6), address(a, 7), address(a, 14)
-    r.breaks, r.n_breaks = address(a, 8), length(a, 8, 0)
+    r.breaks, r.n_breaks = address(a, 8), length(a, 8, 1)
     r.pointer, r.times, r.values = address(a, 9), address(a, 10), address(a, 11)
     r.t_out, r.n_out, r.out = address(a, 12), length(a, 12, 0), address(a, 13)
     r.heads, r.here = address(a, 15), address(a, 0)

@@ -9,7 +9,17 @@ from pathlib import Path
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.plants import LEVELS, MACHINE, RecordedUnit, machine_records, recorded_unit, shelf_model, unit_card
+from hvdc_ident.model import read_card
+from hvdc_ident.plants import (
+    LEVELS,
+    MACHINE,
+    RecordedUnit,
+    block_signals,
+    machine_records,
+    recorded_unit,
+    shelf_model,
+    unit_card,
+)
 from hvdc_ident.psse import read_dyr, read_raw
 from hvdc_ident.study.new_study import DyrOfStudy, NewStudy, new_study
 from hvdc_ident.study.recordings import level_before
@@ -20,6 +30,10 @@ FLAGS = FrozenMap({"Kvp": ("QFLAG",), "Kqp": ("QFLAG", "VFLAG")})
 """Flags of its part that must be 1 for a parameter to count."""
 COMMANDS = ("Pm", "Efd", "Ipcmd", "Iqcmd")
 """Inputs of a machine or converter that its controls give."""
+SEEN = ("P", "Q")
+"""Outputs that are recorded at the terminals."""
+PLAYBACK = "playback"
+"""Component whose inputs are recorded there."""
 SPAN = 4.0
 """Factor from the given value to either bound."""
 
@@ -69,7 +83,7 @@ def new_unit_study(folder: str | Path, recordings: str | Path | Sequence[str | P
 
     # Levels are known once the columns are mapped, and those are mapped to the signals of the card.
     write({})
-    about = DyrOfStudy(asked.dyr, asked.bus, records[0].machine, unit.unknown, _candidates(unit), _places(unit))
+    about = DyrOfStudy(asked.dyr, asked.bus, records[0].machine, unit.unknown, _candidates(unit), _places(unit, card))
     try:
         found = new_study(folder, recordings, card, dyr=about)
     except InputError:
@@ -89,11 +103,14 @@ def _levels(found: NewStudy) -> dict[str, float]:
     return own | {n: level_before(experiment.time, v, experiment.event) for n, v in recorded.items()}
 
 
-def _places(unit: RecordedUnit) -> tuple[str, ...]:
-    """Return patterns of the controls' insertion points and of the outputs: what lacks in a machine's own equations is no effect."""
+def _places(unit: RecordedUnit, card: Path) -> tuple[str, ...]:
+    """Return the signals of the controls, what they act on and the outputs: what lacks in a machine's own equations is no effect."""
     controls = [n for n in unit.parts if n != MACHINE]
+    if not controls:
+        return ()
     commands = [n for n in COMMANDS if n in shelf_model(unit.parts[MACHINE].source).inputs]
-    return (*(f"{n}.*" for n in controls), *(f"{MACHINE}.{n}" for n in commands), "P", "Q") if controls else ()
+    patterns = (*(f"{n}.*" for n in controls), *(f"{MACHINE}.{n}" for n in commands), *SEEN)
+    return block_signals(read_card(card), patterns, shelf_model(PLAYBACK).inputs, SEEN)
 
 
 def _candidates(unit: RecordedUnit) -> dict[str, tuple[float, float]]:

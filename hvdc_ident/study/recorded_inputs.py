@@ -22,10 +22,11 @@ def fitted_records(study: Study) -> tuple[Simulator, tuple[Experiment, ...]]:
     """Return the simulator and the experiments of a study's fit, measured frequency responses among them.
 
     A recorded input has noise, which the model follows before the event while the plant rests: what the model leaves of an output there is
-    the noise of a fit, where the study does not state one. Raises StudyError as `with_responses`.
+    the noise of a fit, where the study does not state one. Where the noise of the inputs is known, that of outputs is their own
+    (`PassedNoise`). Raises StudyError as `with_responses`.
     """
     simulator, experiments = with_responses(study.model, study.experiments, study.responses)
-    noisy = [e for e in experiments if e.domain == "time" and e.outputs and _is_moved(e)]
+    noisy = [e for e in experiments if e.domain == "time" and e.outputs and not e.input_noise and _is_moved(e)]
     runs: dict[str, Mapping[str, Array]] = {}
     for e in noisy:
         with suppress(SimulationError):  # the fit says so where it is run

@@ -20,6 +20,7 @@ from hvdc_ident.data import (
     before_event,
     conversion,
     event_time,
+    input_noise,
     input_signal,
     noise_estimate,
     noise_floor,
@@ -252,12 +253,15 @@ def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapp
     One row of a noisy input would put the references off by its noise, which a voltage control multiplies.
     """
     levels = {n: level_before(experiment.time, v, experiment.event) for n, v in mapped.items()}
-    inputs = {
-        n: replace(i, values=np.concatenate([[levels[n]], i.values[1:]])) if i.times.size > 1 else i
-        for n, i in experiment.inputs.items()
-    }
+    inputs = {n: i.begun_at(levels[n]) for n, i in experiment.inputs.items()}
     values = {n: levels[o] for n, o in table.trim.items()}
-    return experiment.with_(inputs=inputs, values=experiment.values | values)
+    noise = {n: input_noise(experiment.time, mapped[n], experiment.event) for n in inputs}
+    return experiment.with_(
+        inputs=inputs,
+        values=experiment.values | values,
+        input_noise={n: found for n, found in noise.items() if found.any},
+        levels=tuple(dict.fromkeys(table.trim.values())),
+    )
 
 
 def level_before(time: Array, values: Array, event: float | None) -> float:

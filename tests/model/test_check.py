@@ -73,6 +73,14 @@ def test_a_model_travels_to_another_process() -> None:
     assert pickle.loads(pickle.dumps(motor())) == motor()
 
 
+def test_a_model_that_is_sent_twice_is_there_once():
+    first, second = (pickle.loads(pickle.dumps([motor()]))[0] for _ in range(2))
+    assert first is second
+    other = motor().with_values({next(iter(motor().parameters)): 0.123})
+    there = pickle.loads(pickle.dumps(other))
+    assert there == other and there != first and there.origin is not None and there.origin.root == motor()
+
+
 def test_a_factored_expression_is_stored_as_it_reads_back() -> None:
     x = symbol("v")
     kept_apart = sp.Mul(2, x + 1, evaluate=False)

@@ -1,0 +1,100 @@
+"""The signals of a unit's block diagram: what of its insertion points carries a moving quantity to the outputs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Sequence
+from fnmatch import fnmatchcase
+
+import sympy as sp
+
+from hvdc_ident.expression import symbol
+from hvdc_ident.model import Model, insertion_point
+
+
+def block_signals(model: Model, patterns: Sequence[str], moving: Collection[str], outputs: Collection[str]) -> tuple[str, ...]:
+    """Return the insertion points that one of the patterns matches and that are signals of the block diagram.
+
+    moving: inputs that move; outputs: that are seen. With the parameters at their values, so that the flags choose branches, a signal
+    depends on an input that moves or on a state that does, and an output depends on it. It is a quantity: saturation, flags and
+    factors, which have no unit, are part of a block. Of two names of one signal, one of which is used by the other alone, the first
+    counts: it is the same place.
+    """
+    diagram = _Diagram(model)
+    live = diagram.reached_from(moving) & diagram.leading_to(outputs)
+    found = []
+    for place in model.insertion_points:
+        kind, name = insertion_point(model, place)
+        if not any(fnmatchcase(place, p) for p in patterns):
+            continue
+        if kind == "output":
+            if name in outputs:
+                found.append(place)
+        elif name in live and diagram.unit(name) and not diagram.is_other_name(name, patterns, live):
+            found.append(place)
+    return tuple(found)
+
+
+class _Diagram:
+    """What each signal, state and output of a model depends on, with the parameters at their values."""
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        known = {symbol(n): sp.Float(p.value) for n, p in model.parameters.items()}
+        self._own = {
+            **{n: s.value for n, s in model.signals.items()},
+            **{n: s.derivative for n, s in model.states.items()},
+            **{n: a.equation for n, a in model.algebraic.items()},
+        }
+        outputs = {n: o.value for n, o in model.outputs.items() if n not in self._own}
+        constants: dict[sp.Symbol, sp.Expr] = dict(known)
+        size = 0
+        while len(constants) > size:  # what is made of constants is one: a flag may hang on several
+            size = len(constants)
+            self._own = {n: e.xreplace(constants) for n, e in self._own.items()}
+            constants |= {symbol(n): e for n in model.signals if not (e := self._own[n]).free_symbols}
+        self._own |= {n: e.xreplace(constants) for n, e in outputs.items()}
+        self._uses = {n: {s.name for s in e.free_symbols} for n, e in self._own.items()}
+
+    def reached_from(self, inputs: Iterable[str]) -> set[str]:
+        """Return what moves: the inputs, the states with a derivative that is not 0, and what depends on them."""
+        states = {n for n in self._model.states if self._own[n] != 0} | set(self._model.algebraic)
+        found, left = set[str](), [*inputs, *states]
+        users = self._users()
+        while left:
+            name = left.pop()
+            if name not in found:
+                found.add(name)
+                left += [n for n in users.get(name, ()) if n not in self._model.states]
+        return found
+
+    def leading_to(self, outputs: Iterable[str]) -> set[str]:
+        """Return what the outputs depend on."""
+        found, left = set[str](), list(outputs)
+        while left:
+            name = left.pop()
+            if name not in found:
+                found.add(name)
+                left += self._uses.get(name, ())
+        return found
+
+    def unit(self, name: str) -> str:
+        """Return the unit of a signal, a state or an unknown; empty where it has none."""
+        for table in (self._model.signals, self._model.states, self._model.algebraic, self._model.inputs):
+            if name in table:
+                return str(table[name].unit)
+        return ""
+
+    def is_other_name(self, name: str, patterns: Sequence[str], live: Collection[str]) -> bool:
+        """Return whether a signal is another one of the patterns', which nothing else uses of what is live."""
+        source = self._own.get(name)
+        if name not in self._model.signals or not isinstance(source, sp.Symbol):
+            return False
+        known = source.name in self._model.insertion_points and any(fnmatchcase(source.name, p) for p in patterns)
+        return known and [n for n in self._users()[source.name] if n in live] == [name]
+
+    def _users(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {}
+        for n, used in self._uses.items():
+            for name in used:
+                found.setdefault(name, []).append(n)
+        return found
