@@ -19,7 +19,7 @@ from hvdc_ident.discrepancy.explain import at_given, beside_stand_ins, found_of,
 from hvdc_ident.discrepancy.findings import separating
 from hvdc_ident.discrepancy.forms import DescribedForm, best_form, described, disturbance_course, refitted_forms
 from hvdc_ident.discrepancy.hypothesis import Refit, judged
-from hvdc_ident.discrepancy.location import localise, responses
+from hvdc_ident.discrepancy.location import localise
 from hvdc_ident.discrepancy.moves import clock_sentence, clocks, stated
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
@@ -193,7 +193,6 @@ def _assembled(
         tests = tests_of(search, last)
     augmented = last.model.with_values(_own(last)) if last.placed else None
     given = at_given(first, {f.name: f.given for f in free})
-    responses_found = responses(model, first, augmented, last)
     sets = tuple(g for g in judgement.sets if len(g) > 1 or judgement.doubt)
     rest = remaining(first, last, tests, search)
     beyond = leaves_more_than_noise(
@@ -232,7 +231,6 @@ def _assembled(
         parameters_after=FrozenMap({f.name: last.values.get(f.name, f.given) for f in free}),
         augmented=augmented,
         fallback=None if other is None else other.to_dict(),
-        bode=responses_found,
         noise={o: noise_told(n) for o, n in first.noise.items()},
         notes=notes,
         doubt=judgement.doubt,

@@ -224,8 +224,8 @@ class Diagnosis(Shown):
     gap: before and after. remaining: what is left. beyond_noise: whether that is more than noise; the values and
     the intervals then hold only if nothing else is missing. parameters_*: by name; `parameters_refitted` are the
     nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in.
-    fallback: the form found outside the catalogue, if one was looked for. bode: responses of nominal and augmented
-    models with the data's. noise: standard deviation and AR coefficient by output, and where they come from.
+    fallback: the form found outside the catalogue, if one was looked for. noise: standard deviation and AR coefficient by output,
+    and where they come from.
     findings: what is missing, each effect with its probability and its likely places, the likeliest first. remainder: {share of
     the gap, held_out, noise_units, p, at, below_tolerance}. hypotheses: those compared, the likeliest first.
     values_by_place: of each parameter whose value depends
@@ -247,7 +247,6 @@ class Diagnosis(Shown):
     parameters_after: FrozenMap[float]
     augmented: AnyModel | None = None
     fallback: Mapping[str, Any] | None = None
-    bode: tuple[Mapping[str, Any], ...] = ()
     noise: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     doubt: str = ""

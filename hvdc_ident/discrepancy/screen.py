@@ -180,6 +180,11 @@ class Sketch:
         to, sign = self._sums
         return np.asarray(np.bincount(to, sign * column, SKETCHED), dtype=float)
 
+    def kept(self, answer: Array) -> NDArray[np.float32]:
+        """Return (m,) of an answer (N,) in half the digits; one that runs away is as large as they let."""
+        most = float(np.finfo(np.float32).max)
+        return np.clip(self(answer), -most, most).astype(np.float32)
+
 
 @dataclass(frozen=True, eq=False)
 class ScreenSetup:
@@ -350,7 +355,7 @@ def _screened_batch(batch: _Batch) -> _BatchResult:
         found.scores.append(Score(*column, chi2 - fell, setup.point + step, factor, setup.point))
         left = nominal.projected((was - r)[:, None])[:, 0]
         found.size[column], found.left[column] = float(np.sum((was - r) ** 2)), float(left @ left)
-        found.answers[column] = sketch(r - was).astype(np.float32)
+        found.answers[column] = sketch.kept(r - was)
         if several:
             answers[column] = was - r
         if found.size[column] >= EXCITED_CHI2 and found.left[column] > LEAST_SHARE_LEFT * found.size[column]:
@@ -396,7 +401,7 @@ def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: 
         step, fell, factor = setup.without.stepped(-answer, UP_TO_ONE)
         left = nominal.projected(answer[:, None])[:, 0]
         found.size[k, n], found.left[k, n] = float(answer @ answer), float(left @ left)
-        found.answers[k, n] = Sketch(answer.size)(-answer).astype(np.float32)
+        found.answers[k, n] = Sketch(answer.size).kept(-answer)
         found.scores.append(Score(k, n, chi2 - fell, setup.point + step, factor))
 
 

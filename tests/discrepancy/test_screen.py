@@ -149,6 +149,7 @@ def test_a_sketch_keeps_products() -> None:
     a, b = sketch(mixed), sketch(one)
     assert a.size == SKETCHED and a @ b / np.linalg.norm(a) / np.linalg.norm(b) == pytest.approx(exact, abs=0.03)
     assert Sketch(100)(one[:100]).tolist() == one[:100].tolist()
+    assert np.isfinite(Sketch(3).kept(np.array([1e300, -1e300, 1.0]))).all()
 
 
 def test_the_largest_score_under_noise_is_that_of_a_direct_computation(lagged: Refit) -> None:

@@ -83,10 +83,6 @@ ELSEWHERE = ("The truth", "Measured frequency responses", "Global sensitivity")
 CONTROLS = "a[href], button, input, summary, select, textarea"
 
 
-def _response(*values: float) -> list[list[float]]:
-    return [[v, -0.3 * v] for v in values]
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results with every part of the page: stages that ran, and a diagnosis as JSON."""
@@ -100,10 +96,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.exit_code == 0, done.output
     fit = json.loads((results / "fit.json").read_text("utf-8"))
     heading = {k: fit[k] for k in ("schema", "study", "model", "software", "seed", "sources")}
-    bode = [{"input": "Pref2", "output": "P2", "omega": [10.0, 100.0, 1000.0]}]
-    bode[0] |= {k: _response(1.0, 0.7, 0.1) for k in ("data", "nominal", "augmented")}
     candidate = {"effect": "lag", "at": ["P2_m"], "score": 9e4, "p": 0.005, "delta_bic": 8e4, "holdout_rmse": 1.1}
-    found = diagnosis(**heading, bode=bode, candidates=[candidate], notes=["a note"])
+    found = diagnosis(**heading, candidates=[candidate], notes=["a note"])
     found["gap"]["pooled"] = {
         m: {"fit": v, "holdout": 1.1 * v} for m, v in (("nominal", 20.0), ("refitted", 4.0), ("augmented", 1.0))
     }

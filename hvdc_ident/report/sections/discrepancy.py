@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hvdc_ident.report.answers import beyond_noise, places_of
-from hvdc_ident.report.drawing import AFTER, BEFORE, EFFECT, MARK, MEASURED, figure, svg, visible
+from hvdc_ident.report.drawing import AFTER, EFFECT, MEASURED, figure, svg, visible
 from hvdc_ident.report.html import captioned, estimate, folded, number, percent, table, text
 from hvdc_ident.report.results import Results, Section
 from hvdc_ident.text import form_of, listed, one_of, percentage, span, value_by_place, with_unit
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 MODELS = {"nominal": "given values", "refitted": "refitted, nothing added", "augmented": "with the effect"}
@@ -24,8 +23,6 @@ SHOWN = 5e-3
 """A smaller share of the gap is none."""
 PLACES = 4
 """Likely places that are shown of each effect."""
-CHANNELS = 3
-"""Channels that are drawn, those in which the record tells most frequencies: more would be too small to read."""
 
 
 def _render(results: Results) -> str:
@@ -46,7 +43,6 @@ def _render(results: Results) -> str:
             folded(
                 "Where model and recordings differ", _where(found), "Signals, times, frequencies and levels of the gap."
             ),
-            folded("Frequency responses", _responses(found), "Of model and recording, from the inputs that moved."),
             folded("Hypotheses compared", _sets(found) + _candidates(found), compared),
             notes,
         ]
@@ -152,14 +148,6 @@ def _gap(found: dict[str, Any]) -> str:
     )
     note = "<p class='small'>Rows on a jump of an input are left out here: no recorder tells which side they show.</p>"
     return captioned(picture, caption) + line + note
-
-
-def _responses(found: dict[str, Any]) -> str:
-    channels = [c for c in found.get("bode") or [] if c.get("omega")]
-    if not channels:
-        return ""
-    drawn = svg(bode(channels), "frequency responses of model and record")
-    return captioned(drawn, "Frequency responses of recording and model, gain above phase.")
 
 
 def _slider(sizes: dict[str, Any] | None) -> str:
@@ -297,48 +285,6 @@ def hidden_curve(at: str, curve: Mapping[str, Any]) -> Figure:
     axes.set_xlabel("time, s" if curve["over"] == "time" else str(curve["over"]))
     axes.set_ylabel(f"added to {at}")
     return fig
-
-
-def bode(channels: Sequence[Mapping[str, Any]]) -> Figure:
-    """Gain above phase over frequency for each channel, beside each other: the record, the nominal and the augmented model."""
-    most = sorted((c for c in channels if c.get("omega")), key=lambda c: -len(c["omega"]))[:CHANNELS]
-    shown = [c for c in channels if c in most]
-    wide = 3.2 * max(len(shown), 1)
-    edges = {"left": 0.62 / wide, "right": 1.0 - 0.1 / wide, "wspace": 0.2, "bottom": 0.11, "top": 0.93, "hspace": 0.08}
-    fig = figure(wide, 4.6, edges)
-    for k, c in enumerate(shown):
-        above = fig.add_subplot(2, len(shown), k + 1)
-        below = fig.add_subplot(2, len(shown), len(shown) + k + 1, sharex=above)
-        _channel(above, below, c)
-        if k == 0:
-            above.legend(fontsize="small")
-            for axes, label in ((above, "gain, dB"), (below, "phase, degrees")):
-                axes.set_ylabel(label)
-                axes.yaxis.set_label_coords(-0.17, 0.5)
-    return fig
-
-
-def _channel(above: Axes, below: Axes, c: Mapping[str, Any]) -> None:
-    """Draw one channel's gain and phase."""
-    looks = (("data", MEASURED, "record"), ("nominal", BEFORE, "refitted"), ("augmented", AFTER, "with effect"))
-    f = np.array(c["omega"]) / (2 * np.pi)
-    for key, colour, label in looks:
-        if not c.get(key):
-            continue
-        h = np.array(c[key])[:, 0] + 1j * np.array(c[key])[:, 1]
-        style: dict[str, Any] = (
-            {"linestyle": "none", "marker": ".", "markersize": 4} if key == "data" else {"linewidth": 1.3}
-        )
-        keep = np.abs(h) > 0
-        above.semilogx(f[keep], 20 * np.log10(np.abs(h[keep])), color=colour, label=label, **style)
-        below.semilogx(f[keep], np.degrees(np.unwrap(np.angle(h[keep]))), color=colour, **style)
-    above.set_title(f"{c['input']} to {c['output']}", fontsize="small")
-    above.tick_params(labelbottom=False)
-    below.set_xlabel("frequency, Hz")
-    for axes in (above, below):
-        axes.grid(True, color=MARK, alpha=0.3)
-        axes.tick_params(labelsize=7)
-        axes.minorticks_off()  # over three decades nobody reads them, and they take half of the time to draw
 
 
 SECTION = Section(
