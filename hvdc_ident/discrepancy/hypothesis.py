@@ -74,7 +74,7 @@ def begins_anywhere(model: AnyModel, without: AnyModel, uses: Sequence[EffectUse
 
 def _determinant(model: Model) -> float | None:
     """Sign of the determinant of the equations at the model's own steady state; None where it has none."""
-    anchor = equilibria(model).anchor(model, np.array([i.value for i in model.inputs.values()]))
+    anchor = equilibria(model).reference(model, np.array([i.value for i in model.inputs.values()]))
     return None if anchor is None else anchor.sign
 
 

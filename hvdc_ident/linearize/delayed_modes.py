@@ -9,7 +9,7 @@ import numpy as np
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.characteristic import Part
-from hvdc_ident.linearize.delays import DelayFree
+from hvdc_ident.linearize.delays import DelayFreePart
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.modal import Mode
 from hvdc_ident.linearize.operating_point import ZERO
@@ -126,7 +126,7 @@ class _Direction:
     times: tuple[Array, ...]
 
     @classmethod
-    def of(cls, core: DelayFree, gradient: Gradient, places: Array) -> _Direction:
+    def of(cls, core: DelayFreePart, gradient: Gradient, places: Array) -> _Direction:
         assert gradient.delay_free is not None
         n = core.nx
         rows, columns = (np.where(places < n, places, places + k) for k in (core.no, core.nu))

@@ -1,6 +1,6 @@
 """Elimination of algebraic unknowns, and delays and sampled blocks of a linear model: Pade approximants and exact responses.
 
-`DelayFree` is a linear model before its delays are approximated, from which the exact frequency response is computed;
+`DelayFreePart` is a linear model before its delays are approximated, from which the exact frequency response is computed;
 `Blocks` is the matrix over states, inputs and unknowns in which Pade states stand for the delays.
 """
 
@@ -18,7 +18,7 @@ from hvdc_ident.model import Model
 
 
 @dataclass(frozen=True, eq=False)
-class Eliminated:
+class SchurComplement:
     """result = a - b d^-1 c. condition: of d, its rows and columns scaled; left = b d^-1, right = d^-1 c."""
 
     result: Array
@@ -31,27 +31,27 @@ class Eliminated:
         return np.asarray(da - db @ self.right - self.left @ dc + self.left @ dd @ self.right)
 
 
-def eliminate(matrix: Array, rows: int, columns: int) -> Eliminated:
+def eliminate(matrix: Array, rows: int, columns: int) -> SchurComplement:
     """Return the Schur complement that removes the rows and columns after the given counts.
 
     A singular block gives the condition infinity and a result that must not be used.
     """
     a, b, c, d = matrix[:rows, :columns], matrix[:rows, columns:], matrix[rows:, :columns], matrix[rows:, columns:]
     if d.shape[0] == 0:
-        return Eliminated(a, 1.0, b, c)
+        return SchurComplement(a, 1.0, b, c)
     size_r = np.abs(d).max(axis=1)
     if not (size_r > 0).all() or not np.isfinite(matrix).all():
-        return Eliminated(a, np.inf, b, c)
+        return SchurComplement(a, np.inf, b, c)
     scaled = d / size_r[:, None]
     size_c = np.abs(scaled).max(axis=0)
     if not (size_c > 0).all():
-        return Eliminated(a, np.inf, b, c)
+        return SchurComplement(a, np.inf, b, c)
     condition = float(np.linalg.cond(scaled / size_c))
     if not np.isfinite(condition) or condition > 1e15:
-        return Eliminated(a, np.inf, b, c)
+        return SchurComplement(a, np.inf, b, c)
     inverse = np.linalg.inv(scaled / size_c) / size_c[:, None] / size_r[None, :]
     right = np.linalg.solve(d, c)
-    return Eliminated(a - b @ right, condition, b @ inverse, right)
+    return SchurComplement(a - b @ right, condition, b @ inverse, right)
 
 
 MAX_ORDER = 12
@@ -178,7 +178,7 @@ def _order(size: Layout, inputs: list[int], closed: Sequence[int]) -> tuple[list
     return rows, columns
 
 
-def _core(size: Layout, jac: Array, inputs: list[int], closed: Sequence[int]) -> Eliminated:
+def _core(size: Layout, jac: Array, inputs: list[int], closed: Sequence[int]) -> SchurComplement:
     """Return the Jacobian over [x, inputs, delays' outputs], unknowns and delays of 0 s eliminated."""
     rows, columns = _order(size, inputs, closed)
     jac = jac.copy()
@@ -189,7 +189,7 @@ def _core(size: Layout, jac: Array, inputs: list[int], closed: Sequence[int]) ->
 
 
 @dataclass(frozen=True, eq=False)
-class DelayFree:
+class DelayFreePart:
     """matrix: rows [x', outputs, delayed], columns [x, inputs, delays' outputs], unknowns eliminated."""
 
     matrix: Array
@@ -201,7 +201,7 @@ class DelayFree:
     @classmethod
     def of(
         cls, size: Layout, jac: Array, inputs: list[int], found: tuple[Channel, ...], closed: Sequence[int] = ()
-    ) -> DelayFree:
+    ) -> DelayFreePart:
         """Return the core of a Jacobian (main rows, columns). closed: delays of 0 s by their place, which are none."""
         reduced = _core(size, jac, inputs, closed)
         if not np.isfinite(reduced.condition):
@@ -218,7 +218,7 @@ class DelayFree:
         d = djac[:, np.array(rows)[:, None], columns]
         return _core(size, jac, inputs, closed).derivative(d[:, :r, :c], d[:, :r, c:], d[:, r:, :c], d[:, r:, c:])
 
-    def without_zero_delays(self) -> DelayFree:
+    def without_zero_delays(self) -> DelayFreePart:
         """Return the core in which what a delay of 0 s gives is what it gets. Raises LinearizationError for a loop of gain 1."""
         closed = [k for k, c in enumerate(self.channels) if c.total == 0.0]
         if not closed:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, require_known
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.delays import Blocks, DelayFree, Eliminated, channels, eliminate
+from hvdc_ident.linearize.delays import Blocks, DelayFreePart, SchurComplement, channels, eliminate
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
@@ -105,7 +105,7 @@ def _closed(s: CompiledSystem, p: Array, parts: Blocks, names: Sequence[str]) ->
 
 def _eliminated(
     model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, side: Side, pade_order: int
-) -> tuple[Array, Array, Blocks, Eliminated]:
+) -> tuple[Array, Array, Blocks, SchurComplement]:
     """Return the switches' modes, the Jacobian, its blocks with delays, and these without the algebraic unknowns.
 
     Raises LinearizationError on a kink, and where an entry of the Jacobian is not finite.
@@ -145,7 +145,7 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
     _refuse_flat_roots(s, y, w, p, modes, model.name)
     found = channels(model, s, p)
     closed = [k for k, c in enumerate(found) if c.total == 0.0]
-    return Characteristic.of(DelayFree.of(s.layout, jac, list(range(s.layout.nu)), found, closed))
+    return Characteristic.of(DelayFreePart.of(s.layout, jac, list(range(s.layout.nu)), found, closed))
 
 
 def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:
@@ -261,7 +261,7 @@ def _gradient(
     parts: Blocks,
     jac: Array,
     modes: Array,
-    reduced: Eliminated,
+    reduced: SchurComplement,
     names: Sequence[str],
     chosen: list[int],
     closed: Sequence[int],
@@ -278,7 +278,7 @@ def _gradient(
     r, c = parts.rows, parts.columns
     changes = reduced.derivative(along[:, :r, :c], along[:, :r, c:], along[:, r:, :c], along[:, r:, c:])
     kept = [ch for k, ch in enumerate(parts.channels) if k not in closed]
-    core = DelayFree.derivative(s.layout, jac, djac, chosen, closed) if kept else None
+    core = DelayFreePart.derivative(s.layout, jac, djac, chosen, closed) if kept else None
     found = {}
     for k, name in enumerate(names):
         a, b, c_, d = parts.split(changes[k], chosen)
@@ -321,7 +321,7 @@ def _model(
     at: OperatingPoint,
     parts: Blocks,
     jac: Array,
-    reduced: Eliminated,
+    reduced: SchurComplement,
     chosen: list[int],
     keep: bool,
     gradient: dict[str, Gradient],
@@ -370,7 +370,7 @@ def _model(
         name=model.name,
         provenance=FrozenMap(notes),
         gradients=FrozenMap(gradient),
-        delay_free=DelayFree.of(s.layout, jac, chosen, parts.channels, closed)
+        delay_free=DelayFreePart.of(s.layout, jac, chosen, parts.channels, closed)
         if len(parts.channels) > len(closed)
         else None,
     )  # fmt: skip

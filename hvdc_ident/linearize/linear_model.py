@@ -13,7 +13,7 @@ import numpy as np
 from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.delays import DelayFree, eliminate
+from hvdc_ident.linearize.delays import DelayFreePart, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint
 from hvdc_ident.linearize.system import Array
 
@@ -65,7 +65,7 @@ class LinearModel(Shown):
     name: str = "model"
     provenance: FrozenMap[str] = field(default_factory=FrozenMap)
     gradients: FrozenMap[Gradient] = field(default_factory=FrozenMap)
-    delay_free: DelayFree | None = None
+    delay_free: DelayFreePart | None = None
     x0: tuple[float, ...] = ()
     u0: tuple[float, ...] = ()
     y0: tuple[float, ...] = ()

@@ -16,7 +16,7 @@ import scipy.linalg
 from scipy.sparse.csgraph import connected_components
 
 from hvdc_ident.linearize.characteristic import NEUTRAL, Part, Undecided, spectral_radius
-from hvdc_ident.linearize.delays import Channel, DelayFree
+from hvdc_ident.linearize.delays import Channel, DelayFreePart
 from hvdc_ident.linearize.sampling import multipliers
 from hvdc_ident.linearize.system import Array
 
@@ -71,7 +71,7 @@ class Characteristic:
     through: Array
 
     @classmethod
-    def of(cls, core: DelayFree) -> Characteristic:
+    def of(cls, core: DelayFreePart) -> Characteristic:
         """Return the equation of a linear model before its delays are approximated."""
         n, o, u, m = core.nx, core.no, core.nu, core.matrix
         rows = [*range(n), *range(n + o, m.shape[0])]

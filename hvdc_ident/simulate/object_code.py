@@ -225,7 +225,7 @@ def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -
 # --- the integrators ---
 
 ENTRIES = dict.fromkeys(("integrate", "room"), "integrator") | dict.fromkeys(
-    ("newton", "trace", "follow", "slide", "nearest", "judge"), "steady_state_kernels"
+    ("newton", "continuation", "pseudo_transient", "implicit_euler", "minimum_norm", "judge"), "steady_state_kernels"
 )
 """Functions of compiled code that Python calls, with their modules."""
 KERNEL_FILES = (

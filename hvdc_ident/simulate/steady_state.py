@@ -2,7 +2,7 @@
 
 A model may have several equilibria. Its own one is what the search from its guesses finds at its own values (`search`).
 At other values, and with effects put in, the steady state is the one that is connected with it: found by Newton's method
-where that cannot have left the branch, else followed along the values (`trace`), the effects put in by and by.
+where that cannot have left the branch, else followed along the values (`continuation`), the effects put in by and by.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ DOUBLINGS = 11  # of a hundredth of a state's size: to ten times that, beyond wh
 
 
 @dataclass(frozen=True)
-class Anchor:
+class ReferenceEquilibrium:
     """A known steady state: v = [x, z, delayed, sampled values] at parameters p and inputs u.
 
     sign: of the Jacobian's determinant there, 0 where it is singular.
@@ -74,7 +74,7 @@ class Equilibria:
         self.n, self.extra = s.nx + s.nz, s.nd + s.nq
         self._sizes = np.array([s.nx, self.n, 1 + s.nu, self.n + self.extra, s.width], dtype=np.int64)
         self._solve = entry("newton")
-        self._anchors: dict[tuple[Model, bytes], Anchor | None] = {}
+        self._references: dict[tuple[Model, bytes], ReferenceEquilibrium | None] = {}
         self.names = (*structure.states, *structure.unknowns, *structure.model.delays, *structure.model.sampled)
 
     # --- the steady state at given values ---
@@ -86,13 +86,13 @@ class Equilibria:
         SteadyStateError where none is found, or where the one that the model has at its own values ends before these.
         """
         p = np.ascontiguousarray(p, dtype=float)
-        anchor = self.anchor(model, u)
-        if anchor is None or not anchor.sign:
-            return self.search(p, u, time, None if anchor is None else anchor.v, search=search)
-        found = self._directly(anchor, p, u, time)
+        reference = self.reference(model, u)
+        if reference is None or not reference.sign:
+            return self.search(p, u, time, None if reference is None else reference.v, search=search)
+        found = self._directly(reference, p, u, time)
         if found is not None:
             return found
-        path = self._connected(model, anchor, p, u, time, search)
+        path = self._connected(model, reference, p, u, time, search)
         if path.ends == "arrived":
             found = self._newton(path.v, p, u, time)
             if found is not None:
@@ -118,7 +118,7 @@ class Equilibria:
                 raise self._not_at_once()
         return self._slowly(p, u, self._filled(self._guesses[0], p, u, time) if first is None else first, time)
 
-    def anchor(self, model: Model, u: Array) -> Anchor | None:
+    def reference(self, model: Model, u: Array) -> ReferenceEquilibrium | None:
         """The model's own steady state; None where it has none. u: what inputs rest at that the root of its origin lacks."""
         root = model.origin.root if model.origin else model
         own = tuple(model.inputs)
@@ -128,25 +128,25 @@ class Equilibria:
             else np.array([u[k] for k, n in enumerate(own) if n not in root.inputs]).tobytes()
         )
         key = (model, foreign)
-        if key not in self._anchors:
-            if len(self._anchors) >= ROOM:
-                self._anchors.clear()
-            self._anchors[key] = self._own(model) if root is model else self._inherited(model, root, u)
-        return self._anchors[key]
+        if key not in self._references:
+            if len(self._references) >= ROOM:
+                self._references.clear()
+            self._references[key] = self._own(model) if root is model else self._inherited(model, root, u)
+        return self._references[key]
 
     # --- the model's own steady state ---
 
-    def _own(self, model: Model) -> Anchor | None:
+    def _own(self, model: Model) -> ReferenceEquilibrium | None:
         """Return the steady state that the guesses lead to; where some states have one, the nearest of several searches.
 
         Newton's method may leave a guess for a far equilibrium, as where a limit holds on the way. Where it moves a guessed
-        state by more than its size, the slow ways, which stay near or follow the model, are asked too.
+        state by more than its size, the fallback solvers, which stay near or follow the model, are asked too.
         """
         p, u = _values(model)
         given = [(k, s.guess) for k, s in enumerate(model.states.values()) if s.guess is not None]
         if not given:
             try:
-                return self._anchored(p, u, self.search(p, u).v)
+                return self._referenced(p, u, self.search(p, u).v)
             except SteadyStateError:
                 return None
         places, guesses = [k for k, _ in given], np.array([g for _, g in given])
@@ -158,14 +158,14 @@ class Equilibria:
         begun = (self._newton(begin, p, u, 0.0) for begin in self._begins(p, u, 0.0))
         ends = [found.v for found in begun if found is not None and (np.abs(found.v) <= self._region.limit).all()]
         if not any(moved(v).max() <= 1.0 for v in ends):
-            slow = self._slow_ends(p, u, self._filled(self._guesses[0], p, u, 0.0), 0.0)
+            slow = self._fallback_ends(p, u, self._filled(self._guesses[0], p, u, 0.0), 0.0)
             ends += [v for v, _, _, shares in slow if self._region.holds(shares, v)]
         if not ends:
             return None
         # Ends that rounding alone sets apart are one: the first of them stands for all.
-        return self._anchored(p, u, min(ends, key=lambda v: float(np.round(np.linalg.norm(moved(v)), 6))))
+        return self._referenced(p, u, min(ends, key=lambda v: float(np.round(np.linalg.norm(moved(v)), 6))))
 
-    def _inherited(self, model: Model, root: Model, u: Array) -> Anchor | None:
+    def _inherited(self, model: Model, root: Model, u: Array) -> ReferenceEquilibrium | None:
         """The root's own steady state, taken over by name, with the model's effects put in and at the model's own values."""
         known = self._of_root(model, root)
         if known is None:
@@ -181,43 +181,45 @@ class Equilibria:
             if n in root.inputs:
                 u_root[k] = root.inputs[n].value
         v = self._filled(np.array([known.get(n, np.nan) for n in self.names]), p_root, u_root, 0.0)
-        begun: Anchor | None = self._anchored(p_root, u_root, v)
+        begun: ReferenceEquilibrium | None = self._referenced(p_root, u_root, v)
         _, _, shares = self._judged(v, p_root, u_root, 0.0)
         if not (shares < ACCURACY).all():
             path = (
                 self._blend(model, known, (p_root, u_root, 0.0), (p_root, u_root, 0.0)) if _has_effects(model) else None
             )
-            begun = self._anchored(p_root, u_root, path.v) if path is not None and path.ends == "arrived" else None
+            begun = self._referenced(p_root, u_root, path.v) if path is not None and path.ends == "arrived" else None
         if begun is None or not begun.sign or (np.array_equal(p_root, p_own) and np.array_equal(u_root, u_own)):
             return begun
         found = self._directly(begun, p_own, u_own, 0.0)
         if found is not None:
-            return Anchor(p_own, u_own, found.v, found.sign)
+            return ReferenceEquilibrium(p_own, u_own, found.v, found.sign)
         path = self._follow_first(_ways(begun, p_own, u_own, 0.0), begun.v, begun.sign)
-        return Anchor(p_own, u_own, path.v, begun.sign) if path.ends == "arrived" else begun
+        return ReferenceEquilibrium(p_own, u_own, path.v, begun.sign) if path.ends == "arrived" else begun
 
     def _of_root(self, model: Model, root: Model) -> dict[str, float] | None:
         """The root's own steady state by name: states, unknowns and signals."""
         same = root.structure == self.structure.model.structure
         at = self if same else equilibria(root)
-        anchor = at.anchor(root, np.array([i.value for i in root.inputs.values()]))
-        return None if anchor is None else dict(zip(at.names, anchor.v.tolist(), strict=True))
+        reference = at.reference(root, np.array([i.value for i in root.inputs.values()]))
+        return None if reference is None else dict(zip(at.names, reference.v.tolist(), strict=True))
 
-    def _anchored(self, p: Array, u: Array, v: Array) -> Anchor:
+    def _referenced(self, p: Array, u: Array, v: Array) -> ReferenceEquilibrium:
         found = self._newton(v, p, u, 0.0, HALVES)
-        return Anchor(p, u, v, 0.0 if found is None else found.sign)
+        return ReferenceEquilibrium(p, u, v, 0.0 if found is None else found.sign)
 
     # --- paths ---
 
-    def _connected(self, model: Model, anchor: Anchor, p: Array, u: Array, time: float, search: bool) -> Path:
+    def _connected(
+        self, model: Model, reference: ReferenceEquilibrium, p: Array, u: Array, time: float, search: bool
+    ) -> Path:
         """The way from the model's own steady state to the values; where it ends, from the root's, effects put in last.
 
         search: whether more ways than the straight one are tried.
         """
-        ways = _ways(anchor, p, u, time)
+        ways = _ways(reference, p, u, time)
         if not search:
-            return self._along(ways[0], anchor.v, anchor.sign, judged=False)
-        path = self._follow_first(ways, anchor.v, anchor.sign)
+            return self._along(ways[0], reference.v, reference.sign, judged=False)
+        path = self._follow_first(ways, reference.v, reference.sign)
         root = model.origin.root if model.origin else model
         if path.ends == "arrived" or not _has_effects(model):
             return path
@@ -265,7 +267,7 @@ class Equilibria:
         for k, (a, b) in enumerate(pairwise(way)):
             ends_p, ends_w = np.array([a[0], b[0]]), np.array([[a[2], *a[1]], [b[2], *b[1]]])
             equations, reached = self._equations(a[0].copy(), a[1], a[2]), np.array([sign, 0.0])
-            entry("trace")(*equations, ends_p, ends_w, v, reached)
+            entry("continuation")(*equations, ends_p, ends_w, v, reached)
             if reached[0] < 1.0:
                 w, p = equations[3], equations[5]
                 at = (p, w[1 : ends_w.shape[1]].copy(), float(w[0]))
@@ -274,7 +276,7 @@ class Equilibria:
         return Path(v, 1.0, "arrived")
 
     def _turns(self, v: Array, at: _Values, ends_p: Array, ends_w: Array) -> bool:
-        """Return whether the branch turns back a little beyond v, where `trace` ended: followed by its length instead of by the values.
+        """Return whether the branch turns back a little beyond v, where `continuation` ended: followed by its length, not by the values.
 
         Keller's bordered equations: the branch's own direction stays regular at a fold, where the values do not. A jump,
         behind which there is nothing to follow, is no fold, nor is a place where steady states lie side by side. Within
@@ -352,17 +354,17 @@ class Equilibria:
         p = np.ascontiguousarray(p, dtype=float)
         return self._address, self._sizes, y, w, np.zeros_like(w), p, np.zeros(max(s.ns, 1))
 
-    def _directly(self, anchor: Anchor, p: Array, u: Array, time: float) -> SteadyState | None:
+    def _directly(self, reference: ReferenceEquilibrium, p: Array, u: Array, time: float) -> SteadyState | None:
         """Solution at other values that Newton's method finds from a known one, and leads back from.
 
         Corrections that halve are Kantorovich's condition as far as their own direction shows it: with an exponential rate
         they also halve on the way to another branch. From that one the way back ends elsewhere.
         """
-        found = self._newton(anchor.v, p, u, time, HALVES, anchor.sign)
+        found = self._newton(reference.v, p, u, time, HALVES, reference.sign)
         if found is None:
             return None
-        back = self._newton(found.v, anchor.p, anchor.u, 0.0, HALVES, anchor.sign)
-        return found if back is not None and _alike(back.v, anchor.v) else None
+        back = self._newton(found.v, reference.p, reference.u, 0.0, HALVES, reference.sign)
+        return found if back is not None and _alike(back.v, reference.v) else None
 
     def _judged(self, v: Array, p: Array, u: Array, time: float) -> tuple[Array, Array, Array]:
         """(residual, Jacobian, scaled residuals) of the rest equations at v."""
@@ -459,7 +461,7 @@ class Equilibria:
         for sign in (1.0, -1.0):
             x = v.copy()
             x[:nx] += sign * along
-            self._move(("follow", "nearest"), x, p, u, time)
+            self._move(("pseudo_transient", "minimum_norm"), x, p, u, time)
             ends.append(x)
             for far in 2.0 ** np.arange(DOUBLINGS):
                 begin = v.copy()
@@ -487,7 +489,7 @@ class Equilibria:
         """The steady state by steps of least norm, or by following the model; SteadyStateError with the worst equation."""
         tried: list[tuple[Array, Array, Array, Array]] = []
         # The rest next to the guess comes first; where there are several, following the model may end at a far one.
-        for end in self._slow_ends(p, u, begin, time):
+        for end in self._fallback_ends(p, u, begin, time):
             tried.append(end)
             if self._region.holds(end[3], end[0]):
                 break
@@ -505,17 +507,19 @@ class Equilibria:
             y[self.n :], w[1 + s.nu + self.extra :] = slope[: self.n].ravel(), slope[self.n :].ravel()
         return SteadyState(y, w, v)
 
-    def _slow_ends(self, p: Array, u: Array, begin: Array, time: float) -> Iterator[tuple[Array, Array, Array, Array]]:
-        """(v, residual, Jacobian, scaled residuals) where each slow way ends: least norm, following the model, sliding."""
-        for ways in (("nearest",), ("follow", "nearest"), ("slide",)):
+    def _fallback_ends(
+        self, p: Array, u: Array, begin: Array, time: float
+    ) -> Iterator[tuple[Array, Array, Array, Array]]:
+        """(v, residual, Jacobian, scaled residuals) where each fallback solver ends."""
+        for solvers in (("minimum_norm",), ("pseudo_transient", "minimum_norm"), ("implicit_euler",)):
             v = begin.copy()
-            self._move(ways, v, p, u, time)
+            self._move(solvers, v, p, u, time)
             yield v, *self._judged(v, p, u, time)
 
-    def _move(self, ways: tuple[str, ...], v: Array, p: Array, u: Array, time: float) -> None:
-        """Move v by slow ways, one after the other."""
-        for way in ways:
-            entry(way)(*self._equations(p, u, time), self._region.size, v)
+    def _move(self, solvers: tuple[str, ...], v: Array, p: Array, u: Array, time: float) -> None:
+        """Move v by fallback solvers, one after the other."""
+        for solver in solvers:
+            entry(solver)(*self._equations(p, u, time), self._region.size, v)
 
     # --- what is told where there is none ---
 
@@ -659,10 +663,10 @@ def _has_effects(model: Model) -> bool:
     return model.origin is not None and bool(model.origin.neutral)
 
 
-def _ways(anchor: Anchor, p: Array, u: Array, time: float) -> tuple[list[_Values], ...]:
-    """From the anchor's values to others: straight; inputs first; parameters first. Either may leave where a rest exists."""
-    begin, end = (anchor.p, anchor.u, 0.0), (p, u, time)
-    return [begin, end], [begin, (anchor.p, u, time), end], [begin, (p, anchor.u, time), end]
+def _ways(reference: ReferenceEquilibrium, p: Array, u: Array, time: float) -> tuple[list[_Values], ...]:
+    """From the reference's values to others: straight; inputs first; parameters first. Either may leave where a rest exists."""
+    begin, end = (reference.p, reference.u, 0.0), (p, u, time)
+    return [begin, end], [begin, (reference.p, u, time), end], [begin, (p, reference.u, time), end]
 
 
 def _made(model: Model) -> Equilibria:

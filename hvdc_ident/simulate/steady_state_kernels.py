@@ -170,7 +170,7 @@ def _rows(e, jac, pivots):  # type: ignore[no-untyped-def]
 # --- along a path of values ---
 
 
-def trace(a):  # type: ignore[no-untyped-def]
+def continuation(a):  # type: ignore[no-untyped-def]
     """Move v (n,), a steady state at the first of two sets of values, along the straight line between them.
 
     a: equations, values of the parameters (2, parameters), of time and inputs (2, 1 + inputs), v, then way (2,): on entry
@@ -330,7 +330,7 @@ def _euler_step(e, size, v, h, x):  # type: ignore[no-untyped-def]
     return False
 
 
-def follow(a):  # type: ignore[no-untyped-def]
+def pseudo_transient(a):  # type: ignore[no-untyped-def]
     """Move v (n,) by implicit Euler steps whose length grows as the residual falls, one Newton step each: follow the model.
 
     a: equations, size (n,), v.
@@ -368,7 +368,7 @@ def follow(a):  # type: ignore[no-untyped-def]
     return 1
 
 
-def slide(a):  # type: ignore[no-untyped-def]
+def implicit_euler(a):  # type: ignore[no-untyped-def]
     """Move v (n,) by implicit Euler steps that are solved each: to a steady state on the edge of a jump too.
 
     A loop that rests there is driven to it from both sides: a step that is not solved for goes past the edge, and the
@@ -394,7 +394,7 @@ def slide(a):  # type: ignore[no-untyped-def]
     return 1
 
 
-def nearest(a):  # type: ignore[no-untyped-def]
+def minimum_norm(a):  # type: ignore[no-untyped-def]
     """Move v (n,) by Newton steps of least norm, for a Jacobian that is singular where a state does not matter.
 
     a: equations, size (n,), v.
