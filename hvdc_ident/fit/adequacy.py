@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from hvdc_ident.fit.assessment import Curve
 
 LEVEL = 1e-3
-"""Chance of a verdict against the model or the noise where both are right, over all outputs together."""
+"""Chance of a verdict against the model or the noise where both are right, over all outputs, or all parameters, together."""
 MATTERS = 2.0
 """Ratio of the residual's power to the noise's from which intervals that rest on the noise are wrong (see above)."""
 NEXT = "hvdc-ident diagnose STUDY"
