@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.special import chdtrc, fdtri
@@ -19,16 +19,13 @@ from scipy.special import chdtrc, fdtri
 from hvdc_ident.data import FLOOR_SHARE, MAD_TO_STD, Array, Experiment
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, scatter_of, source_of
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.residual import ResidualBlock, stretches
+from hvdc_ident.fit.residual import Curve, ResidualBlock, stretches
 from hvdc_ident.fit.whitening import independent_samples
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import times_text
 
-if TYPE_CHECKING:
-    from hvdc_ident.fit.assessment import Curve
-
 LEVEL = 1e-3
-"""Chance of a verdict against the model or the noise where both are right, over all outputs together."""
+"""Chance of a verdict against the model or the noise where both are right, over all outputs, or all parameters, together."""
 MATTERS = 2.0
 """Ratio of the residual's power to the noise's from which intervals that rest on the noise are wrong (see above)."""
 NEXT = "hvdc-ident diagnose STUDY"

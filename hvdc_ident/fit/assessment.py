@@ -6,61 +6,25 @@ Everything in this module takes a problem in its final weights and the result of
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.adequacy import ljung_box
 from hvdc_ident.fit.descent import descend
 from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.residual import compared_rows, per_deviation, stretches
+from hvdc_ident.fit.residual import Curve, compared_rows, stretches
 from hvdc_ident.fit.result import FitResult
 from hvdc_ident.fit.simulator import observe, unknown_of
 from hvdc_ident.immutable import FrozenMap
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """One output of one experiment at the estimates, at all n rows.
-
-    model, measured: (n,) in the output's unit. rows: those compared. sigma: standard deviation of the noise; profile:
-    (n,) that of each row over sigma, where rows differ.
-    std: (n,) standard deviation of the model's curve from that of the estimates; band: half the width of the 95 % band
-    within which a recorded sample is expected. Both None where no estimate has a standard deviation.
-    """
-
-    model: Array
-    measured: Array
-    rows: NDArray[np.intp]
-    sigma: float
-    std: Array | None
-    band: Array | None
-    profile: Array | None = None
-
-    @property
-    def residual(self) -> Array:
-        """Misfit in standard deviations."""
-        return per_deviation(self.misfit, self.sigma, None if self.profile is None else self.profile[self.rows])
-
-    @property
-    def misfit(self) -> Array:
-        """Measured - model over the compared rows."""
-        return self.measured[self.rows] - self.model[self.rows]
-
-    @property
-    def rmse(self) -> float:
-        """Root mean square of the misfit, in the output's unit."""
-        return float(np.sqrt(np.mean(self.misfit**2)))
-
-
 def assessed(problem: Problem, result: FitResult) -> FitResult:
-    """Return the result with `goodness` and `validation`; errors of held-out experiments are taken with their own nuisances."""
+    """Return the result with curves, `goodness` and `validation`; those of held-out experiments have their own nuisances."""
     nuisances = held_out_nuisances(problem, result)
     by_experiment = curves(problem, result, nuisances)
     rmse = {o: dict(line) for o, line in result.rmse.items()}
@@ -72,6 +36,7 @@ def assessed(problem: Problem, result: FitResult) -> FitResult:
     held_out = {e.name for e in problem.experiments if e.role == "holdout"}
     return replace(
         result,
+        curves=by_experiment,
         goodness=goodness({n: c for n, c in by_experiment.items() if n not in held_out}),
         validation=validation(problem, result, {n: by_experiment.get(n) for n in sorted(held_out)}, nuisances),
     )

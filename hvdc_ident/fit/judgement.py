@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.data.units import same_unit
 from hvdc_ident.fit.adequacy import ResidualSize, sizes_of_runs
-from hvdc_ident.fit.assessment import Curve
+from hvdc_ident.fit.residual import Curve
 from hvdc_ident.fit.tolerance_profile import WINDOWS, ToleranceProfile
 from hvdc_ident.immutable import FrozenMap
 

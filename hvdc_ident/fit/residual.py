@@ -109,6 +109,40 @@ def per_deviation(values: Array, sigma: float, profile: Array | None) -> Array:
     return np.asarray(values / (sigma * profile).reshape(-1, *([1] * (values.ndim - 1))))
 
 
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """One output of one experiment at the estimates, at all n rows.
+
+    model, measured: (n,) in the output's unit. rows: those compared. sigma: standard deviation of the noise; profile:
+    (n,) that of each row over sigma, where rows differ.
+    std: (n,) standard deviation of the model's curve from that of the estimates; band: half the width of the 95 % band
+    within which a recorded sample is expected. Both None where no estimate has a standard deviation.
+    """
+
+    model: Array
+    measured: Array
+    rows: NDArray[np.intp]
+    sigma: float
+    std: Array | None
+    band: Array | None
+    profile: Array | None = None
+
+    @property
+    def residual(self) -> Array:
+        """Misfit in standard deviations."""
+        return per_deviation(self.misfit, self.sigma, None if self.profile is None else self.profile[self.rows])
+
+    @property
+    def misfit(self) -> Array:
+        """Measured - model over the compared rows."""
+        return self.measured[self.rows] - self.model[self.rows]
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of the misfit, in the output's unit."""
+        return float(np.sqrt(np.mean(self.misfit**2)))
+
+
 def stretches(rows: NDArray[np.intp]) -> tuple[slice, ...]:
     """Return the stretches of compared rows without a gap; a step over 1.5 median ones is one, as between instants."""
     steps = np.diff(rows)

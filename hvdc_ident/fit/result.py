@@ -15,6 +15,7 @@ from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.files import plain
 from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.fit.jump_instants import PlacedInstant
+from hvdc_ident.fit.residual import Curve
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import in_python, interval_text
 
@@ -109,6 +110,7 @@ class FitResult(Shown):
     the F quantile of one parameter). goodness, validation: see there.
     covariance: of the unknowns that have one; not in the JSON, which has std and correlation.
     instants: what the rows tell of each parameter that sets the instant of a jump; not in the JSON, whose estimates say it.
+    curves: every output of every experiment at the estimates, where assessed; in the files of waveforms, not in the JSON.
     """
 
     status: Status
@@ -141,6 +143,7 @@ class FitResult(Shown):
     validation: Mapping[str, Any] = field(default_factory=dict)
     covariance: Covariance | None = field(default=None, metadata={"json": False})
     instants: Mapping[str, PlacedInstant] = field(default_factory=dict, metadata={"json": False})
+    curves: Mapping[str, Mapping[str, Curve]] = field(default_factory=dict, metadata={"json": False})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON takes it: full precision, None for what is not finite."""

@@ -7,7 +7,7 @@ misfit gives.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -57,14 +57,13 @@ class Refined:
     """
 
     method: Optimiser
-    polish: TrustRegion = field(default_factory=TrustRegion)
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
         """Return the result of both together; the first method's failure stands where it found no admissible point."""
         first = self.method.run(problem, start)
         if first.cost is None:
             return first
-        end = self.polish.run(problem, np.asarray(first.theta))
+        end = TrustRegion().run(problem, np.asarray(first.theta))
         used = first.evaluations + end.evaluations
         if end.cost is None:
             return OptimiserResult(first.theta, first.cost, "failed", f"{first.message}; {end.message}", used)

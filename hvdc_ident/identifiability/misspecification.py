@@ -14,14 +14,13 @@ from scipy.special import chdtrc
 
 from hvdc_ident.data import Array
 from hvdc_ident.fit import FitParameter
+from hvdc_ident.fit.adequacy import LEVEL
 from hvdc_ident.fit.uncertainty import TWO_SIDED, score_covariance
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, normalised, pivoted_order, standard_deviations
 from hvdc_ident.text import percentage, span, times_text
 
-LEVEL = 0.01
-"""Level of the test of all parameters together (Bonferroni)."""
 TELLS = 0.01
 """An experiment with less than this share of a parameter's information is not asked for its own estimate of it."""
 
@@ -111,7 +110,8 @@ def misspecification(
 ) -> Misspecification:
     """Return the flag and its reasons: experiments that disagree on a parameter, or residuals larger than the noise given.
 
-    With noise of 1e-4 everything is significant: so each sign is given with its size, in the parameter's unit.
+    LEVEL is that of the test of all parameters together (Bonferroni). With noise of 1e-4 everything is significant: so each sign is
+    given with its size, in the parameter's unit.
     """
     signs = []
     for name, h in tests.items():

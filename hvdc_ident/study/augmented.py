@@ -13,8 +13,8 @@ from hvdc_ident.errors import ComputationError
 from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
-from hvdc_ident.fit.assessment import Curve
 from hvdc_ident.fit.noise import MISFIT, source_of, source_text
+from hvdc_ident.fit.residual import Curve
 from hvdc_ident.fit.uncertainty import estimates_of, uncertainty
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, read_card

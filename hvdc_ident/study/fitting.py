@@ -13,11 +13,10 @@ import sympy as sp
 from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.files import csv_columns
 from hvdc_ident.fit import FitResult, Group, Problem, StartOutcome, fit, fit_each, fit_individually
-from hvdc_ident.fit.assessment import Curve, curves, held_out_nuisances, in_final_weights
 from hvdc_ident.fit.judgement import judge
 from hvdc_ident.fit.likelihood import loss
 from hvdc_ident.fit.partial_fits import part_of
-from hvdc_ident.fit.residual import compared_rows
+from hvdc_ident.fit.residual import Curve, compared_rows
 from hvdc_ident.fit.tolerance_profile import tolerance
 from hvdc_ident.identifiability import gated_fit
 from hvdc_ident.identifiability.gate import searched
@@ -150,12 +149,6 @@ def _one_by_one(
         if len(begun.fitted_experiments) > 1:
             table |= fit_each(begun, whiten=whiten, executor=executor, progress=progress)
     return table
-
-
-def curves_of(problem: Problem, result: FitResult) -> dict[str, dict[str, Curve]]:
-    """Every output of every experiment at the estimates, by experiment and output."""
-    final = in_final_weights(problem, result)
-    return curves(final, result, held_out_nuisances(final, result))
 
 
 def curves_of_run(experiment: Experiment, run: Trajectory) -> dict[str, Curve]:

@@ -12,8 +12,8 @@ import pytest
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import InputError, StudyError, UnknownNameError
 from hvdc_ident.fit import tolerance_profile
-from hvdc_ident.fit.assessment import Curve
 from hvdc_ident.fit.judgement import Count, event_end, judge
+from hvdc_ident.fit.residual import Curve
 from hvdc_ident.fit.tolerance_profile import shipped, tolerance
 from tests.fit.simulators import recorded
 

@@ -34,6 +34,8 @@ def test_experiments_that_disagree_set_the_flag_with_their_spread() -> None:
     assert any("disagree on b" in s for s in report.misspecification.signs)
     h = report.heterogeneity["b"]
     assert h.dof == 2 and h.p < 1e-6 and h.i2 > 0.9
+    assert list(h.estimates.values()) == pytest.approx([2.0, 2.0, 2.5], abs=0.05)
+    assert h.spread == pytest.approx(np.std([2.0, 2.0, 2.5]), rel=0.1)
     assert report.to_dict()["misspecified"] is True
 
 

@@ -12,13 +12,12 @@ from hvdc_ident.text import figures_of, interval_text, interval_words
 
 if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
-    from hvdc_ident.fit.assessment import Curve
+    from hvdc_ident.fit.residual import Curve
     from hvdc_ident.study.study import Study
 
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the estimates with their intervals, RMSE before and after, and the values in the forms other tools read."""
-    from hvdc_ident.identifiability.gate import gate, gated
     from hvdc_ident.study import fitting
     from hvdc_ident.study.measured_responses import compared
     from hvdc_ident.study.pipeline import executor_of
@@ -36,14 +35,12 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     data = {**result.to_dict(), **_context(study, problem, options, report, result)}
     if result.status == "failed":
         return StageResult(data, failed=result.message)
-    through = fitting.with_settings(study, gated(problem, gate(report, options.force)))
-    curves = fitting.curves_of(through, result)
-    sets = {"given": fitting.curves_at_given(study), "fitted": curves}
+    sets = {"given": fitting.curves_at_given(study), "fitted": result.curves}
     data["judgement"] = fitting.judgement_of(study, sets, result)
     data["derived"] = fitting.derived(study, result)
     if study.responses:
         data["responses"] = compared(study, {"given": study.given, "fitted": result.values})
-    files = _files(study, data, curves)
+    files = _files(study, data, result.curves)
     return StageResult(data, files, failed=result.message if result.status == "not-converged" else "")
 
 
