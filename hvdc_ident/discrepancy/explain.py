@@ -11,6 +11,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.hypothesis import Placed, Refit, uncertainty_of
+from hvdc_ident.discrepancy.options import LISTED
 from hvdc_ident.discrepancy.prediction import held_out
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, StandIn, Table
 from hvdc_ident.effects import effects, split_sources
@@ -19,11 +20,6 @@ from hvdc_ident.fit import Problem
 from hvdc_ident.fit.noise import SURE
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures, listed, percentage, quantity
-
-MOST_STAND_INS = 3
-"""Effects that a sentence lists beside parameters that are off."""
-MOST_PLACES = 4
-"""Signals at most that are asked for."""
 
 
 def found_of(refit: Refit, placed: Placed, chosen_from: int) -> FoundEffect:
@@ -91,7 +87,7 @@ def advice(
     wanted = [at[0]]  # a signal of each place that is not of the others
     for name, place in others:
         own = [p for p in place if p not in at] or [p for p in at if p not in place]
-        if name == first and own and own[0] not in wanted and len(wanted) < MOST_PLACES:
+        if name == first and own and own[0] not in wanted and len(wanted) < LISTED:
             wanted.append(own[0])
     if len(wanted) > 1:
         wanted = list(dict.fromkeys(p.removeprefix("outputs.") for p in wanted))
@@ -184,8 +180,8 @@ def beside_stand_ins(moved: Finding, others: Sequence[StandIn]) -> Finding:
     """The finding on parameters that are off, beside the effects that explain the records as well with these as given."""
     if not others:
         return moved
-    others_text = "; or ".join(f"{s.text} (with {listed(s.values)} as given)" for s in others[:MOST_STAND_INS])
-    more = f"; or one of {len(others) - MOST_STAND_INS} more effects" if len(others) > MOST_STAND_INS else ""
+    others_text = "; or ".join(f"{s.text} (with {listed(s.values)} as given)" for s in others[:LISTED])
+    more = f"; or one of {len(others) - LISTED} more effects" if len(others) > LISTED else ""
     text = moved.text.replace("No effect is missing:", "No effect is needed:")
     return replace(moved, text=f"{text} The records do not distinguish this from: {others_text}{more}.")
 

@@ -14,6 +14,7 @@ from hvdc_ident.discrepancy.explain import advice, sentence
 from hvdc_ident.discrepancy.forms import with_values
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.implied import apart
+from hvdc_ident.discrepancy.options import LISTED
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival, ValueAt
 from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.effects import effects, split_sources
@@ -22,8 +23,6 @@ from hvdc_ident.text import figures_of, listed, quantity
 
 SHARED = ("s", "rad/s", "Hz", "")
 """Units of parameters that mean the same at every place."""
-MAX_LISTED = 3
-"""Places with other values of the parameters that a sentence lists."""
 
 
 def finding(
@@ -216,8 +215,8 @@ def _apart(best: Rival, places: Sequence[Place]) -> str:
     from_others += (
         [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if best.source and sources_too else []
     )
-    from_others += [f"this place from {_with_values(p, names)}" for p in others[:MAX_LISTED]]
-    from_others += [f"from {len(others) - MAX_LISTED} more with other values"] if len(others) > MAX_LISTED else []
+    from_others += [f"this place from {_with_values(p, names)}" for p in others[:LISTED]]
+    from_others += [f"from {len(others) - LISTED} more with other values"] if len(others) > LISTED else []
     then = f", where {_values(own.values, names)}" if others else ""
     return f"{then}; the records do not distinguish {', nor '.join(from_others)}" if from_others else ""
 

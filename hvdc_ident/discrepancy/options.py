@@ -21,6 +21,8 @@ SHORTLIST = 6
 """The best by a cheap measure (a score, a regression) that are tried in full: formulas, filters, places, earlier rivals."""
 FIELD = 40
 """Proposals refitted at a time."""
+LISTED = 3
+"""Items that a sentence lists; of more it says how many there are."""
 BEAM = 2
 """Hypotheses that are followed side by side."""
 

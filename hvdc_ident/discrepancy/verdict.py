@@ -18,7 +18,7 @@ from hvdc_ident.discrepancy.forms import alternatives
 from hvdc_ident.discrepancy.hypothesis import Refit, signal
 from hvdc_ident.discrepancy.implied import implied
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.options import REFUTED, TOLERANCE, SearchContext
+from hvdc_ident.discrepancy.options import LISTED, REFUTED, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
 from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict, as_line
@@ -33,8 +33,6 @@ LEAST_EXPLAINED = 0.5
 """Share of the gap that what is named has to explain."""
 OUTSIDE = ("term", "filter")
 """Forms that no name of the catalogue stands for."""
-MAX_LISTED_PLACES = 3
-"""Places of an effect that a sentence lists."""
 STRONG_SHARE = 0.1
 """Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
 that has no name: less is what a wrong idea of the noise makes."""
@@ -220,8 +218,8 @@ def _class_text(each: Sequence[EffectClass]) -> str:
     texts = []
     for c in likely(each):
         at = list(dict.fromkeys([c.best.at, *(r.at for r, _ in c.members)]))
-        where = ", or at ".join(listed(places) for places in at[:MAX_LISTED_PLACES])
-        more = f", or at one of {len(at) - MAX_LISTED_PLACES} more places" if len(at) > MAX_LISTED_PLACES else ""
+        where = ", or at ".join(listed(places) for places in at[:LISTED])
+        more = f", or at one of {len(at) - LISTED} more places" if len(at) > LISTED else ""
         texts.append(f"{' or '.join(c.kinds)} ({percentage(c.probability)}) at {where}{more}")
     return "; or ".join(texts)
 
