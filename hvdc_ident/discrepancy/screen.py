@@ -452,6 +452,8 @@ class _Runner:
         known = own.values(theta) if candidate.named else {}
         named = {n: known.get(str(p), setup.model.parameters[str(p)].value) for n, p in candidate.named.items()}
         values = moved.placed(candidate) | moved.sized({**probe.values, **named})
+        if effects()[candidate.effect].self_exciting:  # what it does at the first row is no state that the plant rests in
+            return _residual(self._from_rest[loop], theta, values)
         try:
             return _residual(self._problems[loop], theta, values)
         except FAILURES:  # it leaves no steady state, as levels in a loop do not, or none near

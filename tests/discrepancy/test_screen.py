@@ -122,6 +122,16 @@ def test_gains_that_hide_an_effect_are_left_for_those_given() -> None:
     assert promising.index("lag at wm") < 5 and len(promising) < len(known.best())
 
 
+def test_a_sine_that_begins_at_its_peak_is_no_state_to_begin_from(lagged: Refit) -> None:
+    """The integrator behind `err` rests at no sine: beside one that begins at its peak it would start far off. Its answer is that of one
+    a quarter of a period earlier, but for the transient at the start."""
+    (sine,) = listed(lagged, ("disturbance",), ("err",))
+    wave = {"amplitude": 0.05, "frequency": 5.0}
+    sine = replace(sine, probes=()).with_sizes([wave | {"phase": p} for p in (0.0, np.pi / 2)], like=sine.probes)
+    screen = round_model(lagged, (sine,)).screen((sine,), "both phases")
+    assert screen.size[0, 1] == pytest.approx(screen.size[0, 0], rel=0.05)
+
+
 def test_sizes_that_were_run_are_not_run_again(lagged: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
     found = listed(lagged, ("lag", "limit"), ("wm", "err"))
     stand = round_model(lagged, found)
