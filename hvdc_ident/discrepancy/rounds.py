@@ -225,10 +225,13 @@ class RoundModel:
             spent=lambda: self.search.spent,
         )  # fmt: skip
 
+    def order(self, screen: Screen, found: Sequence[CandidateEffect], point: Array) -> list[int]:
+        """Return the candidates by what they promise from other unknowns, by their answers in a screen (`Screen.reordered`)."""
+        return screen.reordered(replace(self.setup, point=point).without, found)
+
     def promising(self, screen: Screen, found: Sequence[CandidateEffect], point: Array) -> list[int]:
-        """Return the candidates that promise most from other unknowns, by their answers in a screen (`Screen.reordered`): a share of all,
-        and of each effect as many as are refitted."""
-        order = screen.reordered(replace(self.setup, point=point).without, found)
+        """Return the candidates that promise most from other unknowns: a share of all, and of each effect as many as are refitted."""
+        order = self.order(screen, found, point)
         count: Counter[str] = Counter()
         kept = []
         for n, k in enumerate(order):

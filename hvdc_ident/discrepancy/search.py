@@ -228,10 +228,12 @@ def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit
 
 
 def _neighbours(round_model: RoundModel, opened: Round, lead: CandidateFit, number: int) -> tuple[Round, list[Score]]:
-    """Return the round and the scores of what is at the leader's places or is its effect, from the gains that the leader came to.
+    """Return the round and the scores of what is at the leader's places, is its effect, or promises most, from the gains that the leader
+    came to.
 
     Its effect elsewhere, and at several places of which one is the leader's, is tried in the leader's size too, and another kind
-    of delay there with a delay as long.
+    of delay there with a delay as long. What promises most there is ranked by the answers of the screen: beside gains that make up for
+    what is missing, it was misjudged.
     """
     own = opened.candidates[lead.pick.candidate]
     sizes = lead.refit.sizes(lead.refit.placed[-1])
@@ -241,14 +243,15 @@ def _neighbours(round_model: RoundModel, opened: Round, lead: CandidateFit, numb
     around = [k for k in same if set(found[k].at) > set(own.at)]
     parts = [k for k in same if len(found[k].at) == 1 and any(found[k].at[0] in found[f].at for f in around)]
     here = [k for k, c in enumerate(found) if set(c.at) <= set(own.at) and not c.still]
-    which = list(dict.fromkeys((*here, *like[: 2 * REFITS_PER_EFFECT], *parts, *around)))
+    theta = gains_of(opened.before, lead.refit)
+    promising = round_model.order(opened.screen, found, theta)[:FIELD]
+    which = list(dict.fromkeys((*here, *like[: 2 * REFITS_PER_EFFECT], *parts, *around, *promising)))
     late = effects()[own.effect].delay_with(sizes)
     for k in which:
         if found[k].effect == own.effect:
             found[k] = found[k].with_sizes([sizes])
         elif late:
             found[k] = found[k].with_sizes(_delaying(found[k], late))
-    theta = gains_of(opened.before, lead.refit)
     screen = round_model.screen(found, f"round {number}: beside {own.label}", which, theta)
     best = opened.before.chi2 - lead.refit.chi2
     near = [
