@@ -19,9 +19,14 @@ from hvdc_ident.parameters import Input
 from hvdc_ident.shelf import card_of, components, record_of, source_of
 
 UNCONNECTED = FrozenMap(
-    {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0", "wg": "1"}
+    {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0"}
+    | {"wg": "1", "wt": "1", "wref": "1", "theta": "0", "theta_start": "0", "dPm": "0"}
 )
-"""What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), nominal frequency and speed."""
+"""What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), nominal frequency and speed, no
+turbine and no pitch."""
+AHEAD = FrozenMap({"Pref0": "Pref"})
+"""Inputs that follow a signal of another name, ahead of the part that takes it and gives it on changed: the torque controller of a wind
+turbine makes of the plant's power reference the one that the electrical controller follows, the pitch controller takes the former."""
 REFERENCES = (
     ("P0", "P", "MW", ("Plant_pref", "Pref", "nref", "Pm")),
     ("Q0", "Q", "Mvar", ("Vref", "Qref", "Qext", "PFaref", "Efd")),
@@ -33,14 +38,19 @@ LEVELS = FrozenMap({level: output for level, output, _, _ in REFERENCES})
 LOADED = 0.8
 """Share of its base that a unit delivers where its level is not known."""
 VOLTAGE = Input(1.0, "pu", "voltage of the infinite bus")
-SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu"})
+SHOWN = FrozenMap(
+    {"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu", "wt": "pu", "wg": "pu"}
+)
 """Outputs of a unit, where one of its components has them, with their units."""
 
 
 METER = "freq.dwn"
 """What controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts."""
 MACHINE = "gen"
-NAMES = FrozenMap({"Ir": MACHINE, "Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd": "elec", "Qext": "plant"})
+NAMES = FrozenMap(
+    {"Ir": MACHINE, "wg": "drive", "dPm": "aero", "theta": "pitch", "wref": "torque"}
+    | {"Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd": "elec", "Qext": "plant"}
+)
 """Name of a part in a unit by the output that it gives; another goes by the name of its component."""
 
 
@@ -118,18 +128,28 @@ def _wired(
         (n, u, quantity) for n, m in models.items() for u, quantity in m.inputs.items() if f"{n}.{u}" not in found
     ]
     for part, u, quantity in targets:
-        sources = [n for n, other in models.items() if n != part and u in other.outputs]
+        sources = _sources(models, part, u)
         if len(sources) > 1:
             raise ModelError(f"'{part}.{u}' may follow several parts", expected="one", got=", ".join(sources))
         if sources:
-            found[f"{part}.{u}"] = f"{sources[0]}.{u}"
+            found[f"{part}.{u}"] = f"{sources[0]}.{AHEAD.get(u, u)}"
         elif played and u == "dwn":
             found[f"{part}.{u}"] = "bus.dwn" if part == machine else METER
         else:
-            found[f"{part}.{u}"] = UNCONNECTED.get(u, u)
-            if u not in UNCONNECTED:
-                inputs.setdefault(u, quantity)
+            signal = AHEAD.get(u, u)
+            found[f"{part}.{u}"] = UNCONNECTED.get(signal, signal)
+            if signal not in UNCONNECTED:
+                inputs.setdefault(signal, quantity)
     return found, FrozenMap(inputs)
+
+
+def _sources(models: Mapping[str, Model], part: str, u: str) -> list[str]:
+    """Return the parts that an input of a part may follow: of those that give its signal, where one takes it from the others and gives
+    it on changed, that one, or for an input ahead of it the others."""
+    signal = AHEAD.get(u, u)
+    givers = [n for n, m in models.items() if n != part and signal in m.outputs]
+    changing = [n for n in givers if any(AHEAD.get(v) == signal for v in models[n].inputs)]
+    return [n for n in givers if (n in changing) == (u == signal)] if changing else givers
 
 
 def _component_lines(name: str, part: UnitPart) -> Iterator[str]:
