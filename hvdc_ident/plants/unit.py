@@ -38,14 +38,13 @@ LEVELS = FrozenMap({level: output for level, output, _, _ in REFERENCES})
 LOADED = 0.8
 """Share of its base that a unit delivers where its level is not known."""
 VOLTAGE = Input(1.0, "pu", "voltage of the infinite bus")
-SHOWN = FrozenMap(
-    {"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu", "wt": "pu", "wg": "pu"}
-)
+SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu", "wt": "pu", "wg": "pu"})
 """Outputs of a unit, where one of its components has them, with their units."""
 
 
 METER = "freq.dwn"
-"""What controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts."""
+"""What controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts. A machine, which
+has a speed of its own in the frame, takes that of the frame."""
 MACHINE = "gen"
 NAMES = FrozenMap(
     {"Ir": MACHINE, "wg": "drive", "dPm": "aero", "theta": "pitch", "wref": "torque"}
@@ -84,7 +83,7 @@ def unit_card(
     models = {n: shelf_model(p.source) for n, p in parts.items()}
     machine = _one_that_gives(models, "Ir")
     played = network == "playback"
-    connections, references = _wired(models, machine, _network(machine, network), played)
+    connections, references = _wired(models, _network(machine, network), played)
     inputs: dict[str, Input] = {**(shelf_model("playback").inputs if played else {"E": VOLTAGE}), **references}
     known = {"f": f0} | dict(levels)
     grid = (
@@ -120,7 +119,7 @@ def unit_card(
 
 
 def _wired(
-    models: Mapping[str, Model], machine: str, connections: Mapping[str, str], played: bool
+    models: Mapping[str, Model], connections: Mapping[str, str], played: bool
 ) -> tuple[dict[str, str], FrozenMap[Input]]:
     """Return what each input of the parts follows, and the inputs of the unit that are left. connections: those with the network."""
     found, inputs = dict(connections), dict[str, Input]()
@@ -134,7 +133,7 @@ def _wired(
         if sources:
             found[f"{part}.{u}"] = f"{sources[0]}.{AHEAD.get(u, u)}"
         elif played and u == "dwn":
-            found[f"{part}.{u}"] = "bus.dwn" if part == machine else METER
+            found[f"{part}.{u}"] = "bus.dwn" if "dw" in models[part].outputs else METER
         else:
             signal = AHEAD.get(u, u)
             found[f"{part}.{u}"] = UNCONNECTED.get(signal, signal)
