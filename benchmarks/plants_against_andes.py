@@ -11,6 +11,7 @@ playback bus, PLBVFU1, as tests/plants/playback_andes.json.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import tempfile
 import tomllib
@@ -49,8 +50,9 @@ FACTORS = {"qref0": -1.0, "q0": 20.0}
 """Factors from the step of a reference to that of a constant; 1/R = 20 in the cases with q0."""
 SHOWN = {"P": ("Pe", 100.0, 0.0), "Q": ("Qe", 100.0, 0.0), "Vt": ("v", 1.0, 0.0), "dw": ("omega", 1.0, -1.0)}
 """Signals by name: the variable of the machine or converter, the factor and what is added; MW, Mvar, pu."""
-TIME_STEPS = {"SynGen": 0.001, "RenGen": 0.002}
-"""Time steps, s, by group of the unit. Swings are hardly damped: the trapezoidal rule's error of their frequency shows soon."""
+TIME_STEPS = {"SynGen": 0.001, "RenTorque": 0.001, "RenGen": 0.002}
+"""Time steps, s, by the first of these groups that the unit has. Swings, of rotors and of shafts, are hardly damped: the trapezoidal
+rule's error of their frequency shows soon."""
 ENDS = {"SynGen": 5.0, "RenGen": 2.5}
 """Ends of the runs, s: converters settle sooner."""
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
@@ -74,6 +76,13 @@ ESAC8B = {
     "KD": 0.0,
 }
 """Values of AC8B that make it ESAC8B, which andes does not have: by name, the value or the name of ESAC8B's."""
+SCALES = {"WTDTA1": {"Freq1": 2.0 * math.pi}, "WTTQA1": {"Kpp": -1.0, "Kip": -1.0}}
+"""Factors from a record's values to those that andes reads: it takes Freq1 in rad/s, and has the error of the torque, which these gains
+multiply, with the opposite sign."""
+TORQUE = "WTTQA1"
+"""A model whose record andes cannot read, although it has the model."""
+NAMED = ("rea", "rego", "ree", "reg")
+"""Parts that it refers to."""
 ABSENT = {"SCRX", "PSS2B", "STAB2A"}
 """Models that andes does not have, or takes another for."""
 PLAYED = ("ieeet1", "sexs")
@@ -118,27 +127,42 @@ Q
 """
 
 
+def record_of(model: str) -> list[str]:
+    """Return the names of a record's values, in PSS/E's order."""
+    card: dict[str, list[str]] = tomllib.loads((SHELF / f"{model.lower()}.toml").read_text(encoding="utf-8"))
+    return card["record"]
+
+
 def line(model: str, values: list[float]) -> str:
     """Return the .dyr line of a record, its values in the order in which andes reads them."""
-    if model in ORDERS or model == "ESAC8B":
-        card = tomllib.loads((SHELF / f"{model.lower()}.toml").read_text(encoding="utf-8"))
-        named = dict(zip(card["record"], values, strict=True))
+    if model in ORDERS or model in SCALES or model == "ESAC8B":
+        named = dict(zip(record_of(model), values, strict=True))
         if model == "ESAC8B":
             given = {n: named[v] if isinstance(v, str) else v for n, v in ESAC8B.items()}
             model, named = "AC8B", named | given
-        values = [named[n] for n in ORDERS[model].split()]
+        names = ORDERS[model].split() if model in ORDERS else record_of(model)
+        values = [named[n] * SCALES.get(model, {}).get(n, 1.0) for n in names]
     return f"1 '{model}' 1 {' '.join(map(repr, values))} /"
 
 
 def system(records: dict[str, list[float]], folder: Path) -> Any:
     """Return andes' system of a unit, initialised."""
     (folder / "unit.raw").write_text(RAW, encoding="utf-8")
-    lines = [line(model, values) for model, values in records.items()]
+    lines = [line(model, values) for model, values in records.items() if model != TORQUE]
     (folder / "unit.dyr").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    found = andes.load(str(folder / "unit.raw"), addfile=str(folder / "unit.dyr"), no_output=True, default_config=True)
+    found = andes.load(
+        str(folder / "unit.raw"), addfile=str(folder / "unit.dyr"), no_output=True, default_config=True, setup=False
+    )
+    if TORQUE in records:
+        named = dict(zip(record_of(TORQUE), records[TORQUE], strict=True))
+        own = {n.replace("spd", "sp"): v * SCALES[TORQUE].get(n, 1.0) for n, v in named.items() if n != "-"}
+        found.add(TORQUE, {"idx": "torque", "rep": found.WTPTA1.idx.v[0], **own})
+        for reference in (found.WTPTA1.rego, found.WTPTA1.ree, *(getattr(found.WTTQA1, n) for n in NAMED)):
+            reference.vtype = str  # of the names of other parts, which andes takes for numbers
+    found.setup()
     found.PFlow.config.tol = 1e-10
     found.PFlow.run()
-    found.TDS.config.fixt, found.TDS.config.shrinkt = 1, 0
+    found.TDS.config.fixt, found.TDS.config.shrinkt, found.TDS.config.tol = 1, 0, 1e-7
     found.TDS.config.tstep = next(
         h for group, h in TIME_STEPS.items() if any(m.n for m in found.groups[group].models.values())
     )
@@ -149,7 +173,7 @@ def system(records: dict[str, list[float]], folder: Path) -> Any:
 
 def group_of(found: Any) -> str:
     """Return the group of the unit: machines or converters."""
-    return next(group for group in TIME_STEPS if any(m.n for m in found.groups[group].models.values()))
+    return next(group for group in ENDS if any(m.n for m in found.groups[group].models.values()))
 
 
 def eigenvalues(records: dict[str, list[float]], folder: Path) -> list[list[float]]:
@@ -179,6 +203,7 @@ def response(records: dict[str, list[float]], step: str, folder: Path) -> dict[s
         "Qext": flags.get("PFFLAG", False),
         "PFaref": not flags.get("PFFLAG", True),
         "Plant_pref": not flags.get("Fflag", True),
+        "Pref": any(m.n for m in found.groups["RenTorque"].models.values()),  # it keeps that of the start
     }
     if not taken or unused.get(step, False):
         return None

@@ -7,36 +7,49 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal
 
+import sympy as sp
+
 from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model, read_card
+from hvdc_ident.model import Model, parse_card, read_card
 from hvdc_ident.model.card import toml_key, toml_string
+from hvdc_ident.model.transform import substituted, without_vanished
 from hvdc_ident.parameters import Input
 from hvdc_ident.shelf import card_of, components, record_of, source_of
 
 UNCONNECTED = FrozenMap(
-    {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0", "wg": "1"}
+    {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0"}
+    | {"wg": "1", "wt": "1", "wref": "1", "theta": "0", "theta_start": "0", "dPm": "0"}
 )
-"""What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), nominal frequency and speed."""
+"""What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), nominal frequency and speed, no
+turbine and no pitch."""
+AHEAD = FrozenMap({"Pref0": "Pref"})
+"""Inputs that follow a signal of another name, ahead of the part that takes it and gives it on changed: the torque controller of a wind
+turbine makes of the plant's power reference the one that the electrical controller follows, the pitch controller takes the former."""
 REFERENCES = (
     ("P0", "P", "MW", ("Plant_pref", "Pref", "nref", "Pm")),
-    ("Q0", "Q", "Mvar", ("Vref", "Qref", "Qext", "Efd")),
+    ("Q0", "Q", "Mvar", ("Vref", "Qref", "Qext", "PFaref", "Efd")),
 )
 """Of a unit that is played back: the input with the recorded level before the event, its output and unit, and the reference that is
-found from it, the first that the unit has."""
+found from it, the first that the unit has and that its flags let act."""
 LEVELS = FrozenMap({level: output for level, output, _, _ in REFERENCES})
 """By input with a level the output that has it."""
 LOADED = 0.8
 """Share of its base that a unit delivers where its level is not known."""
 VOLTAGE = Input(1.0, "pu", "voltage of the infinite bus")
-SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu"})
+SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu", "wt": "pu", "wg": "pu"})
 """Outputs of a unit, where one of its components has them, with their units."""
 
 
 METER = "freq.dwn"
-"""What controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts."""
+"""What controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts. A machine, which
+has a speed of its own in the frame, takes that of the frame."""
 MACHINE = "gen"
-NAMES = FrozenMap({"Ir": MACHINE, "Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd": "elec", "Qext": "plant"})
+NAMES = FrozenMap(
+    {"Ir": MACHINE, "wg": "drive", "dPm": "aero", "theta": "pitch", "wref": "torque"}
+    | {"Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd": "elec", "Qext": "plant"}
+)
 """Name of a part in a unit by the output that it gives; another goes by the name of its component."""
 
 
@@ -70,9 +83,8 @@ def unit_card(
     models = {n: shelf_model(p.source) for n, p in parts.items()}
     machine = _one_that_gives(models, "Ir")
     played = network == "playback"
-    connections, references = _wired(models, machine, _network(machine, network), played)
+    connections, references = _wired(models, _network(machine, network), played)
     inputs: dict[str, Input] = {**(shelf_model("playback").inputs if played else {"E": VOLTAGE}), **references}
-    found = _references(inputs, parts[machine]) if played else {}
     known = {"f": f0} | dict(levels)
     grid = (
         {"bus": UnitPart("playback", {"f0": f0})}
@@ -84,26 +96,30 @@ def unit_card(
         grid["freq"] = UnitPart("bus-frequency", {"f0": f0})
     shared = {n: {"f0": f0} if "f0" in m.parameters else {} for n, m in models.items()}
     components = {n: replace(p, values=shared[n] | dict(p.values)) for n, p in parts.items()} | grid
-    lines = [
-        "schema = 1",
-        f"name = {toml_string(name)}",
-        "",
-        "[inputs]",
-        *(_input_line(n, replace(i, value=known.get(n, i.value))) for n, i in inputs.items()),
-        *(line for n, p in components.items() for line in _component_lines(n, p)),
-        "",
-        "[connections]",
-        *(f"{toml_key(n)} = {e if e.startswith('{') else toml_string(e)}" for n, e in connections.items()),
-        *(line for n, about in found.items() for line in _reference_lines(n, machine, *about)),
-        "",
-        "[outputs]",
-        *_output_lines(models),
-    ]
-    return "\n".join(lines) + "\n"
+
+    def card(references: Mapping[str, tuple[str, str, Input]]) -> str:
+        lines = [
+            "schema = 1",
+            f"name = {toml_string(name)}",
+            "",
+            "[inputs]",
+            *(_input_line(n, replace(i, value=known.get(n, i.value))) for n, i in inputs.items()),
+            *(line for n, p in components.items() for line in _component_lines(n, p)),
+            "",
+            "[connections]",
+            *(f"{toml_key(n)} = {e if e.startswith('{') else toml_string(e)}" for n, e in connections.items()),
+            *(line for n, about in references.items() for line in _reference_lines(n, machine, *about)),
+            "",
+            "[outputs]",
+            *_output_lines(models),
+        ]
+        return "\n".join(lines) + "\n"
+
+    return card(_references(inputs, parts[machine], parse_card(card({}))) if played else {})
 
 
 def _wired(
-    models: Mapping[str, Model], machine: str, connections: Mapping[str, str], played: bool
+    models: Mapping[str, Model], connections: Mapping[str, str], played: bool
 ) -> tuple[dict[str, str], FrozenMap[Input]]:
     """Return what each input of the parts follows, and the inputs of the unit that are left. connections: those with the network."""
     found, inputs = dict(connections), dict[str, Input]()
@@ -111,18 +127,28 @@ def _wired(
         (n, u, quantity) for n, m in models.items() for u, quantity in m.inputs.items() if f"{n}.{u}" not in found
     ]
     for part, u, quantity in targets:
-        sources = [n for n, other in models.items() if n != part and u in other.outputs]
+        sources = _sources(models, part, u)
         if len(sources) > 1:
             raise ModelError(f"'{part}.{u}' may follow several parts", expected="one", got=", ".join(sources))
         if sources:
-            found[f"{part}.{u}"] = f"{sources[0]}.{u}"
+            found[f"{part}.{u}"] = f"{sources[0]}.{AHEAD.get(u, u)}"
         elif played and u == "dwn":
-            found[f"{part}.{u}"] = "bus.dwn" if part == machine else METER
+            found[f"{part}.{u}"] = "bus.dwn" if "dw" in models[part].outputs else METER
         else:
-            found[f"{part}.{u}"] = UNCONNECTED.get(u, u)
-            if u not in UNCONNECTED:
-                inputs.setdefault(u, quantity)
+            signal = AHEAD.get(u, u)
+            found[f"{part}.{u}"] = UNCONNECTED.get(signal, signal)
+            if signal not in UNCONNECTED:
+                inputs.setdefault(signal, quantity)
     return found, FrozenMap(inputs)
+
+
+def _sources(models: Mapping[str, Model], part: str, u: str) -> list[str]:
+    """Return the parts that an input of a part may follow: of those that give its signal, where one takes it from the others and gives
+    it on changed, that one, or for an input ahead of it the others."""
+    signal = AHEAD.get(u, u)
+    givers = [n for n, m in models.items() if n != part and signal in m.outputs]
+    changing = [n for n in givers if any(AHEAD.get(v) == signal for v in models[n].inputs)]
+    return [n for n in givers if (n in changing) == (u == signal)] if changing else givers
 
 
 def _component_lines(name: str, part: UnitPart) -> Iterator[str]:
@@ -172,15 +198,39 @@ def part_name(source: str) -> str:
     return next((n for o, n in NAMES.items() if o in outputs), source)
 
 
-def _references(inputs: dict[str, Input], machine: UnitPart) -> dict[str, tuple[str, str, Input]]:
-    """Return by reference its level's name, its output and what it was; the levels take the places of the references among the inputs."""
-    found = {}
-    for level, output, unit, names in REFERENCES:
-        reference = next((n for n in names if n in inputs), None)
+def _references(inputs: dict[str, Input], machine: UnitPart, unit: Model) -> dict[str, tuple[str, str, Input]]:
+    """Return by reference its level's name, its output and what it was; the levels take the places of the references among the inputs.
+
+    unit: with the references as inputs.
+    """
+    found, uses = {}, _uses(unit)
+    for level, output, unit_of_level, names in REFERENCES:
+        acting = _followed(uses, output)
+        reference = next((n for n in names if n in inputs and n in acting), None)
         if reference is not None:
             found[reference] = (level, output, inputs.pop(reference))
             base = machine.values.get("Sn", shelf_model(machine.source).values.get("Sn", 100.0))
-            inputs[level] = Input(LOADED * base if output == "P" else 0.0, unit, f"{output} before the event")
+            inputs[level] = Input(LOADED * base if output == "P" else 0.0, unit_of_level, f"{output} before the event")
+    return found
+
+
+def _uses(model: Model) -> dict[str, set[str]]:
+    """Return by variable the names that its expressions have at the values of the parameters: flags decide which branch counts."""
+    at = {symbol(n): sp.Float(v) for n, v in model.values.items() if n in model.parameters}
+    fields = substituted(without_vanished(model), at)
+    found = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in fields["states"].items()}
+    found |= {n: [s.value] for n, s in fields["signals"].items()}
+    found |= {n: [a.equation] for n, a in fields["algebraic"].items()}
+    found |= {n: [o.value] for n, o in fields["outputs"].items() if n not in found}
+    return {n: {s.name for e in expressions for s in e.free_symbols} for n, expressions in found.items()}
+
+
+def _followed(uses: Mapping[str, set[str]], name: str) -> set[str]:
+    """Return a name and the names of all that it follows."""
+    found, new = set[str](), {name}
+    while new:
+        found |= new
+        new = {s for n in new for s in uses.get(n, ())} - found
     return found
 
 

@@ -22,9 +22,9 @@ HERE = Path(__file__).parent
 CASES = tomllib.loads((HERE / "cases.toml").read_text(encoding="utf-8"))
 RECORDED = json.loads((HERE / "andes.json").read_text(encoding="utf-8"))
 ANDES, STEPS, TIMES = RECORDED["cases"], RECORDED["steps"], np.array(RECORDED["times"])
-UNUSED = {"reeca1-q": 3, "reeca1-pf": 2, "reeca1-v": 3, "reeca1-dip": 3, "reecb1-q": 3}
+UNUSED = {"reeca1-q": 4, "reeca1-pf": 3, "reeca1-v": 4, "reeca1-dip": 4, "reecb1-q": 4}
 """States of branches that a flag switches off, by case: andes keeps them, unseen by all others."""
-UNSEEN = ("repca1-q",)
+UNSEEN = ("repca1-q", "type3-plant")
 """Cases without a comparison of eigenvalues: the Jacobian of andes lacks the power of the branch that a plant controller measures."""
 ENDS_ALONE = (("reeca1-dip", "Pref"),)
 """Responses of which the end alone is compared: on the way to the limit of the active current, which is the same, P of andes is up to
@@ -48,6 +48,12 @@ def unit(name: str) -> Model:
     return model.with_values(point.inputs)
 
 
+def read(matrix: np.ndarray) -> np.ndarray:
+    """Return the matrix of the states without those that no other one follows, as the eigenvalues of andes are without them."""
+    kept = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=0, initial=0.0) > 0
+    return matrix if kept.all() else read(matrix[np.ix_(kept, kept)])
+
+
 @pytest.fixture(scope="module", params=ANDES)
 def case(request):
     return request.param, unit(request.param)
@@ -62,7 +68,8 @@ def test_eigenvalues(case) -> None:
         rest = hi.simulate(model, TIMES[:2], outputs=held)
         model = model.driven(held).with_values({n: rest[n][0] for n in held})
         point = hi.find_operating_point(model, guess=point.states)
-    found = np.linalg.eigvals(hi.linearize(model, point).A)
+    matrix = hi.linearize(model, point).A
+    found = np.linalg.eigvals(read(matrix) if "REGCA1" in CASES[name] else matrix)
     expected = np.array([complex(*e) for e in ANDES[name]["eigenvalues"]])
     assert found.size == expected.size - UNUSED.get(name, 0)
     apart = np.abs(found[:, None] - expected[None, :]) / np.maximum(1.0, np.abs(expected))

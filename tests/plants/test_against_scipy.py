@@ -250,7 +250,7 @@ def test_loops_of_reactive_power_and_voltage(source, VFLAG, E) -> None:
 
 def test_the_drive_train_swings_at_its_frequency() -> None:
     """Two free masses with a shaft: the torsional mode is at Freq1, damped by Dshaft (1/(2 Ht) + 1/(2 Hg))/2; one mass has none."""
-    values = {"H": 5.0, "Htfrac": 0.8, "Freq1": 2.0, "Dshaft": 1.0, "DAMP": 0.5, "Pm": 0.0, "Pe": 0.0}
+    values = {"H": 5.0, "Htfrac": 0.8, "Freq1": 2.0, "Dshaft": 1.0, "DAMP": 0.5, "Pe": 0.0}
     modes = np.linalg.eigvals(hi.linearize(shelf_model("wtdta1").with_values(values)).A)
     mode = modes[modes.imag > 0][0]
     assert abs(mode) == pytest.approx(2 * np.pi * 2.0, rel=2e-3)
@@ -261,7 +261,7 @@ def test_the_drive_train_swings_at_its_frequency() -> None:
 
 def test_pitch_control_follows_its_block_diagram() -> None:
     """The speed rises and falls: the pitch leaves its lowest angle, comes to its highest rate and back."""
-    model = shelf_model("wtpta1").with_values({"wt": 0.98, "Pset": 0.9, "TetaMax": 8.0, "Kcc": 0.1})
+    model = shelf_model("wtpta1").with_values({"wt": 0.98, "Pref0": 0.9, "TetaMax": 8.0, "Kcc": 0.1})
     p = model.values
     speed = [(0.0, 0.98), (0.5, 0.98), (1.5, 1.06), (2.5, 1.06), (3.5, 0.99), (5.0, 0.99)]
 
@@ -289,6 +289,7 @@ name = "torque"
 [inputs]
 wg = {value = 0.9, unit = "pu"}
 Vt = {value = 1.0, unit = "pu"}
+Pref0 = {value = 0.65, unit = "pu"}
 [states]
 Pe = {derivative = "(torque.Pref - Pe)/0.1", guess = 0.65, unit = "pu"}
 [components.torque]
@@ -298,7 +299,7 @@ parameters = {Twref = 5.0}
 "torque.Pe" = "Pe"
 "torque.wg" = "wg"
 "torque.Vt" = "Vt"
-"torque.Pref0" = "0.8"
+"torque.Pref0" = "Pref0"
 [outputs]
 Pe = "Pe"
 wref = "torque.wref"
@@ -326,14 +327,14 @@ def test_torque_control_follows_its_block_diagram(Vt) -> None:
 
     found = solve_ivp(rates, (0, 5), [power, power, 0.9, power / 0.9], t_eval=TIMES, rtol=1e-8, atol=1e-10)
     steps = {"wg": hi.step(0.9, 0.92, at=0.0), "Vt": hi.step(1.0, Vt, at=0.0)}
-    run = hi.simulate(parse_card(TORQUE), TIMES, inputs=steps)
+    run = hi.simulate(parse_card(TORQUE).with_values({"Pref0": power}), TIMES, inputs=steps)
     assert apart(run, "Pe", found.y[0]) < 1e-4
     assert apart(run, "wref", found.y[2]) < 1e-4
 
 
 def test_aerodynamics_fall_with_the_pitch() -> None:
-    model = shelf_model("wtara1").with_values({"theta0": 2.0, "theta": 5.0, "Pm0": 0.9})
-    assert hi.find_operating_point(model).outputs["Pm"] == pytest.approx(0.9 - 0.007 * 5.0 * 3.0)
+    model = shelf_model("wtara1").with_values({"theta0": 2.0, "theta": 5.0})
+    assert hi.find_operating_point(model).outputs["dPm"] == pytest.approx(-0.007 * 5.0 * 3.0)
 
 
 # --- network ---

@@ -44,3 +44,22 @@ def test_controls_measure_the_frequency_of_a_recorded_angle() -> None:
     slowed = hi.simulate(model, times, inputs={"f": hi.step(50.0, 50.0 - fall, at=1.0)})["P"]
     assert slowed[-1] - slowed[0] == pytest.approx(100.0 * 20.0 * fall / 50.0, rel=0.05)
     assert np.abs(turned - slowed).max() < 0.02 / 0.25 * np.ptp(slowed)
+
+
+@pytest.mark.parametrize(
+    ("elec", "plant", "reference"),
+    [
+        ({"PFFLAG": 0.0}, None, "Qext"),
+        ({"PFFLAG": 1.0}, None, "PFaref"),
+        ({"PFFLAG": 0.0}, {"RefFlag": 1.0}, "Vref"),
+        ({"PFFLAG": 0.0}, {"RefFlag": 0.0}, "Qref"),
+        ({"PFFLAG": 1.0}, {"RefFlag": 1.0}, "PFaref"),
+    ],
+)
+def test_the_reference_that_the_flags_let_act_is_found(elec, plant, reference) -> None:
+    parts = {"gen": UnitPart("regca1"), "elec": UnitPart("reeca1", {"VFLAG": 0.0, "QFLAG": 0.0, **elec})}
+    parts |= {} if plant is None else {"plant": UnitPart("repca1", plant)}
+    model = parse_card(unit_card(parts, network="playback", f0=60.0))
+    assert reference in model.states
+    found = hi.find_operating_point(model.with_values({"P0": 80.0, "Q0": 15.0})).outputs
+    assert (found["P"], found["Q"]) == pytest.approx((80.0, 15.0), abs=1e-6)
