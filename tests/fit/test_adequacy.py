@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import f as f_distribution
 
 from hvdc_ident.fit import FitParameter, Problem, fit
+from hvdc_ident.fit.adequacy import cross_correlation
 from tests.fit.simulators import Closed, coloured, line, parameters, recorded
 
 T = np.linspace(0.0, 1.0, 200)
@@ -155,3 +157,14 @@ def test_records_that_are_off_only_together_are_told_by_their_size():
     assert judged.verdict == "noise-understated" and judged.outputs["y"].record == ""
     assert {s.follows for s in signals} == {True, False}
     assert all(s.follows is (s.ratio <= 2.0) for s in signals if s.ratio < s.high)
+
+
+def test_two_slow_signals_that_have_nothing_to_do_with_each_other_are_not_related() -> None:
+    """Of independent AR(1) signals of coefficient 0.95 about one pair in twenty has p < 0.05; a copy is seen at its lag."""
+    random = np.random.default_rng(11)
+    slow = lfilter([1.0], [1.0, -0.95], random.standard_normal((2, 200, 400)), axis=2)
+    found = [cross_correlation(r, u)["p"] for r, u in zip(*slow, strict=True)]
+    assert np.mean(np.array(found) < 0.05) < 0.1
+    signal = slow[0, 0]
+    led = cross_correlation(signal[:-3], signal[3:])  # the input leads by three rows
+    assert led["lag"] == 3 and led["correlation"] == pytest.approx(1.0, abs=0.02) and led["p"] < 1e-6

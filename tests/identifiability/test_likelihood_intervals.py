@@ -6,11 +6,12 @@ from math import sqrt
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq, lsq_linear
+from scipy.optimize import brentq, lsq_linear, nnls
 from scipy.stats import binom
 
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.profile import profile_pair, profiles
+from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.likelihood_intervals import bootstrap_rise, thresholds
 from hvdc_ident.identifiability.misspecification import heterogeneity
@@ -121,6 +122,18 @@ def test_two_on_their_bounds_together_get_limits_that_cover() -> None:
         plant, [measured(plant, {"a": -0.02, "b": -0.02}, 0.05, seed)], free[:1], starts=1, held={"b": 0.0}
     )
     assert 0 < report.parameters["a"].ci95[1] < 2.5 * alone.parameters["a"].ci95[1]
+    # The rise at the limit of a: the 95 % quantile by SciPy's non-negative least squares of noise on top of that limit.
+    found = report.parameters["a"]
+    columns, random = np.column_stack([np.ones(T.size), T]) / 0.05, np.random.default_rng(5)
+    rises = []
+    for noise in random.standard_normal((3000, T.size)):
+        y = columns[:, 0] * found.ci95[1] + noise
+        (best, _), left = nnls(columns, y)
+        _, beside = nnls(columns[:, 1:], noise)
+        rises.append(0.5 * (beside**2 - left**2) if best < found.ci95[1] else 0.0)
+    rise = found.profile.threshold / report.thresholds["a"] * TWO_SIDED
+    # It was asked at the limit for one alone, which lies farther out, where the bound of a takes less of the scatter.
+    assert np.quantile(rises, 0.95) < rise < 0.75 * ONE_SIDED
 
 
 def test_the_bootstrap_of_one_on_its_bound_is_the_known_quantile() -> None:
