@@ -247,6 +247,8 @@ def _neighbours(round_model: RoundModel, opened: Round, lead: CandidateFit, numb
     promising = round_model.order(opened.screen, found, theta)[:FIELD]
     which = list(dict.fromkeys((*here, *like[: 2 * REFITS_PER_EFFECT], *parts, *around, *promising)))
     late = effects()[own.effect].delay_with(sizes)
+    for k in promising:  # bends are missed between two sizes
+        found[k] = _denser(found[k])
     for k in which:
         if found[k].effect == own.effect:
             found[k] = found[k].with_sizes([sizes])
