@@ -24,8 +24,9 @@ from hvdc_ident.study.new_unit import UnitAsked, new_unit_study  # noqa: E402
 RESULTS = HERE / "unit-results"
 """One file for each unit that is done; a second call goes on with the others. expected.json has all of them."""
 COMMAND = (sys.executable, "-c", "from hvdc_ident.cli import main; main()")
-CONVENTIONS = {"genrou": "Kw = 0.0", "reeca1": "Tpfilt = 0.02", "reecb1": "Tpfilt = 0.02"}
-"""What andes has otherwise than the standard, by component: the power acts as a torque, the power reference has a filter of 20 ms."""
+CONVENTIONS = {"genrou": "Kw = 0.0", "reeca1": "Tpfilt = 0.02", "reecb1": "Tpfilt = 0.02", "bus-frequency": "T = 0.12"}
+"""What andes has otherwise than the standard, by component: the power acts as a torque, the power reference has a filter of 20 ms, the
+frequency is measured behind lags of 20 and 100 ms."""
 
 NEAR = 0.05
 """Share of the truth within which an estimate is near it."""
@@ -111,7 +112,7 @@ def _effect_outcome(plant: Plant, verdict: str, first: list[tuple[str, str]], to
     if verdict == "named" and right and all(right):
         return "named"
     if any(plant.hidden.right(e, p) for e, p in told):
-        return "covered" if len(first) < 2 else "covered, with another"
+        return "covered" if len(first) < 2 or verdict == "ambiguous" or all(right) else "covered, with another"
     if not first:
         return "held"
     return "place" if all(e in plant.hidden.effects for e, _ in first) else "wrong"

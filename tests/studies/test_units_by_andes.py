@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import hvdc_ident as hi
+from hvdc_ident.study.fitting import problem_of
 from tests.studies.study_module import load
 
 RUN = load("units_by_andes")
@@ -49,3 +52,16 @@ def test_the_vendors_file_differs_where_the_unit_says(name) -> None:
 def test_the_record_is_finite_and_moves(name) -> None:
     table = np.loadtxt(RUN.HERE / "recordings" / name / "event.csv", delimiter=",", skiprows=1)
     assert np.isfinite(table).all() and (np.diff(table[:, 0]) > 0.0).all() and (np.ptp(table[:, 1:], axis=0) > 0.01).all()
+
+
+@pytest.mark.parametrize("name", ["gas_load_limit", "steam_regulator_limit", "park_frequency_dead_band"])
+def test_what_the_plant_itself_leaves_of_a_record_is_noise(name, tmp_path) -> None:
+    """With the plant's own values: white and of size 1, once what the noise of voltage and angle makes of P and Q is counted."""
+    problem = problem_of(hi.load_study(RUN.write_study(name, tmp_path / name, "true.dyr")))
+    for b in problem.blocks(problem.given):
+        r = b.residual
+        assert 0.88 < np.sqrt(np.mean(r**2)) < 1.12
+        assert abs(r[1:] @ r[:-1]) < 0.12 * (r @ r)
+    alone = [e.with_(input_noise={}) for e in problem.experiments]
+    blind = replace(problem, experiments=alone, passed={}).blocks(problem.given)
+    assert max(np.sqrt(np.mean(b.residual**2)) for b in blind) > 2.0
