@@ -61,6 +61,8 @@ def serve(
             from nicegui import ui
 
             from hvdc_ident.app.plot import ASSETS
+
+            tabs()  # what they import is of the extra, too
         except ImportError as error:
             raise InputError(
                 "the workbench's framework is not installed",

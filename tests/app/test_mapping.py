@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+pytest.importorskip("tomlkit", reason="the workbench needs: pip install 'hvdc_ident[app]'")
+
 import hvdc_ident as hi
 from hvdc_ident.app.desk import opened
 from hvdc_ident.app.mapping import RecordingMap, SignalLine, drafted, experiments_in, proposed, write_mapping

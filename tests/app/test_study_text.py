@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("tomlkit", reason="the workbench needs: pip install 'hvdc_ident[app]'")
+
 from hvdc_ident.app.study_text import with_experiment
 from hvdc_ident.errors import StudyError
 
@@ -135,9 +137,88 @@ def test_every_layout_of_one_experiment_is_changed(layout: str) -> None:
     assert found.get("phases") == tomllib.loads(text)["experiment"][0].get("phases")
 
 
+APART = """[[experiment]]
+name = "first" # of two
+data = "first.csv"
+[experiment.inputs] # played
+Pref2 = "P"
+# Vdcref1 = "V" may be one, too
+
+# what is compared
+[experiment.outputs]
+gen.P = "P" # active
+gen.Q = "Q" # reactive
+# for the outputs
+[experiment.columns.gen]
+P.base = 500.0 # MVA
+# how it is fitted
+[fit]
+starts = 2
+# a later one
+[[experiment]]
+name = "second"
+data = "second.csv"
+outputs.gen.P = "P" # active
+outputs.V = "V" # voltage
+# the end
+"""
+
+
+def test_comments_stay_with_what_they_are_about() -> None:
+    first = {
+        "inputs": {"Pref2": "P", "Vdcref1": "V"},
+        "outputs": {"gen.P": "P", "gen.Q": "Q2", "V": "U"},
+        "columns": {"gen.P": {"base": 600.0}, "gen.Q": {"unit": "MW"}},
+        "event": 0.1,
+    }
+    new = with_experiment(APART, "first", first, "study.toml")
+    assert new == (
+        APART.replace('data = "first.csv"\n', 'data = "first.csv"\nevent = 0.1\n\n')
+        .replace('Pref2 = "P"\n', 'Pref2 = "P"\nVdcref1 = "V"\n')
+        .replace('gen.Q = "Q" # reactive\n', 'gen.Q = "Q2" # reactive\nV = "U"\n')
+        .replace("P.base = 500.0 # MVA\n", 'P.base = 600.0 # MVA\nQ = {unit = "MW"}\n')
+    )
+    second = {"outputs": {"gen.P": "P", "V": "U"}, "window": [0.0, 1.0]}
+    new = with_experiment(APART, "second", second, "study.toml")
+    assert new == APART.replace('V = "V" # voltage\n', 'V = "U" # voltage\nwindow = [0.0, 1.0]\n')
+
+
+def test_a_new_experiment_is_laid_out_as_in_a_new_study() -> None:
+    new = {
+        "name": "third",
+        "outputs": {"gen.P": "P"},
+        "inputs": {},
+        "columns": {"gen.P": {"base": 2.0}},
+        "role": "holdout",
+    }
+    assert with_experiment(APART, "third", new, "study.toml") == APART.replace(
+        "# the end\n",
+        """
+[[experiment]]
+name = "third"
+role = "holdout"
+
+[experiment.outputs]   # signal of the model = column
+"gen.P" = "P"
+
+[experiment.columns]
+"gen.P" = {base = 2.0}
+# the end
+""",
+    )
+
+
+def test_an_experiment_in_one_line_is_changed_there() -> None:
+    text = 'experiment = [{name = "up", data = "up.csv", outputs = ["Vdc1"]}] # one\n'
+    new = with_experiment(text, "up", {"outputs": {"Vdc1": "V"}}, "study.toml")
+    assert new == text.replace('["Vdc1"]', '{Vdc1 = "V"}')
+
+
 def test_a_layout_that_cannot_be_changed_is_refused() -> None:
-    text = 'schema = 1\nexperiment = [{name = "up", data = "up.csv", outputs = ["Vdc1"]}]\n'
-    with pytest.raises(StudyError, match="as it was"):
-        with_experiment(text, "up", keys(), "study.toml")
+    inside_a_text = '[[experiment]]\nname = "up"\nnote = """\n[[experiment]]\n"""\n'
+    out_of_order = '[[experiment]]\nname = "up"\n[fit]\n[experiment.outputs]\nVdc1 = "V"\n'
+    for text in (inside_a_text, out_of_order):
+        with pytest.raises(StudyError, match="as it was"):
+            with_experiment(text, "up", keys(), "study.toml")
     with pytest.raises(StudyError, match="not valid TOML"):
         with_experiment("schema = = 1", "up", keys(), "study.toml")
