@@ -11,12 +11,13 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
+from hvdc_ident.colours import FITTED, MARK
 from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.files import plain
 from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import in_python
+from hvdc_ident.text import estimate_texts, in_python, interval_text
 
 NOT_ASKED = "not a candidate"
 """Reason of a parameter that is held because it was not asked for."""
@@ -149,13 +150,13 @@ class FitResult(Shown):
         yield self._quality()
         yield f"{self.roughness['text']}." if self.roughness else ""
         start = self.starts[0].start if self.starts else {}
-        rows = [(n, e.value, e.unit, _ends(e), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
+        rows = [(n, *_cells(e), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
         yield (
             Table(("parameter", "estimate", "unit", "95 % interval", "std", "start", "remark"), tuple(rows))
             if rows
             else ""
         )
-        own = [(x, n, e.value, e.unit, _ends(e)) for x, table in self.nuisance.items() for n, e in table.items()]
+        own = [(x, n, *_cells(e)) for x, table in self.nuisance.items() for n, e in table.items()]
         yield Table(("experiment", "nuisance", "estimate", "unit", "95 % interval"), tuple(own)) if own else ""
         yield self._held()
         columns = (self.rmse_given, self.rmse_start, self.rmse)
@@ -187,13 +188,13 @@ class FitResult(Shown):
         for row, (name, e) in enumerate(self.estimates.items()):
             base = start.get(name) or 0.0
             size = abs(base) or abs(e.value) or 1.0
-            axes.plot([100 * (e.value - base) / size], [row], marker="o", color="#1f5fa8")
+            axes.plot([100 * (e.value - base) / size], [row], marker="o", color=FITTED)
             low, high = e.ci95 or (None, None)
             if low is not None and high is not None:
                 axes.plot(
-                    [100 * (low - base) / size, 100 * (high - base) / size], [row, row], color="#1f5fa8", linewidth=2
+                    [100 * (low - base) / size, 100 * (high - base) / size], [row, row], color=FITTED, linewidth=2
                 )
-        axes.axvline(0.0, color="#999999", linestyle=":")
+        axes.axvline(0.0, color=MARK, linestyle=":")
         axes.set_yticks(range(len(self.estimates)), list(self.estimates))
         axes.invert_yaxis()
         axes.set_xlabel("change from the start, with the 95 % interval, %")
@@ -220,14 +221,9 @@ class FitResult(Shown):
         return "\n".join(lines) + "\n"
 
 
-def _ends(e: Estimate) -> str:
-    """Return the 95 % interval as text, with the figures that tell its ends apart."""
-    low, high = e.ci95 or (None, None)
-    if low is None or high is None:
-        return "" if low is high else f"below {high:.6g}" if low is None else f"above {low:.6g}"
-    width = high - low
-    figures = 6 if width <= 0 else min(15, max(4, math.ceil(math.log10(max(abs(low), abs(high)) / width)) + 2))
-    return f"{low:.{figures}g} to {high:.{figures}g}"
+def _cells(e: Estimate) -> tuple[str, str, str]:
+    """Return value, unit and interval as text."""
+    return estimate_texts(e.value, e.ci95)[0], e.unit, interval_text(e.ci95)
 
 
 def _key(name: str) -> str:

@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.display import Table, rounded
 from hvdc_ident.linearize import loop, margins
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.study.run_summary import conditions, values_table
-from hvdc_ident.text import listed, percentage, quantity
+from hvdc_ident.summary import RunSummary
+from hvdc_ident.summary.tables import truth_table
+from hvdc_ident.text import listed, probability_text, quantity
 
 FILE = "truth.json"
 """Name of the file in the folder of results; the report reads it there."""
@@ -56,21 +56,12 @@ def equivalent_delay(plant: Model, model: Model, order: str) -> dict[str, Any] |
     return {"order": order, "seconds": float(-np.angle(late / prompt) / omega), "at_hz": omega / math.tau}
 
 
-def truth_table(truth: Mapping[str, Any], fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> Table:
-    """Return the candidates with their given values, those that were found, and the true ones."""
-    found = values_table(fit, diagnosis)
-    true = {n: rounded(p["value"], 6) for n, p in truth["parameters"].items()}
-    return Table((*found.header, "true"), tuple((*row, true.get(row[0])) for row in found.rows))
-
-
-def found_effect(diagnosis: Mapping[str, Any]) -> str:
+def found_effect(s: RunSummary) -> str:
     """Return what was found missing, as a delay where it is one; "nothing" where nothing was."""
-    findings = diagnosis.get("findings") or []
     said = []
-    for f in findings:
-        delay = f.get("equivalent_delay") or {}
-        size = f" that acts as a delay of {quantity(delay['value'], 's')}" if delay.get("value") else ""
-        said.append(f"{f['effect']}{size} ({percentage(f['probability'])})")
+    for f in s.findings:
+        size = f" that acts as a delay of {quantity(f.delay, 's')}" if f.delay else ""
+        said.append(f"{f.effect}{size} ({probability_text(f.probability)})")
     return "; ".join(said) or "nothing"
 
 
@@ -83,14 +74,13 @@ def true_effect(truth: Mapping[str, Any]) -> str:
     return f"{truth['plant']} has further states in its {listed(truth['lacking'])}{late}"
 
 
-def truth_lines(truth: Mapping[str, Any], fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[str]:
-    """Return the screen: the truth beside what was found."""
+def truth_lines(truth: Mapping[str, Any], s: RunSummary) -> list[str]:
+    """Return the table of the screen, with the truth beside what was found."""
     return [
         f"The recordings were made by {truth['plant']}, so that the truth is known:",
         "",
-        *str(truth_table(truth, fit, diagnosis)).splitlines(),
-        *conditions(fit, diagnosis),
+        *str(truth_table(s, truth["parameters"])).splitlines(),
         "",
-        f"missing, found: {found_effect(diagnosis)}",
+        f"missing, found: {found_effect(s)}",
         f"missing, true: {true_effect(truth)}",
     ]

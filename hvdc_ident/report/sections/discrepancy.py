@@ -8,22 +8,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.report.answers import beyond_noise, places_of
-from hvdc_ident.report.drawing import AFTER, BEFORE, EFFECT, MARK, MEASURED, figure, svg, visible
-from hvdc_ident.report.html import captioned, estimate, folded, number, percent, table, text
-from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import form_of, listed, one_of, percentage, span, value_by_place, with_unit
+from hvdc_ident.colours import EFFECT, FITTED, RECORDED, ROLES
+from hvdc_ident.report.drawing import bode_axes, complex_of, draw_response, figure, svg, visible
+from hvdc_ident.report.html import Section, captioned, folded, number, table, table_of, text, typeset
+from hvdc_ident.summary import Results, RunSummary
+from hvdc_ident.summary.phrases import by_place, gained_sentence
+from hvdc_ident.summary.tables import findings_table
+from hvdc_ident.text import estimate_text, form_of, listed, percentage, span, with_unit
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 MODELS = {"nominal": "given values", "refitted": "refitted, nothing added", "augmented": "with the effect"}
 MOST = 12
 SHOWN = 5e-3
 """A smaller share of the gap is none."""
-PLACES = 4
-"""Likely places that are shown of each effect."""
 CHANNELS = 3
 """Channels that are drawn, those in which the record tells most frequencies: more would be too small to read."""
 
@@ -32,19 +31,21 @@ def _render(results: Results) -> str:
     found = results.get("discrepancy")
     if not found.get("verdict"):
         return ""
+    s = results.summary
     notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
     compared = "For specialists: what else was tried, and how far behind it is on the scale of the Bayesian information criterion (BIC)."
     return "".join(
         [
             _lead(found),
-            _effects(found),
-            _findings(found),
-            _advice(found),
+            _effects(s),
+            _findings(s),
             _curve(found),
-            _gap(found),
+            _gap(s, found),
             _slider(found.get("sizes")),
             folded(
-                "Where model and recordings differ", _where(found), "Signals, times, frequencies and levels of the gap."
+                "Where model and recordings differ",
+                _where(s, found),
+                "Signals, times, frequencies and levels of the gap.",
             ),
             folded("Frequency responses", _responses(found), "Of model and recording, from the inputs that moved."),
             folded("Hypotheses compared", _sets(found) + _candidates(found), compared),
@@ -70,44 +71,23 @@ def _curve(found: dict[str, Any]) -> str:
     )
 
 
-def _effects(found: dict[str, Any]) -> str:
+def _effects(s: RunSummary) -> str:
     lines = []
-    for e in found.get("effects") or []:
-        sizes = []
-        for name, p in (e.get("parameters") or {}).items():
-            value, interval = estimate(p.get("value"), p.get("ci95"))
-            ends = f" (95 %: {interval})" if p.get("ci95") and not beyond_noise(found) else ""
-            sizes.append(f"{text(name)} = {value}{ends} {text(p.get('unit') or '')}".rstrip())
-        among = _one_of_several(found) + f"Chosen from {text(e.get('chosen_from'))} candidates that were refitted."
-        lines.append(f"<li>{text(str(e.get('text', '')).rstrip('.'))}: {'; '.join(sizes)}. {among}</li>")
+    depend = "; ".join(f"{p.name} is {by_place(p)}" for p in s.parameters if p.by_place)
+    among = f" This is one of several that the recordings do not tell apart: {depend}." if depend else ""
+    for e in s.effects:
+        kept = {n: None if s.remainder.more_than_noise else q.interval for n, q in e.sizes.items()}
+        sizes = [f"{n} = {estimate_text(q.value, q.unit, kept[n])}" for n, q in e.sizes.items()]
+        chosen = f" Chosen from {e.chosen_from} candidates that were refitted." if e.chosen_from else ""
+        lines.append(f"<li>{text(e.text)}: {typeset('; '.join(sizes))}.{text(among + chosen)}</li>")
     return f"<ul>{''.join(lines)}</ul>" if lines else ""
 
 
-def _one_of_several(found: dict[str, Any]) -> str:
-    """Sentence beside what was put into the model, where other places explain the recordings as well with other values."""
-    depend = found.get("values_by_place") or {}
-    if not depend:
-        return ""
-    values = "; ".join(f"{text(n)} is {text(value_by_place(each))}" for n, each in depend.items())
-    return f"This is one of several that the recordings do not tell apart: {values}. "
-
-
-def _findings(found: dict[str, Any]) -> str:
+def _findings(s: RunSummary) -> str:
     """Return the likely effects and, apart from them, their places, with probabilities, where there is more than one of either."""
-    rows = []
-    for f in found.get("findings") or []:
-        delay = f.get("equivalent_delay") or {}
-        places = places_of(f["places"], depend=found.get("values_by_place") or {})
-        where = "; ".join(f"{at} ({percent(p)})" for at, p in [*places.items()][:PLACES])
-        where += f"; and {len(places) - PLACES} more" if len(places) > PLACES else ""
-        value = None if found.get("values_by_place") else delay.get("value")
-        late = "" if value is None else number(1e3 * value, 3)
-        rows.append([text(one_of(f["same_as"])), text(f"{percent(f['probability'])}"), text(where), late])
-    if not rows or (len(rows) == 1 and len(found["findings"][0]["places"]) < 2):
+    if not s.findings or (len(s.findings) == 1 and len(s.findings[0].places) < 2):
         return ""
-    return "<h3>What may be missing, and where</h3>" + table(
-        ["effect", "probability", "likely at", "delay, ms"], rows, words=(0, 1, 2)
-    )
+    return "<h3>What may be missing, and where</h3>" + table_of(findings_table(s))
 
 
 def _sets(found: dict[str, Any]) -> str:
@@ -132,24 +112,15 @@ def _sets(found: dict[str, Any]) -> str:
     return "".join(parts)
 
 
-def _advice(found: dict[str, Any]) -> str:
-    advice = (found.get("separating_experiment") or {}).get("text")
-    return f"<p><strong>What to measure.</strong> {text(advice.rstrip('.'))}.</p>" if advice else ""
-
-
-def _gap(found: dict[str, Any]) -> str:
+def _gap(s: RunSummary, found: dict[str, Any]) -> str:
     """Figure of the pooled residual before and after, and a sentence on the held-out recordings."""
     gap = found.get("gap") or {}
     if not gap.get("pooled"):
         return ""
     picture = svg(gap_bars(gap["pooled"]), "residual of the three models in noise units")
     caption = "Residual of all signals together in units of the noise, on fitted and on held-out recordings."
-    shrink = gap.get("shrink_holdout")
-    line = (
-        f"<p>On held-out recordings the effect shrinks the residual by {percentage(shrink)} against the refitted model.</p>"
-        if shrink is not None and (found.get("augmented_model") or found.get("effects"))
-        else ""
-    )
+    gained = gained_sentence(s)
+    line = f"<p>{text(gained)}</p>" if gained else ""
     note = "<p class='small'>Rows on a jump of an input are left out here: no recorder tells which side they show.</p>"
     return captioned(picture, caption) + line + note
 
@@ -183,7 +154,7 @@ def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
     time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
     fig = figure(7.4, 3.6)
     top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-    top.plot(*visible(time, measured), color=MEASURED, linewidth=1.0, label="recorded")
+    top.plot(*visible(time, measured), color=RECORDED, linewidth=1.0, label="recorded")
     for k, curve in enumerate(sizes["curves"]):
         values = np.asarray(curve, dtype=float)
         for axes, shown in ((top, values), (strip, measured - values)):
@@ -207,8 +178,8 @@ def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
     return drawn
 
 
-def _where(found: dict[str, Any]) -> str:
-    place, left = found.get("location") or {}, found.get("remaining") or {}
+def _where(s: RunSummary, found: dict[str, Any]) -> str:
+    place = found.get("location") or {}
     outputs, experiments = _shares(place.get("outputs")), _shares(place.get("experiments"))
     window, band, region = place.get("time_window"), place.get("band_hz"), place.get("region")
     parts = [f"Share of the gap by output: {outputs}; by experiment: {experiments}."] if outputs else []
@@ -220,15 +191,9 @@ def _where(found: dict[str, Any]) -> str:
         parts.append(
             f"It is densest where {text(region['signal'])} lies between {span(region['from'], region['to'], '', 3)}."
         )
-    explained = left.get("explained_share")
-    rest = "not all noise" if beyond_noise(found) else "noise" if left.get("adequate") else "no louder than noise"
-    if explained is not None:
-        parts.append(f"{percentage(explained, 1)} of the gap is explained; what is left is {rest}.")
-    elif left:
-        parts.append(f"What is left is {rest}.")
-    if not parts:
-        return ""
-    return "<p>" + " ".join(parts) + "</p>"
+    if s.remainder.explained is not None:
+        parts.append(f"{percentage(s.remainder.explained, 1)} of the gap is explained.")
+    return f"<p>{' '.join(parts)}</p>" if parts else ""
 
 
 def _shares(found: dict[str, float] | None) -> str:
@@ -265,13 +230,13 @@ def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
     axes = fig.subplots()
     names = [n for n in MODELS if n in pooled]
     for k, (part, label, colour) in enumerate(
-        (("fit", "fitted recordings", "#5f7386"), ("holdout", "held-out recordings", "#9fb0c0"))
+        (("fit", "fitted recordings", ROLES["fit"]), ("holdout", "held-out recordings", ROLES["holdout"]))
     ):
         values = [pooled[n].get(part) for n in names]
         axes.bar(
             np.arange(len(names)) + (k - 0.5) * 0.38, [v or np.nan for v in values], 0.38, label=label, color=colour
         )
-    axes.axhline(1.0, color=MEASURED, linestyle=":", linewidth=1.0, label="noise")
+    axes.axhline(1.0, color=RECORDED, linestyle=":", linewidth=1.0, label="noise")
     axes.set_yscale("log")
     axes.set_xticks(range(len(names)), [MODELS[n] for n in names], fontsize=8)
     axes.set_ylabel("residual, in noise units", fontsize=8)
@@ -287,8 +252,8 @@ def hidden_curve(at: str, curve: Mapping[str, Any]) -> Figure:
     axes = fig.subplots()
     x, y = np.array(curve["at"]), np.array(curve["value"])
     wide = 1.96 * np.array([np.nan if s is None else s for s in curve["std"]])
-    axes.fill_between(x, y - wide, y + wide, color=AFTER, alpha=0.25, linewidth=0.0)
-    axes.plot(x, y, color=AFTER, linewidth=1.4, marker=".", markersize=5)
+    axes.fill_between(x, y - wide, y + wide, color=EFFECT, alpha=0.25, linewidth=0.0)
+    axes.plot(x, y, color=EFFECT, linewidth=1.4, marker=".", markersize=5)
     # A level that the records hardly visit has a band that would hide all others.
     known = y[np.isfinite(wide) & (wide < np.ptp(y))] if np.ptp(y) > 0 else y
     room = 0.3 * max(float(np.ptp(known)) if known.size else 0.0, 1e-12)
@@ -306,39 +271,19 @@ def bode(channels: Sequence[Mapping[str, Any]]) -> Figure:
     wide = 3.2 * max(len(shown), 1)
     edges = {"left": 0.62 / wide, "right": 1.0 - 0.1 / wide, "wspace": 0.2, "bottom": 0.11, "top": 0.93, "hspace": 0.08}
     fig = figure(wide, 4.6, edges)
-    for k, c in enumerate(shown):
-        above = fig.add_subplot(2, len(shown), k + 1)
-        below = fig.add_subplot(2, len(shown), len(shown) + k + 1, sharex=above)
-        _channel(above, below, c)
-        if k == 0:
-            above.legend(fontsize="small")
-            for axes, label in ((above, "gain, dB"), (below, "phase, degrees")):
-                axes.set_ylabel(label)
-                axes.yaxis.set_label_coords(-0.17, 0.5)
+    looks = {"data": (RECORDED, "record"), "nominal": (FITTED, "refitted"), "augmented": (EFFECT, "with the effect")}
+    pairs = bode_axes(fig, max(len(shown), 1))
+    for pair, c in zip(pairs, shown, strict=False):
+        pair[0].set_title(f"{c['input']} to {c['output']}", fontsize="small")
+        for key, (colour, label) in looks.items():
+            dots = {"linestyle": "none", "marker": ".", "markersize": 4} if key == "data" else {"linewidth": 1.3}
+            if c.get(key):
+                draw_response(
+                    pair, np.array(c["omega"]), complex_of(*zip(*c[key], strict=True)), label, color=colour, **dots
+                )
+    if shown:
+        pairs[0][0].legend(fontsize="small")
     return fig
-
-
-def _channel(above: Axes, below: Axes, c: Mapping[str, Any]) -> None:
-    """Draw one channel's gain and phase."""
-    looks = (("data", MEASURED, "record"), ("nominal", BEFORE, "refitted"), ("augmented", AFTER, "with effect"))
-    f = np.array(c["omega"]) / (2 * np.pi)
-    for key, colour, label in looks:
-        if not c.get(key):
-            continue
-        h = np.array(c[key])[:, 0] + 1j * np.array(c[key])[:, 1]
-        style: dict[str, Any] = (
-            {"linestyle": "none", "marker": ".", "markersize": 4} if key == "data" else {"linewidth": 1.3}
-        )
-        keep = np.abs(h) > 0
-        above.semilogx(f[keep], 20 * np.log10(np.abs(h[keep])), color=colour, label=label, **style)
-        below.semilogx(f[keep], np.degrees(np.unwrap(np.angle(h[keep]))), color=colour, **style)
-    above.set_title(f"{c['input']} to {c['output']}", fontsize="small")
-    above.tick_params(labelbottom=False)
-    below.set_xlabel("frequency, Hz")
-    for axes in (above, below):
-        axes.grid(True, color=MARK, alpha=0.3)
-        axes.tick_params(labelsize=7)
-        axes.minorticks_off()  # over three decades nobody reads them, and they take half of the time to draw
 
 
 SECTION = Section(

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.answers import Answers
-from hvdc_ident.report.html import estimate, folded, number, share, table, text
-from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import interval_words, listed
+from hvdc_ident.report.html import Section, estimate, folded, number, table, text, typeset
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.phrases import by_place, interval_name, remarks
+from hvdc_ident.text import change_text, interval_words
 
 
 def _render(results: Results) -> str:
@@ -15,8 +15,6 @@ def _render(results: Results) -> str:
     candidates = fit.get("candidates") or {}
     if not candidates:
         return ""
-    if results.get("discrepancy").get("verdict"):  # what is to be done next has been done
-        fit = {**fit, "adequacy": {**(fit.get("adequacy") or {}), "next": ""}}
     held = fit.get("held") or {}
     fixed = [n for n in held if n not in candidates]
     rest = f"<p class='small'>Not candidates, at the model's values: {text(', '.join(fixed))}.</p>" if fixed else ""
@@ -25,63 +23,44 @@ def _render(results: Results) -> str:
 
 def _by_name(results: Results, fit: dict[str, Any]) -> str:
     """Table of every value that a parameter has, each column with its name."""
-    found, diagnosis = Answers(results), results.get("discrepancy")
-    refitted = diagnosis.get("parameters_refitted") or {} if found.added else {}
+    s = results.summary
     rows = []
-    for v in found.values:
-        line, own = fit["candidates"][v.name], (fit.get("estimates") or {}).get(v.name) or {}
-        fitted, interval = estimate(v.fitted, own.get("ci95"))
-        after, later = estimate(v.effect, v.effect_interval) if v.effect is not None else (text(v.by_place), "")
+    for p in s.parameters:
+        fitted, interval = estimate(p.fitted, p.fitted_interval)
+        after, later = estimate(p.effect, p.effect_interval) if p.effect is not None else (text(by_place(p)), "")
         rows.append(
             [
-                f"<strong>{text(v.name)}</strong>",
-                number(line.get("given")),
-                fitted if v.fitted is not None else "–",
-                interval if v.fitted is not None else "–",
-                share(v.fitted, line.get("given")) if v.fitted is not None else "",
-                number(refitted.get(v.name)) if v.effect is not None or v.by_place else "",
+                f"<strong>{text(p.name)}</strong>",
+                number(p.given),
+                fitted,
+                interval,
+                typeset(change_text(p.fitted, p.given)),
+                number(p.refitted) if p.effect is not None or p.by_place else "",
                 after,
                 later,
-                share(v.effect, line.get("given")) if v.effect is not None else "",
-                text(v.unit),
+                typeset(change_text(p.effect, p.given)),
+                text(p.unit),
             ]
         )
-    header = ["parameter", "given", "fitted", found.interval_words(effect=False), "change", "refitted by the diagnosis"]
-    header += ["with the effect", found.interval_words(effect=True), "change", "unit"]
-    conditions = ", if nothing else is missing: what remains is more than the noise" if found.conditional else ""
+    header = ["parameter", "given", "fitted", interval_name(s, "fitted"), "change", "refitted by the diagnosis"]
+    header += ["with the effect", interval_name(s, "effect"), "change", "unit"]
+    if s.counting.name == "effect":
+        counting = "these are the values that count"
+    else:
+        counting = f"{text(s.counting.doubt)}, so exports take the fitted ones unless --values effect asks for these"
+    conditions = ", if nothing else is missing: what remains is more than the noise" if s.counts_conditional else ""
     told = (
         "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
-        f"effect: the same with the finding in the model; {_counting(found)}{conditions}.</p>"
+        f"effect: the same with the finding in the model; {counting}{conditions}.</p>"
     )
-    words = (0, 6, 9) if any(v.by_place for v in found.values) else (0, 9)
-    return table(header, rows, words=words) + (told if refitted else "") + _notes(fit)
-
-
-def _counting(found: Answers) -> str:
-    """Clause on which of the values count."""
-    counts = found.counting
-    if counts.name == "effect":
-        return "these are the values that count"
-    return f"{text(counts.doubt)}, so exports take the fitted ones unless --values effect asks for these"
+    words = (0, 6, 9) if any(p.by_place for p in s.parameters) else (0, 9)
+    return table(header, rows, words=words) + (told if s.counting.kind else "") + _notes(fit)
 
 
 def _notes(fit: dict[str, Any]) -> str:
     """Why parameters are held, and on what the intervals rest."""
-    notes = {n: _note(n, (fit.get("estimates") or {}).get(n) or {}, fit) for n in fit["candidates"]}
-    lines = "".join(f"<li><strong>{text(n)}</strong>: {text(note)}.</li>" for n, note in notes.items() if note)
+    lines = "".join(f"<li><strong>{text(n)}</strong>: {text(said)}.</li>" for n, said in remarks(fit).items())
     return f"<ul class='small'>{lines}</ul>" if lines else ""
-
-
-def _note(name: str, own: dict[str, Any], fit: dict[str, Any]) -> str:
-    why = (fit.get("held") or {}).get(name)
-    notes = [f"held: {why}"] if why else []
-    if own.get("method") == "one-sided":
-        notes.append("on a bound, one-sided interval")
-    if own.get("conditional_on"):
-        notes.append(f"estimated with {listed(map(str, own['conditional_on']))} held")
-    if own.get("reason"):
-        notes.append(str(own["reason"]))
-    return "; ".join(notes)
 
 
 STATUS = {
@@ -99,10 +78,7 @@ def _outcome(fit: dict[str, Any]) -> str:
     judged = fit.get("adequacy") or {}
     word = "" if status == "converged" else f" ({text(status)})"
     said = f"<p><strong>{text(STATUS.get(status, status))}</strong>{word}: {text(fit.get('message', ''))}.</p>"
-    if judged.get("text"):
-        head = "The model does not fit these records" if judged["verdict"] == "does-not-fit" else "On the noise"
-        what = f" Next: {text(judged['next'])}." if judged.get("next") else ""
-        said += f"<p><strong>{head}</strong>: {text(judged['text'])}.{what}</p>"
+    said += f"<p>The residuals: {text(judged['text'])}.</p>" if judged.get("text") else ""
     if fit.get("roughness"):
         said += f"<p>{text(fit['roughness']['text'])}.</p>"
     return said

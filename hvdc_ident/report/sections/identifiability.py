@@ -9,8 +9,9 @@ import numpy as np
 
 from hvdc_ident.axes import draw_intervals, draw_profile
 from hvdc_ident.report.drawing import figure, svg
-from hvdc_ident.report.html import captioned, estimate, folded, number, table, text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.html import Section, captioned, folded, number, table, table_of, text
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.tables import verdicts_table
 from hvdc_ident.text import listed, with_unit
 
 if TYPE_CHECKING:
@@ -30,8 +31,7 @@ def _render(results: Results) -> str:
         return ""
     parts = [
         _lead(found),
-        _model(found),
-        _verdicts(found, parameters),
+        table_of(verdicts_table(found)),
         _next(found),
         folded(
             "Profiles of the cost",
@@ -92,29 +92,6 @@ def _structure(structural: dict[str, Any]) -> str:
     return f"What perfect data could tell: {text(structural['status'])}"
 
 
-def _verdicts(found: dict[str, Any], parameters: dict[str, Any]) -> str:
-    ratio = (found.get("pilot") or {}).get("chi2_per_dof") if found.get("misspecified") else None
-    interval = "95 % interval" if ratio is None else f"95 % interval (χ²/dof {number(ratio, 3)})"
-    drawn_anew = any(v.get("ci95_experiments") for v in parameters.values())
-    rows = []
-    for name, v in parameters.items():
-        cells = {
-            "parameter": f"<strong>{text(name)}</strong>",
-            "verdict": text(v.get("verdict", "")),
-            "value": estimate(v.get("value"), v.get("ci95"))[0],
-            interval: estimate(v.get("value"), v.get("ci95"))[1],
-            "experiments drawn anew": estimate(v.get("value"), v.get("ci95_experiments"))[1],
-            "unit": text(v.get("unit", "")),
-            "why": text(v.get("reason", "")),
-        }
-        if not drawn_anew:
-            del cells["experiments drawn anew"]
-        rows.append(cells)
-    header = list(rows[0])
-    words = [i for i, h in enumerate(header) if h in ("parameter", "verdict", "unit", "why")]
-    return table(header, [list(r.values()) for r in rows], words=words)
-
-
 def _collinearity(parameters: dict[str, Any]) -> str:
     """Table of the collinearity index of each parameter, with the one that resembles it most."""
     rows = [
@@ -123,14 +100,6 @@ def _collinearity(parameters: dict[str, Any]) -> str:
         if v.get("collinearity") is not None
     ]
     return table(["parameter", "collinearity index", "mostly with"], rows, words=(0, 2)) if rows else ""
-
-
-def _model(found: dict[str, Any]) -> str:
-    if not found.get("misspecified"):
-        return ""
-    detail = found.get("misspecification") or {}
-    signs = "; ".join(str(s) for s in detail.get("signs") or [])
-    return f"<p><strong>The model does not explain these data:</strong> {text(signs)}. {text(_capital(detail.get('next', '')))}.</p>"
 
 
 def _pictures(found: dict[str, Any]) -> str:
@@ -171,12 +140,12 @@ def _next(found: dict[str, Any]) -> str:
     advice = found.get("recommended_experiment") or {}
     if not advice.get("text"):
         return ""
-    lead = f"<h3>What to measure next</h3><p>{text(advice['text'])}</p>"
     failed = advice.get("failed") or []
-    if failed:
-        lead += (
-            f"<p class='small'>Could not be simulated: {text('; '.join(failed[:3]))}{' …' if failed[3:] else ''}.</p>"
-        )
+    lead = (
+        f"<p class='small'>Could not be simulated: {text('; '.join(failed[:3]))}{' …' if failed[3:] else ''}.</p>"
+        if failed
+        else ""
+    )
     lines = [advice, *(advice.get("others") or [])]
     if not advice.get("moves") or len(lines) < 2:
         return lead

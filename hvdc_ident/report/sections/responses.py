@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hvdc_ident.report.drawing import figure, svg
-from hvdc_ident.report.html import captioned, number, table, text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.colours import SERIES
+from hvdc_ident.report.drawing import bode_axes, complex_of, draw_response, figure, svg
+from hvdc_ident.report.html import Section, captioned, number, table, text
+from hvdc_ident.summary import Results
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 STYLES = {"given": "--", "fitted": "-"}
 
 
@@ -52,38 +51,20 @@ def _remarks(r: dict[str, Any]) -> str:
     return f"<p>{' '.join(found)}</p>" if found else ""
 
 
-def _values(parts: dict[str, Any]) -> NDArray[np.complex128]:
-    return np.asarray(np.array(parts["real"], dtype=float) + 1j * np.array(parts["imag"], dtype=float))
-
-
 def _bode(r: dict[str, Any]) -> str:
     omega = np.array(r["omega"], dtype=float)
     fig = figure(7.5, 4.8, {"left": 0.1, "right": 0.99, "bottom": 0.11, "top": 0.98, "hspace": 0.1})
-    gain, phase = fig.subplots(2, 1, sharex=True)
-    curves = [("measured", _values(r["measured"]))]
-    curves += [(n, _values(m)) for n, m in r["models"].items() if "reason" not in m]
+    (pair,) = bode_axes(fig)
+    curves = {"measured": r["measured"], **{n: m for n, m in r["models"].items() if "reason" not in m}}
     for k, channel in enumerate(r["channels"]):
-        for name, values in curves:
-            v = values[:, k]
-            keep = (omega > 0) & (np.abs(v) > 0)
-            if not keep.any():
-                continue
-            style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)]}
+        for name, parts in curves.items():
+            style: dict[str, Any] = {"linestyle": STYLES.get(name, "-."), "linewidth": 1.2}
             if name == "measured":
-                style |= {"linestyle": "none", "marker": ".", "markersize": 4}
-            else:
-                style |= {"linestyle": STYLES.get(name, "-."), "linewidth": 1.2}
+                style = {"linestyle": "none", "marker": ".", "markersize": 4}
             label = f"{channel}, {name}" if k == 0 or name == "measured" else None
-            hertz = omega[keep] / (2 * np.pi)
-            gain.semilogx(hertz, 20 * np.log10(np.abs(v[keep])), label=label, **style)
-            phase.semilogx(hertz, np.degrees(np.unwrap(np.angle(v[keep]))), **style)
-    gain.set_ylabel("gain, dB")
-    phase.set_ylabel("phase, degrees")
-    phase.set_xlabel("frequency, Hz")
-    gain.legend(fontsize="small")
-    for axes in (gain, phase):
-        axes.grid(True, color="#dddddd", linewidth=0.5)
-        axes.yaxis.set_label_coords(-0.08, 0.5)
+            values = complex_of(parts["real"], parts["imag"])[:, k]
+            draw_response(pair, omega, values, label, color=SERIES[k % len(SERIES)], **style)
+    pair[0].legend(fontsize="small")
     drawn = svg(fig, "Bode diagram of the measured response " + r["name"])
     return captioned(drawn, f"{text(r['name'])}: dots measured, lines of the model.")
 

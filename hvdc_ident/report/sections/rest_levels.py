@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.html import Section, number, table, text
+from hvdc_ident.summary import Results
 
 
 def _render(results: Results) -> str:

@@ -4,34 +4,27 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.answers import Answers, beyond_noise
-from hvdc_ident.report.html import estimate, number, table, text
-from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import interval_words, listed
+from hvdc_ident.report.html import Section, estimate, number, table, table_of, text
+from hvdc_ident.summary import Results, RunSummary
+from hvdc_ident.summary.phrases import condition, interval_name
+from hvdc_ident.summary.tables import truth_table
+from hvdc_ident.text import listed
 
 
 def _render(results: Results) -> str:
-    truth, fit, diagnosis = (results.get(name) for name in ("truth", "fit", "discrepancy"))
+    truth, diagnosis = results.get("truth"), results.get("discrepancy")
     if not truth:
         return ""
-    after = diagnosis.get("parameters_after") or {} if diagnosis.get("augmented_model") else {}
-    after = {n: v for n, v in after.items() if n not in (diagnosis.get("values_by_place") or {})}
-    rows = []
-    for name, true in truth["parameters"].items():
-        given = (fit.get("candidates") or {}).get(name) or {}
-        fitted = (fit.get("estimates") or {}).get(name) or {}
-        values = (given.get("given"), fitted.get("value"), after.get(name), true["value"])
-        rows.append([text(name), *("" if v is None else number(v) for v in values), text(true["unit"])])
-    header = ["parameter", "given", "fitted", "with the effect", "true", "unit"]
+    s = results.summary
     lead = f"<p>The recordings were made by {text(truth['plant'])}, so that the truth is known.</p>"
-    answers = Answers(results)
-    told = f"<p class='small'>With the effect: {text(answers.condition)}</p>" if after and answers.condition else ""
-    return lead + table(header, rows, words=(0, 5)) + told + _missing(truth, diagnosis)
+    after = any(p.effect is not None for p in s.parameters)
+    told = f"<p class='small'>With the effect: {text(condition(s))}</p>" if after and condition(s) else ""
+    return lead + table_of(truth_table(s, truth["parameters"])) + told + _missing(s, truth, diagnosis)
 
 
-def _missing(truth: dict[str, Any], diagnosis: dict[str, Any]) -> str:
+def _missing(s: RunSummary, truth: dict[str, Any], diagnosis: dict[str, Any]) -> str:
     """Return the table of delays, found and true."""
-    words = interval_words(beyond_noise=beyond_noise(diagnosis))
+    words = interval_name(s, "effect")
     rows = []
     for f in diagnosis.get("findings") or []:
         delay = f.get("equivalent_delay") or {}
