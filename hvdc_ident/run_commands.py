@@ -42,11 +42,11 @@ def demo(
     console: Console,
 ) -> None:
     """Calibrate the shipped link on recordings made here."""
-    from hvdc_ident.study.demo_truth import truth_lines
     from hvdc_ident.study.examples import write_demo, write_truth
     from hvdc_ident.study.pipeline import run_study
     from hvdc_ident.study.study import load_study
     from hvdc_ident.summary import Results
+    from hvdc_ident.summary.truth import truth_lines
 
     with console.progress() as progress:
         options = work.options(console, progress)

@@ -149,6 +149,11 @@ def _folded(line: str, width: int) -> str:
     return textwrap.fill(kept, width, subsequent_indent="  ", **settings).replace("\0", " ")  # type: ignore[arg-type]
 
 
+def capital(words: str) -> str:
+    """Return the words with a capital at their beginning."""
+    return words[:1].upper() + words[1:]
+
+
 def listed(names: Iterable[str]) -> str:
     """Return the names as "A, B and C"."""
     *most, last = [*names] or [""]

@@ -70,10 +70,16 @@ def badge(passed: bool | None) -> str:
 
 
 def table_of(found: Table) -> str:
-    """Return a table of text as HTML."""
+    """Return a table of text and numbers as HTML; a number has four digits, and None is a dash."""
     words = [k for k, numbers in enumerate(found.numeric) if not numbers]
-    rows = [["" if c is None else typeset(c) for c in row] for row in found.rows]
+    rows = [[typeset(c) if isinstance(c, str) else number(c) for c in row] for row in found.rows]
     return table([typeset(h) for h in found.header], rows, words=words)
+
+
+def rows_of(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return a table of text and numbers as HTML; "" without rows."""
+    cells = tuple(tuple(row) for row in rows)
+    return table_of(Table(tuple(header), cells)) if cells else ""
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, words: Sequence[int] = (0,)) -> str:

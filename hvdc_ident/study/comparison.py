@@ -62,6 +62,11 @@ class RunComparison(Shown):
         if not beyond:
             if judged:
                 return "No value differs beyond both intervals."
+            if placed := [v["parameter"] for v in self.data["values"] if v["depends"]]:
+                plural = "s" if len(placed) == 1 else ""
+                return (
+                    f"{listed(placed)} depend{plural} on where the effect is, so that there is no one value to compare."
+                )
             fitted = any(None not in v["values"] for v in self.data["values"])
             return (
                 "No value has an interval in both, by which to judge it." if fitted else "No value was fitted in both."
@@ -173,7 +178,7 @@ def compare_runs(first: str | Path, second: str | Path) -> RunComparison:
             "values": _values(both),
             "gaps": _gaps(both),
             "verdicts": _verdicts(results),
-            "findings": [_findings(s) for s in both],
+            "findings": [plain(s.findings) if s.diagnosis else None for s in both],
         }
     )
 
@@ -284,6 +289,7 @@ def _values(both: Sequence[RunSummary]) -> list[dict[str, Any]]:
                 "given": [None if p is None else p.given for p in pair],
                 "values": values,
                 "ci95": plain(intervals),
+                "depends": any(p.by_place for p in known),
                 "held": [_held(s, p) for s, p in zip(both, pair, strict=True)],
                 "change_percent": 100.0 * (values[1] / values[0] - 1.0)
                 if values[0] and values[1] is not None
@@ -338,19 +344,3 @@ def _verdict(stage: Stage, results: Results) -> str:
     if not data.get("fingerprint"):
         return f"not finished: {data.get('message') or data.get('status') or 'no reason is kept'}"
     return stage.verdict(data)
-
-
-def _findings(s: RunSummary) -> list[dict[str, Any]] | None:
-    """Return the findings of the diagnosis; None where none has run."""
-    if not s.diagnosis:
-        return None
-    return [
-        {
-            "effect": f.effect,
-            "probability": f.probability,
-            "parameters": plain(f.sizes),
-            "text": f.text,
-            "places": [list(p.at) for p in f.places],
-        }
-        for f in s.findings
-    ]

@@ -18,6 +18,7 @@ from hvdc_ident.summary.run_summary import (
     SignalSummary,
 )
 from hvdc_ident.text import (
+    capital,
     figures,
     interval_text,
     listed,
@@ -255,7 +256,7 @@ def remainder_sentence(s: RunSummary) -> str:
         times = f" ({times_text(r.record_times)} the noise)" if r.record_times else ""
         where = f", most of it in {r.record}{times}" if r.record else ""
         parts.append(f"on held-out recordings {percentage(r.held_out)} is left{where}")
-    told = ". ".join([*parts[:1], *(p[:1].upper() + p[1:] for p in parts[1:])])
+    told = ". ".join([*parts[:1], *map(capital, parts[1:])])
     return told or ("" if r.adequate else "what is left is still not noise")
 
 

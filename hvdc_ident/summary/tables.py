@@ -60,13 +60,6 @@ def verdicts_table(identified: Mapping[str, Any]) -> Table:
     return Table(header, tuple(rows)).without_empty()
 
 
-def truth_table(s: RunSummary, truth: Mapping[str, Any]) -> Table:
-    """Return the candidates with their given values, those that were found, and the true ones. truth: {name: {value, unit}}."""
-    found = values_table(s)
-    true = {n: figures(p["value"]) for n, p in truth.items()}
-    return Table((*found.header, "true"), tuple((*row, true.get(row[0], "")) for row in found.rows))
-
-
 def sets_table(s: RunSummary) -> Table:
     """Return the error of the worst signal with each set of values, and how many signals pass."""
     signal = s.signal(s.judged.worst) if s.judged is not None else None

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from hvdc_ident import Model, apply_effects, load_model
-from hvdc_ident.study.demo_truth import equivalent_delay, found_effect, truth_lines, truth_of
+from hvdc_ident.study.demo_truth import equivalent_delay, truth_of
 from hvdc_ident.summary import summarise
+from hvdc_ident.summary.truth import found_effect, truth_lines
 
 LOOP = Model(
     "loop",
@@ -83,4 +84,4 @@ def test_the_screen_and_the_page_have_the_truth_beside_what_was_found(tmp_path: 
 
     body = SECTION.render(Results(tmp_path))
     assert '<td class="n">28</td><td class="n">31.25</td><td class="n">29.88</td><td class="n">30</td>' in body
-    assert "found: lag" in body and "1.30 to 1.50" in body and "in the loop of Irorder2" in body
+    assert "found: lag that acts as a delay of 1.4 ms" in body and "delay the loop of Irorder2" in body

@@ -297,7 +297,7 @@ def test_letter_and_report_speak_of_the_given_values(study: Path, fitted: dict[s
     page = (study.parent / "s-results/report.html").read_text()
     assert "start values" not in page and "given values" in page
     for heading in ("<h2>The values</h2>", "<h2>Parameters</h2>"):
-        row = re.search(r"<tr><td><strong>K</strong>(?:, 1/s)?</td>(.*?)</tr>", page.split(heading)[1])
+        row = re.search(r"<tr><td>(?:<strong>)?K(?:</strong>)?(?:, 1/s)?</td>(.*?)</tr>", page.split(heading)[1])
         assert row is not None
         cells = re.findall(r"<td[^>]*>(.*?)</td>", row[1])
         assert cells[0] == "11" and cells[3] == f"{change:+.1f} %"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from nicegui import run, ui
 
@@ -14,7 +13,6 @@ from hvdc_ident.app.runs import folder_name, result_folders
 from hvdc_ident.app.server import Tab
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.study.comparison import APART, SIDES, RunComparison
-from hvdc_ident.text import percentage
 
 
 class ComparedRuns:
@@ -71,7 +69,6 @@ class ComparedRuns:
             self._show(found, chosen)
 
     def _show(self, found: RunComparison, folders: list[Path]) -> None:
-        data = found.to_dict()
         self._place.clear()
         with self._place:
             ui.label(found.conclusion).classes("text-body1 text-bold")
@@ -83,19 +80,8 @@ class ComparedRuns:
             if gaps.rows:
                 ui.label("RMSE over the recordings that both have").classes("text-subtitle2")
                 show_table(gaps)
-            with ui.row().classes("w-full no-wrap items-stretch"):
-                for folder, findings in zip(folders, data["findings"], strict=True):
-                    self._show_findings(folder.name, findings)
-            for line in (*found.input_lines, *(n for n in found.verdict_lines if not n.startswith("missing"))):
+            for line in (*found.input_lines, *found.verdict_lines):
                 ui.label(line).classes("text-body2")
-
-    def _show_findings(self, name: str, findings: list[dict[str, Any]] | None) -> None:
-        with ui.card().classes("col").props("flat bordered"):
-            ui.label(f"What is missing, by {name}").classes("text-subtitle2")
-            if not findings:
-                ui.label("No diagnosis has run." if findings is None else "Nothing was found.")
-            for f in findings or ():
-                ui.label(f"{f['effect']} ({percentage(f['probability'])}): {f['text']}")
 
     def _give(self) -> None:
         if self._found is not None:

@@ -10,11 +10,12 @@ import numpy as np
 
 from hvdc_ident.colours import EFFECT, FITTED, RECORDED, ROLES
 from hvdc_ident.report.drawing import bode_axes, complex_of, draw_response, figure, svg, visible
-from hvdc_ident.report.html import Section, captioned, folded, number, table, table_of, text, typeset
+from hvdc_ident.report.html import Section, captioned, folded, number, rows_of, table_of, text, typeset
+from hvdc_ident.report.overlay import Sheet
 from hvdc_ident.summary import Results, RunSummary
 from hvdc_ident.summary.phrases import by_place, gained_sentence
 from hvdc_ident.summary.tables import findings_table
-from hvdc_ident.text import estimate_text, form_of, listed, percentage, span, with_unit
+from hvdc_ident.text import estimate_text, form_of, listed, percentage, quantity, span, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -93,22 +94,14 @@ def _findings(s: RunSummary) -> str:
 def _sets(found: dict[str, Any]) -> str:
     parts = []
     for group in (g for g in found.get("ambiguity") or [] if len(g) > 1):
+        late = ["" if r.get("late") is None else quantity(r["late"], "s", 3) for r in group]
         rows = [
-            [
-                text(form_of(r)),
-                text(", ".join(r["at"])),
-                text(r.get("from", "")),
-                "" if r.get("late") is None else number(1e3 * r["late"], 3),
-                number(r["delta_bic"], 3),
-            ]
-            for r in group[:MOST]
+            (form_of(r), ", ".join(r["at"]), r.get("from") or "", delay, r["delta_bic"])
+            for r, delay in zip(group[:MOST], late, strict=False)
         ]
         more = f"<p class='small'>and {len(group) - MOST} more</p>" if len(group) > MOST else ""
-        parts.append(
-            "<h3>As good as what was put in</h3>"
-            + table(["effect", "at", "from", "late, ms", "behind the best, BIC"], rows, words=(0, 1, 2))
-            + more
-        )
+        shown = rows_of(["effect", "at", "from", "late", "behind the best, BIC"], rows)
+        parts.append(f"<h3>As good as what was put in</h3>{shown}{more}")
     return "".join(parts)
 
 
@@ -152,8 +145,8 @@ def _slider(sizes: dict[str, Any] | None) -> str:
 def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
     """The drawing: recorded and simulated above, what is left below; the curves of one size are shown."""
     time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
-    fig = figure(7.4, 3.6)
-    top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[2, 1])
+    sheet = Sheet.new(7.4, 3.6, 0.5)
+    top, strip, unit = sheet.top, sheet.strip, sizes.get("output_unit") or ""
     top.plot(*visible(time, measured), color=RECORDED, linewidth=1.0, label="recorded")
     for k, curve in enumerate(sizes["curves"]):
         values = np.asarray(curve, dtype=float)
@@ -161,16 +154,10 @@ def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
             label = "model" if k == chosen and axes is top else None
             (line,) = axes.plot(*visible(time, shown), color=EFFECT, linewidth=1.3, label=label)
             line.set_gid(f"size-{k}-{'top' if axes is top else 'strip'}")
-    unit = sizes.get("output_unit") or ""
     top.set_ylabel(with_unit(str(sizes["output"]), unit), fontsize=8)
     strip.set_ylabel(with_unit("error", unit), fontsize=8)
-    strip.set_xlabel("time, s", fontsize=8)
-    for axes in (top, strip):
-        axes.grid(True, color="#e4e4e4", linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=8)
     top.legend(frameon=False, fontsize=8)
-    drawn = svg(fig, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
+    drawn = svg(sheet.figure, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
     for k in range(len(sizes["curves"])):
         hidden = "" if k == chosen else ' style="display: none"'
         for place in ("top", "strip"):
@@ -204,24 +191,14 @@ def _candidates(found: dict[str, Any]) -> str:
     lines = [c for c in found.get("candidates") or [] if c.get("delta_bic") is not None][:MOST]
     if not lines:
         return ""
-    rows = [
-        [
-            text(c["effect"]),
-            text(", ".join(c["at"])),
-            text(c.get("from", "")),
-            number(c["score"], 3),
-            number(c["p"], 2),
-            number(c["delta_bic"], 4),
-            number(c.get("holdout_rmse"), 4),
-        ]
-        for c in lines
-    ]
+    keys = ("score", "p", "delta_bic", "holdout_rmse")
+    rows = [(c["effect"], ", ".join(c["at"]), c.get("from") or "", *(c.get(k) for k in keys)) for c in lines]
     header = ["effect", "at", "from", "score", "p", "gain in BIC", "held out, noise units"]
     note = (
         "<p class='small'>Score: how much of the residuals the effect's signature takes at its best size, in noise units "
         "squared; p: the chance of such a score anywhere from noise alone.</p>"
     )
-    return "<h3>Candidates that were refitted</h3>" + table(header, rows, words=(0, 1, 2)) + note
+    return "<h3>Candidates that were refitted</h3>" + rows_of(header, rows) + note
 
 
 def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:

@@ -11,6 +11,7 @@ from hvdc_ident.report.drawing import bode_axes, complex_of, draw_response, figu
 from hvdc_ident.report.html import Section, captioned, number, table, text
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.linear import locus_lines, margin_lines, other_lines, port_lines, stability
+from hvdc_ident.text import capital
 
 NEAREST = 5
 LINES = ("-", "--", "-.", ":")
@@ -235,7 +236,7 @@ def _locus(data: dict[str, Any]) -> str:
 
 def _said(lines: list[str]) -> str:
     """Lines of the stage as sentences."""
-    return "".join(f"<p>{text(line[:1].upper() + line[1:])}.</p>" for line in lines)
+    return "".join(f"<p>{text(capital(line))}.</p>" for line in lines)
 
 
 SECTION = Section(

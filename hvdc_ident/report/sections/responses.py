@@ -8,7 +8,7 @@ import numpy as np
 
 from hvdc_ident.colours import SERIES
 from hvdc_ident.report.drawing import bode_axes, complex_of, draw_response, figure, svg
-from hvdc_ident.report.html import Section, captioned, number, table, text
+from hvdc_ident.report.html import Section, captioned, number, rows_of, text
 from hvdc_ident.summary import Results
 
 STYLES = {"given": "--", "fitted": "-"}
@@ -73,32 +73,12 @@ def _errors(r: dict[str, Any]) -> str:
     rows = []
     for name, m in r["models"].items():
         for e in m.get("errors", ()):
-            share = "–" if e["relative"] is None else number(100 * e["relative"], 3)
-            chi2 = e["chi2_per_point"]
-            gain, phase = e["gain_db"], e["phase_deg"]
-            rows.append(
-                [
-                    text(e["channel"]),
-                    text(name),
-                    share,
-                    number(gain["value"], 3),
-                    number(gain["omega"] / (2 * np.pi)),
-                    number(phase["value"], 3),
-                    number(phase["omega"] / (2 * np.pi)),
-                    number(np.sqrt(chi2), 3) if chi2 is not None else "",
-                ]
-            )
-    header = [
-        "channel",
-        "values",
-        "error, %",
-        "gain off by, dB",
-        "at, Hz",
-        "phase off by, degrees",
-        "at, Hz",
-        "error / noise",
-    ]
-    return table(header, rows, words=(0, 1)) if rows else ""
+            share = None if e["relative"] is None else 100.0 * e["relative"]
+            off = [v for kind in ("gain_db", "phase_deg") for v in (e[kind]["value"], e[kind]["omega"] / (2 * np.pi))]
+            noise = "" if e["chi2_per_point"] is None else float(np.sqrt(e["chi2_per_point"]))
+            rows.append((e["channel"], name, share, *off, noise))
+    header = ["channel", "values", "error, %", "gain off by, dB", "at, Hz", "phase off by, degrees", "at, Hz"]
+    return rows_of([*header, "error / noise"], rows)
 
 
 SECTION = Section(

@@ -87,9 +87,10 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     from hvdc_ident.summary import summarise
     from hvdc_ident.summary.phrases import remarks
     from hvdc_ident.summary.screen import lines_of as screen
+    from hvdc_ident.text import capital
 
     judged = (data.get("adequacy") or {}).get("text")
-    more = [f"The residuals: {judged}."] if judged else []
+    more = [f"{capital(judged)}."] if judged else []
     more += [f"{data['roughness']['text']}."] if data.get("roughness") else []
     more += [f"{n}: {remark}." for n, remark in remarks(data).items()] + _conditions(data)
     more += [*response_lines(data.get("responses", ()), "fitted"), *_searched(data)]
