@@ -21,6 +21,7 @@ from hvdc_ident.text import (
     capital,
     figures,
     interval_text,
+    interval_words,
     listed,
     one_of,
     percentage,
@@ -141,7 +142,7 @@ def sizes_text(sizes: Mapping[str, Quantity]) -> str:
 
 def interval_name(s: RunSummary, name: str) -> str:
     """Return what the intervals of a set of values are called: of a model that leaves more than noise none has a chance of 95 %."""
-    return "interval if nothing else is missing" if s.conditional[name] else "95 % interval"
+    return interval_words(beyond_noise=s.conditional[name])
 
 
 def by_place(p: ParameterSummary) -> str:
