@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.colours import FITTED, MARK
 from hvdc_ident.data import Array
 
-LINE, MARK, HELD = "#1f5fa8", "#999999", "#b0b0b0"
+HELD = "#b0b0b0"
 FINEST = 1e-4
 """%: below this the axis of the intervals is linear."""
 
@@ -20,8 +21,8 @@ FINEST = 1e-4
 def draw_profile(axes: Any, name: str, profile: Mapping[str, Any], verdict: Mapping[str, Any]) -> None:
     """Draw the rise of the cost over one parameter, in units of the 95 % level, with the ends of the interval."""
     x, y = np.array(profile["values"], dtype=float), np.array(profile["rises"], dtype=float) / profile["threshold"]
-    axes.plot(*joined(x, y), color=LINE, linewidth=1.2)
-    axes.plot(x, y, color=LINE, linewidth=0, marker="o", markersize=2.5)
+    axes.plot(*joined(x, y), color=FITTED, linewidth=1.2)
+    axes.plot(x, y, color=FITTED, linewidth=0, marker="o", markersize=2.5)
     axes.axhline(1.0, color=MARK, linewidth=0.8, linestyle="--")
     for end in ("lower", "upper"):
         if profile[end]["limit"] is not None:
@@ -53,10 +54,10 @@ def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> No
             axes.plot([0.0], [row], marker="x", color=HELD)
             continue
         low, high = (edge if e is None else e for e, edge in zip(pair, (-reach, reach), strict=True))
-        axes.plot([low, high], [row, row], color=LINE, linewidth=2)
-        axes.plot([0.0], [row], marker="o", color=LINE, markersize=4)
+        axes.plot([low, high], [row, row], color=FITTED, linewidth=2)
+        axes.plot([0.0], [row], marker="o", color=FITTED, markersize=4)
         for end, at, arrow in ((pair[0], low, "<"), (pair[1], high, ">")):
-            axes.plot([at], [row], marker="|" if end is not None else arrow, color=LINE, markersize=8)
+            axes.plot([at], [row], marker="|" if end is not None else arrow, color=FITTED, markersize=8)
     axes.set_xscale("symlog", linthresh=smallest)
     axes.set_xlim(-1.5 * reach, 1.5 * reach)
     ticks = _decades(smallest, reach)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -13,6 +14,8 @@ from hvdc_ident.errors import InputError
 
 WIDTH = 110
 """Characters in a line of a summary."""
+_ONE = r"[-+<>]? ?[\d.,]*(e[-+]\d+)?( %)?"
+_NUMBER = re.compile(rf"((below|above) )?{_ONE}( to {_ONE})?|–")
 ROWS_SHOWN = 40
 """Rows of a table that a summary lists, where nothing else is said."""
 
@@ -27,13 +30,18 @@ class Table:
     def __str__(self) -> str:
         cells = [self.header, *(tuple(map(_text, row)) for row in self.rows)]
         widths = [max(len(row[k]) for row in cells) for k in range(len(self.header))]
-        numbers = [all(isinstance(row[k], int | float | None) for row in self.rows) for k in range(len(widths))]
+        numbers = self.numeric
 
         def line(row: Sequence[str]) -> str:
             padded = (c.rjust(w) if right else c.ljust(w) for c, w, right in zip(row, widths, numbers, strict=True))
             return "  ".join(padded).rstrip()
 
         return "\n".join(map(line, cells))
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Whether each column holds numbers alone."""
+        return [all(_is_number(row[k]) for row in self.rows) for k in range(len(self.header))]
 
     def without_empty(self) -> Table:
         """Return the table without the columns that have nothing in any row."""
@@ -126,6 +134,10 @@ def axes_of(ax: Any, width: float = 7.0, height: float = 5.0, *, rows: int = 1) 
     import matplotlib.pyplot as plt
 
     return plt.subplots(rows, 1, sharex=rows > 1, figsize=(width, height), layout="constrained")[1]
+
+
+def _is_number(cell: Any) -> bool:
+    return cell is None or isinstance(cell, int | float) or _NUMBER.fullmatch(cell) is not None
 
 
 def _text(value: Any) -> str:

@@ -13,10 +13,11 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hvdc_ident.errors import InputError
 
+T = TypeVar("T")
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """Beginnings of texts that a spreadsheet takes for a formula."""
 
@@ -139,6 +140,18 @@ def plain(value: Any) -> Any:
     if isinstance(value, Path):
         return value.as_posix()
     raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def read_plain(kind: type[T], data: Any) -> T:
+    """Return the frozen value of a kind that `plain` made JSON of. Raises InputError where the data are none of that kind."""
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        return TypeAdapter(kind).validate_python(data)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"])) or kind.__name__
+        raise InputError(f"not the JSON of a {kind.__name__}", where=where, got=first["msg"]) from None
 
 
 def json_text(value: Any) -> str:

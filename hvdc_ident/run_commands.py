@@ -29,6 +29,7 @@ from hvdc_ident.study.stages import Stage
 if TYPE_CHECKING:
     from hvdc_ident.study.pipeline import Done
     from hvdc_ident.study.study import Study
+    from hvdc_ident.summary import RunSummary
 
 
 def demo(
@@ -41,18 +42,18 @@ def demo(
     console: Console,
 ) -> None:
     """Calibrate the shipped link on recordings made here."""
-    from hvdc_ident.study.demo_truth import truth_lines
     from hvdc_ident.study.examples import write_demo, write_truth
     from hvdc_ident.study.pipeline import run_study
     from hvdc_ident.study.study import load_study
+    from hvdc_ident.summary import Results
+    from hvdc_ident.summary.truth import truth_lines
 
     with console.progress() as progress:
         options = work.options(console, progress)
         study = load_study(write_demo(out, seed=work.seed, progress=progress))
         truth = write_truth(out, study, seed=work.seed)
         done = run_study(study, out, options)
-    found = {d.stage.name: d.data for d in done if not d.failed}
-    compared = truth_lines(truth, found.get("fit", {}), found.get("diagnose", {}))
+    compared = truth_lines(truth, Results(out).summary)
     _tell_run(
         study, out, done, console, lambda line: pasteable(line, study.path, out, None), truth=compared, opens=open_
     )
@@ -94,18 +95,35 @@ def _tell_run(
     truth: lines with the values beside the true ones, in place of the table of values. opens: the report, in the browser.
     """
     from hvdc_ident.study.pipeline import heading_of
-    from hvdc_ident.study.run_summary import run_lines
+    from hvdc_ident.summary import Results
 
     seed = done[0].data["seed"] if done else 0
     found = {d.stage.name: d.data for d in done}
     console.print_json({**heading_of(study, seed), "stages": found, "report": "report.html"})
-    console.say(*map(typed, run_lines(done, truth)))
+    console.say(*map(typed, run_lines(done, Results(folder).summary if done else None, truth)))
     console.say(f"report: {folder / 'report.html'}")
     if opens:
         open_page(folder / "report.html")
     failures = [f"{d.stage.name}: {d.failed}" for d in done if d.failed]
     if failures:
         raise CommandFailed("; ".join(failures))
+
+
+def run_lines(done: Sequence[Done], summary: RunSummary | None, truth: Sequence[str] = ()) -> list[str]:
+    """Return the screen of a run: for each stage its state and verdict, then what the results say.
+
+    truth: lines that hold the values beside the true ones, where these are known, in place of the table of values.
+    """
+    from hvdc_ident.summary.screen import lines_of
+
+    lines = [f"steady state, {line}" for line in dict.fromkeys(n for d in done for n in d.data.get("steady_state", ()))]
+    for d in done:
+        state = "failed" if d.failed else "done" if d.fresh else "kept from before"
+        verdict = d.failed or d.stage.verdict(d.data)
+        lines.append(f"{d.stage.name}: {state}; {verdict}" if verdict else f"{d.stage.name}: {state}")
+    if summary is None:
+        return lines
+    return [*lines, "", *lines_of(summary, truth)]
 
 
 def stage_command(stage: Stage) -> Callable[..., None]:

@@ -9,6 +9,8 @@ import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+Interval = Sequence[float | None]
+"""The ends of an interval; one that is None is open."""
 _SMALLER = ((1e-4, 1e6, "µs"), (0.1, 1e3, "ms"))
 
 
@@ -18,12 +20,45 @@ def figures(value: float, digits: int = 4) -> str:
     return f"{value:.0f}" if "e+" in shown and abs(value) < 1e6 else shown
 
 
-def quantity(value: float, unit: str = "", digits: int = 4) -> str:
-    """Return a value with its unit, so many significant digits; short times in ms or µs."""
+def estimate_texts(value: float | None, interval: Interval | None = None, digits: int = 4) -> tuple[str, str, str]:
+    """Return a value and the ends of its interval as text, each "" where there is none: the one form that these have anywhere.
+
+    All have the decimals that show two digits of half the interval's width; without two ends, so many significant digits.
+    """
+    low, high = interval or (None, None)
+    each = (value, low, high)
+    size = max((abs(v) for v in each if v is not None), default=0.0)
+    if low is not None and high is not None and low < high and size < 1e6:
+        places = max(1 - math.floor(math.log10(0.5 * (high - low))), 0)
+        if places <= 5 and size >= 10.0 ** (1 - places):
+            low_text, high_text, value_text = ("" if v is None else f"{v:.{places}f}" for v in (low, high, value))
+            return value_text, low_text, high_text
+        digits = figures_of(interval, digits)
+    value_text, low_text, high_text = ("" if v is None else figures(v, digits) for v in each)
+    return value_text, low_text, high_text
+
+
+def quantity(value: float, unit: str = "", digits: int = 4, interval: Interval | None = None) -> str:
+    """Return a value with its unit, so many significant digits, or those that its interval leaves; short times in ms or µs."""
+    factor, unit = _scale(value, unit)
+    low, high = interval or (None, None)
+    scaled = None if low is None or high is None else (factor * low, factor * high)
+    return f"{estimate_texts(factor * value, scaled, digits)[0]} {unit}".rstrip()
+
+
+def estimate_text(value: float, unit: str, interval: Interval | None) -> str:
+    """Return a value with its interval in one unit, "17.96 ms (17.87 to 18.05 ms)"; without an interval as `quantity`."""
+    factor, smaller = _scale(value, unit)
+    ends = interval_text([None if end is None else factor * end for end in interval or (None, None)])
+    return quantity(value, unit, interval=interval) + (f" ({ends} {smaller}".rstrip() + ")" if ends else "")
+
+
+def _scale(value: float, unit: str) -> tuple[float, str]:
+    """Return the factor and the unit in which a value is read best."""
     for below, factor, smaller in _SMALLER:
         if unit == "s" and 0.0 < abs(value) < below:
-            return f"{figures(factor * value, digits)} {smaller}"
-    return f"{figures(value, digits)} {unit}".rstrip()
+            return factor, smaller
+    return 1.0, unit
 
 
 def with_unit(name: str, unit: str) -> str:
@@ -46,20 +81,30 @@ def duration(seconds: float) -> str:
 
 def span(low: float, high: float, unit: str = "", digits: int = 4, word: str = "and") -> str:
     """Return the two ends of a range with one unit, that of the upper one, with as many digits as tell them apart."""
+    factor, unit = _scale(high, unit)
     digits = figures_of((low, high), digits)
-    for below, factor, smaller in _SMALLER:
-        if unit == "s" and 0.0 < abs(high) < below:
-            return f"{figures(factor * low, digits)} {word} {figures(factor * high, digits)} {smaller}"
-    return f"{figures(low, digits)} {word} {figures(high, digits)} {unit}".rstrip()
+    return f"{figures(factor * low, digits)} {word} {figures(factor * high, digits)} {unit}".rstrip()
 
 
-def interval_text(ci95: Sequence[float | None] | None) -> str:
+def interval_text(interval: Interval | None, word: str = " to ") -> str:
     """Return an interval as "A to B"; one end that is open as "above A" or "below B"; empty where both are."""
-    low, high = ci95 or (None, None)
-    if low is not None and high is not None:
-        return span(low, high, digits=6, word="to")
-    end = high if low is None else low
-    return "" if end is None else f"{'below' if low is None else 'above'} {figures(end, 6)}"
+    _, low, high = estimate_texts(None, interval)
+    if low and high:
+        return f"{low}{word}{high}"
+    return f"above {low}" if low else f"below {high}" if high else ""
+
+
+def change_text(after: float | None, before: float | None) -> str:
+    """Return the change from before to after in per cent with its sign; "" where it cannot be told."""
+    if after is None or not before:
+        return ""
+    change = 100.0 * (after / before - 1.0)
+    return "0.0 %" if abs(change) < 0.05 else f"{change:+.1f} %"
+
+
+def probability_text(share: float) -> str:
+    """Return a share of 1 in whole per cent; one that is nearly nothing, or nearly all, is said so."""
+    return "< 1 %" if 0 < share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 - 1e-9 else percentage(share)
 
 
 def interval_words(*, beyond_noise: bool) -> str:
@@ -75,9 +120,14 @@ def figures_of(ci95: Sequence[float | None] | None, fewest: int = 6) -> int:
     return min(15, max(fewest, math.ceil(math.log10(max(abs(low), abs(high)) / (high - low))) + 2))
 
 
+def factor_text(factor: float) -> str:
+    """Return "31" or "1,030": two figures, or whole numbers from 100 on."""
+    return f"{factor:.2g}" if factor < 99.5 else f"{factor:,.0f}"
+
+
 def times_text(factor: float) -> str:
-    """Return "31 times" or "1,030 times": two figures, or whole numbers from 100 on."""
-    return f"{factor:.2g} times" if factor < 99.5 else f"{factor:,.0f} times"
+    """Return "31 times" or "1,030 times"."""
+    return f"{factor_text(factor)} times"
 
 
 _COMMAND = re.compile(r"`hvdc-ident [^`]*`|(?<![`\w/.-])hvdc-ident .*$")
@@ -97,6 +147,11 @@ def _folded(line: str, width: int) -> str:
     kept = _COMMAND.sub(lambda found: found[0].replace(" ", "\0"), line)
     settings = {"break_long_words": False, "break_on_hyphens": False}
     return textwrap.fill(kept, width, subsequent_indent="  ", **settings).replace("\0", " ")  # type: ignore[arg-type]
+
+
+def capital(words: str) -> str:
+    """Return the words with a capital at their beginning."""
+    return words[:1].upper() + words[1:]
 
 
 def listed(names: Iterable[str]) -> str:
@@ -130,14 +185,15 @@ def value_by_place(values: Sequence[Mapping[str, Any]]) -> str:
     values: {value, unit, effect, at, from} by place, as `values_by_place` of a diagnosis has them. Places with the same value to
     three digits stand together.
     """
-    places: dict[str, dict[str, list[str]]] = {}
+    places: dict[str, tuple[str, dict[str, list[str]]]] = {}
     for v in values:
         brought = f" with {v['from']}" if v.get("from") else ""
-        at = places.setdefault(f"{v['value']:.3g} {v.get('unit') or ''}".rstrip(), {}).setdefault(v["effect"], [])
-        at.append(f"{listed(v['at'])}{brought}")
+        shown = quantity(v["value"], v.get("unit") or "")
+        by_effect = places.setdefault(f"{v['value']:.3g}", (shown, {}))[1]
+        by_effect.setdefault(v["effect"], []).append(f"{listed(v['at'])}{brought}")
     one_effect = len({v["effect"] for v in values}) == 1
     told = []
-    for k, (value, by_effect) in enumerate(places.items()):
+    for k, (value, by_effect) in enumerate(places.values()):
         where = " or ".join(
             f"{'it' if one_effect and k else f'the {effect}'} is at {one_of(at)}" for effect, at in by_effect.items()
         )

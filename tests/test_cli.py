@@ -90,6 +90,7 @@ def test_fit_finds_the_gain_and_writes_every_file(study: Path) -> None:
     assert abs(found["estimates"]["k"]["value"] - 5.0) < 0.05
     assert {"schema", "study", "model", "software", "seed"} <= set(found)
     names = {
+        "summary.json",
         "identifiability.json",
         "fit.json",
         "fitted-values.toml",
@@ -169,8 +170,9 @@ def test_run_prints_the_verdict_of_each_stage_and_the_values(study: Path) -> Non
     lines = call("run", study).stdout.splitlines()
     assert lines[0].startswith("simulate: done; worst is y in step, RMSE 0.")
     assert lines[1] == "identify: done; identifiable: k"
-    assert lines[2] == "fit: done; converged; the model fits"
-    header, row = lines[4], lines[5].split()
+    assert lines[2] == "fit: done; converged"
+    assert lines[4] == "PASS. The fitted model follows every recorded signal to its noise."
+    header, row = lines[6], lines[7].split()
     assert header.split() == ["parameter", "unit", "given", "fitted", "95", "%", "interval"]
     assert row[:3] == ["k", "1/s", "1"] and float(row[4]) < 5.0 < float(row[6])
     assert lines[-1] == f"report: {study.parent / 'study-results' / 'report.html'}"

@@ -22,11 +22,14 @@ const spread = (u, low, high) => {
   return [low - pad, high + pad];
 };
 
+// A colour of the style sheet as a canvas takes it, on the ground that the page has now.
+const paint = (color) => (color.startsWith("var(") ? getComputedStyle(document.body).getPropertyValue(color.slice(4, -1)).trim() : color);
+
 // A cross at each point of a series, as poles are drawn.
 const crosses = (color) => (u, k) => {
   const ctx = u.ctx, r = 6 * devicePixelRatio;
   ctx.save();
-  ctx.strokeStyle = color;
+  ctx.strokeStyle = paint(color);
   ctx.lineWidth = 2.2 * devicePixelRatio;
   ctx.beginPath();
   u.data[0].forEach((x, n) => {
@@ -144,9 +147,9 @@ export default {
       });
     },
     curve(c) {
-      const points = c.mark ? { show: c.mark === "cross" ? crosses(c.color) : true, size: c.size || 7, stroke: c.color, fill: c.mark === "ring" ? "transparent" : c.color } : { show: false };
+      const points = c.mark ? { show: c.mark === "cross" ? crosses(c.color) : true, size: c.size || 7, stroke: () => paint(c.color), fill: () => (c.mark === "ring" ? "transparent" : paint(c.color)) } : { show: false };
       return {
-        label: c.name, stroke: c.color, width: 1.5, dash: c.dashed ? [6, 4] : undefined, points, spanGaps: false,
+        label: c.name, stroke: () => paint(c.color), width: 1.5, dash: c.dashed ? [6, 4] : undefined, points, spanGaps: false,
         paths: c.mark ? () => null : undefined, value: (u, v) => (v == null ? "–" : v.toPrecision(5)),
       };
     },

@@ -15,14 +15,16 @@ import numpy as np
 from nicegui import ui
 from numpy.typing import NDArray
 
+from hvdc_ident.colours import DARK, LIGHT, style, variable
 from hvdc_ident.data import Array
 
-NOW, GIVEN, RECORDED = "#2f7ed8", "#8a8f98", "#d9822b"
-"""Colours, each of a contrast of 3 and more on the white and on the dark page."""
+RECORDED, GIVEN, NOW, EFFECT = (variable(name) for name in ("measured", "given", "fitted", "effect"))
+"""Colours, as the page's style sheet names them; `NOW` is that of the values at hand."""
 MOST = 4000
 """Rows that are drawn as they are: a screen has fewer columns than half of them."""
 ASSETS = Path(__file__).parent / "static" / "uplot"
-HEAD = """<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/assets/uPlot.iife.min.js"></script>
+HEAD = f"<style>:root {{ {style(LIGHT)} }} .body--dark {{ {style(DARK)} }}</style>"
+HEAD += """<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/assets/uPlot.iife.min.js"></script>
 <style>.plot .u-legend { font: 11px system-ui, sans-serif; margin: 0; text-align: left; padding-left: 58px; }
 .plot .u-legend th { font-weight: 400; } .plot .u-legend .u-marker { border-width: 2px; width: .8em; height: .8em; }
 .plot .u-legend .u-series > * { padding: 0 2px; } .plot .u-value { min-width: 5.5em; }
@@ -172,7 +174,7 @@ def sketch(x: Array, y: Array, width: int, height: int) -> str:
         drawing = there
     return (
         f'<svg width="{width}" height="{height}" viewBox="0 0 {width} {height}" aria-hidden="true">'
-        f'<path d="{"".join(pieces)}" fill="none" stroke="{RECORDED}" stroke-width="1"/></svg>'
+        f'<path d="{"".join(pieces)}" fill="none" style="stroke: {RECORDED}" stroke-width="1"/></svg>'
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +12,20 @@ from nicegui import ui
 
 import hvdc_ident as hi
 from hvdc_ident.app.next_panel import NextExperiment
-from hvdc_ident.app.plot import GIVEN, NOW, RECORDED, Grid, Plot, Trace, thinned
+from hvdc_ident.app.plot import EFFECT, GIVEN, NOW, RECORDED, Grid, Plot, Trace, thinned
 from hvdc_ident.app.result_tables import (
-    finding_table,
-    gap_table,
-    on_page,
     overlay_columns,
     profile_columns,
-    verdict_table,
 )
-from hvdc_ident.app.supposed import advice_lines, suppositions
-from hvdc_ident.app.what_if import EFFECT, WhatIf
+from hvdc_ident.app.supposed import suppositions
+from hvdc_ident.app.what_if import WhatIf
 from hvdc_ident.display import Table
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.fit.result import FIT_WORDS
-from hvdc_ident.report.overlay import WORDS, overlay_of
-from hvdc_ident.report.results import Results
-from hvdc_ident.study.run_summary import values_table
+from hvdc_ident.report.overlay import overlay_of
+from hvdc_ident.study.stages import stage
+from hvdc_ident.summary import Results, RunSummary, summarise
+from hvdc_ident.summary.phrases import WORDS, advice, verdict_sentence
+from hvdc_ident.summary.tables import findings_table, sets_table, values_table, verdicts_table
 from hvdc_ident.text import with_unit
 
 SETS = {"given": (GIVEN, True), "fitted": (NOW, False), "effect": (EFFECT, False)}
@@ -49,6 +47,11 @@ class FoundResults:
     def of(self, stage: str) -> Mapping[str, Any]:
         """Return the JSON of a stage; empty where it has not run."""
         return self.data.get(stage, {})
+
+    @cached_property
+    def summary(self) -> RunSummary:
+        """What the results say."""
+        return summarise({Path(stage(n).file).stem: data for n, data in self.data.items()})
 
 
 @dataclass(frozen=True)
@@ -95,10 +98,9 @@ def _identifiability(found: FoundResults) -> None:
     data = found.of("identify")
     if data.get("misspecified"):
         signs = data["misspecification"]
-        told = f"The model does not explain these data: {'; '.join(signs['signs'])}. Next: {signs['next']}."
-        ui.label(on_page(told))
+        ui.label(f"The model does not explain these data: {'; '.join(signs['signs'])}.")
     profiles = {n: p for n, p in (data.get("profiles") or {}).items() if len(p.get("values") or ()) > 1}
-    table = show_table(verdict_table(data))
+    table = show_table(verdicts_table(data))
     table.add_slot(
         "body-cell-0",
         '<q-td :props="props"><q-btn flat dense no-caps no-wrap color="primary" icon-right="show_chart" :label="props.value"'
@@ -131,12 +133,8 @@ def _open(data: Mapping[str, Any], profiles: Mapping[str, Any], name: str, place
 
 def _fitted(found: FoundResults) -> None:
     """Build the values, and recorded, given and fitted waveforms of an experiment."""
-    fit = found.of("fit")
-    judged = fit.get("adequacy") or {}
-    if judged.get("text"):
-        words = FIT_WORDS[judged["verdict"]]
-        ui.label(f"{words[:1].upper()}{words[1:]}: {judged['text']}.")
-    show_table(values_table(fit, found.of("diagnose")))
+    ui.label(verdict_sentence(found.summary))
+    show_table(values_table(found.summary))
     results = Results(found.folder)
     try:
         names = [n for n in results.experiments if results.table(f"fit.{n}.csv") is not None]
@@ -176,12 +174,12 @@ def _diagnosed(found: FoundResults) -> None:
     """Build findings, gaps, and the records with what was found at a size that a slider sets."""
     data = found.of("diagnose")
     ui.label(str(data.get("text") or data.get("verdict", ""))).classes("text-body2")
-    findings, gaps = finding_table(data), gap_table(data)
+    findings, errors = findings_table(found.summary), sets_table(found.summary)
     if findings.rows:
         show_table(findings)
-    if gaps.rows:
+    if errors.rows:
         with ui.row().style("max-width: 40rem"):
-            show_table(gaps)
+            show_table(errors)
     try:
         models = suppositions(found.study, data, found.folder)
     except HvdcIdentError as error:
@@ -196,9 +194,7 @@ def _diagnosed(found: FoundResults) -> None:
 def _next(found: FoundResults) -> None:
     """Build what to record next, simulated before it is made."""
     identified, diagnosis = found.of("identify"), found.of("diagnose")
-    lines = advice_lines(identified, diagnosis)
-    for line in lines or ["The results ask for no further record."]:
-        ui.label(line).classes("text-body2")
+    ui.label(advice(found.summary) or "The results ask for no further record.").classes("text-body2")
     try:
         rivals = suppositions(found.study, diagnosis, found.folder)
     except HvdcIdentError as error:

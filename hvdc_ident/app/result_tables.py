@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,28 +9,7 @@ import numpy as np
 
 from hvdc_ident.axes import joined
 from hvdc_ident.data import Array
-from hvdc_ident.display import Table, rounded
-from hvdc_ident.report.answers import beyond_noise, places_of
 from hvdc_ident.report.overlay import Overlay
-from hvdc_ident.text import figures_of, interval_text, interval_words, one_of, percentage
-
-_COMMAND = re.compile(r"`?hvdc-ident ([a-z]+) STUDY(?: --to FILE)?`?")
-_BUTTONS = {"letter": "the button Letter", "export": "a button below Take away", "run": "Run all"}
-"""Names on the page for commands that are no stages."""
-MODELS = {"nominal": "given values", "refitted": "refitted", "augmented": "with the effect"}
-"""Models whose gaps a diagnosis compares, and their names on the page."""
-PLACES = 6
-"""Likely places of an effect that are listed."""
-
-
-def verdict_table(identified: Mapping[str, Any]) -> Table:
-    """Return each candidate's verdict with its value, interval and reason."""
-    rows = []
-    for name, p in (identified.get("parameters") or {}).items():
-        ci95 = p.get("ci95")
-        value = rounded(p.get("value"), figures_of(ci95, 5))
-        rows.append((name, p["verdict"], value, interval_text(ci95), p.get("unit", ""), p["reason"]))
-    return Table(("parameter", "verdict", "value", "95 % interval", "unit", "reason"), tuple(rows))
 
 
 def profile_columns(profile: Mapping[str, Any]) -> list[Array]:
@@ -68,36 +46,3 @@ def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = F
         else:
             columns.append(overlay.error(name) if errors else run[overlay.output])
     return columns
-
-
-def finding_table(diagnosis: Mapping[str, Any]) -> Table:
-    """Return what may be missing: effects with probabilities, sizes and likely places."""
-    rows, depend = [], diagnosis.get("values_by_place") or {}
-    for f in diagnosis.get("findings") or []:
-        sizes = []
-        for name, p in (f.get("parameters") or {}).items():
-            within = interval_text(p.get("ci95"))
-            value = f"{name} = {p['value']:.{figures_of(p.get('ci95'), 4)}g} {p.get('unit') or ''}".rstrip()
-            sizes.append(f"{value} ({within})" if within else value)
-        places = [f"{at} ({percentage(p)})" for at, p in places_of(f["places"], depend=depend).items()]
-        more = [f"{len(places) - PLACES} more"] if len(places) > PLACES else []
-        where = "; ".join([*places[:PLACES], *more])
-        rows.append((one_of(f["same_as"]), percentage(f["probability"]), "; ".join(sizes), where))
-    words = "95 %" if not beyond_noise(diagnosis) else interval_words(beyond_noise=True)
-    return Table(("effect", "probability", f"size ({words})", "likely at"), tuple(rows)).without_empty()
-
-
-def gap_table(diagnosis: Mapping[str, Any]) -> Table:
-    """Return the gaps before and after in units of the noise, over the fitted and over the held-out recordings."""
-    pooled = (diagnosis.get("gap") or {}).get("pooled") or {}
-    rows = [
-        (MODELS[n], rounded(g.get("fit"), 3), rounded(g.get("holdout"), 3)) for n, g in pooled.items() if n in MODELS
-    ]
-    if not diagnosis.get("augmented_model"):
-        rows = [row for row in rows if row[0] != MODELS["augmented"]]
-    return Table(("gap, times the noise", "fitted records", "held-out records"), tuple(rows)).without_empty()
-
-
-def on_page(text: str) -> str:
-    """Return the text of a result with the commands in it as what stands on the page for them."""
-    return _COMMAND.sub(lambda found: _BUTTONS.get(found[1], f"the stage {found[1]}"), text)

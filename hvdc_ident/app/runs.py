@@ -20,9 +20,9 @@ from hvdc_ident.app.study_folder import stamp
 from hvdc_ident.app.worker import EVERYTHING, GRACE
 from hvdc_ident.errors import InputError
 from hvdc_ident.executor import times_of
-from hvdc_ident.report.results import Results
 from hvdc_ident.study.pipeline import FIRST, standing
 from hvdc_ident.study.stages import Stage, stages
+from hvdc_ident.summary import Results
 
 State = Literal["not run", "done", "stale", "failed", "interrupted"]
 Outcome = Literal["running", "done", "failed", "cancelled"]

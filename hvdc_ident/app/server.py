@@ -16,6 +16,7 @@ from functools import cache
 from hvdc_ident.app.desk import Desk, opened
 from hvdc_ident.app.guard import LOOPBACK, Guard
 from hvdc_ident.app.study_folder import MOST_BYTES
+from hvdc_ident.colours import FITTED
 from hvdc_ident.errors import InputError
 
 RECONNECT = 120.0
@@ -137,7 +138,7 @@ def _page(desk: Desk) -> None:
 
     show_errors()
     ui.add_head_html(HEAD)
-    ui.colors(primary="#1f5fa8", negative="#d64545")
+    ui.colors(primary=FITTED, negative="#d64545")
     with ui.header().classes("items-center q-py-none"):
         ui.label(desk.title).classes("text-subtitle1 text-bold")
         with ui.tabs().props("dense") as bar:

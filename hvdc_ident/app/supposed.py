@@ -127,9 +127,3 @@ def _planned(told: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> Ite
         if line.get("moves"):
             design = ExperimentDesign(tuple(Move.of(m) for m in line["moves"]))
             yield PlannedExperiment(design.text(units), design, tuple(line["record"]), tuple(line["new_signals"]))
-
-
-def advice_lines(identified: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[str]:
-    """Return in words what to record next: to tell rivals apart first, then to know the parameters better."""
-    told = (diagnosis.get("separating_experiment") or {}, identified.get("recommended_experiment") or {})
-    return [f"{text.rstrip('.')}." for t in told if (text := t.get("text"))]

@@ -12,15 +12,13 @@ from nicegui import run, ui
 import hvdc_ident as hi
 from hvdc_ident.app.knob import Knob
 from hvdc_ident.app.latest import Latest
-from hvdc_ident.app.plot import GIVEN, RECORDED, Grid, Plot, Trace, thinned
+from hvdc_ident.app.plot import EFFECT, NOW, RECORDED, Grid, Plot, Trace, thinned
 from hvdc_ident.app.setting import Setting, span_of
 from hvdc_ident.app.supposed import Supposition, refitted
 from hvdc_ident.data import Array
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.text import with_unit
 
-EFFECT = "#2a9d5c"
-"""Colour of curves with the effect."""
 TALL = 150
 
 
@@ -150,7 +148,7 @@ class WhatIf:
         self._place.clear()
         curves = (
             Trace("recorded", RECORDED),
-            Trace("refitted without it", GIVEN, dashed=True),
+            Trace("refitted without it", NOW, dashed=True),
             Trace("with it", EFFECT),
         )
         with self._place:

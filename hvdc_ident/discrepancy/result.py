@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
+from hvdc_ident.colours import EFFECT, RECORDED, ROLES
 from hvdc_ident.display import Shown, data_frame
 from hvdc_ident.display import Table as TextTable
 from hvdc_ident.effects import effects
@@ -356,10 +357,8 @@ class Diagnosis(Shown):
         for k, (part, label) in enumerate((("fit", "fitted"), ("holdout", "held out"))):
             values = [self.gap.pooled[n][part] for n in names]
             at = np.arange(3) + (k - 0.5) * width
-            left.bar(
-                at, [np.nan if v is None else v for v in values], width, label=label, color=("#1f5fa8", "#d08020")[k]
-            )
-        left.axhline(1.0, color="#222222", linewidth=1.0, linestyle=":", label="noise")
+            left.bar(at, [np.nan if v is None else v for v in values], width, label=label, color=[*ROLES.values()][k])
+        left.axhline(1.0, color=RECORDED, linewidth=1.0, linestyle=":", label="noise")
         left.set_yscale("log")
         left.set_xticks(range(3), ["given gains", "refitted", "with effect"])
         left.set_ylabel("residual in noise units")
@@ -367,7 +366,7 @@ class Diagnosis(Shown):
         refitted = [c for c in self.candidates if c.delta_bic is not None and c.round == 1]
         best = sorted(refitted, key=lambda c: -(c.delta_bic or 0.0))[:MAX_DRAWN][::-1]
         if best:
-            right.barh(range(len(best)), [c.delta_bic or 0.0 for c in best], color="#1f5fa8")
+            right.barh(range(len(best)), [c.delta_bic or 0.0 for c in best], color=EFFECT)
             labels = [f"{c.effect} at {', '.join(c.at)}" + (f" from {c.source}" if c.source else "") for c in best]
             right.set_yticks(range(len(best)), labels, fontsize="small")
             right.set_xlabel("gain in BIC over the refitted model")

@@ -17,7 +17,7 @@ from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.fit.jump_instants import PlacedInstant
 from hvdc_ident.fit.residual import Curve
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import in_python, interval_text
+from hvdc_ident.text import estimate_texts, in_python, interval_text
 
 NOT_ASKED = "not a candidate"
 """Reason of a parameter that is held because it was not asked for."""
@@ -154,13 +154,13 @@ class FitResult(Shown):
         yield self._quality()
         yield f"{self.roughness['text']}." if self.roughness else ""
         start = self.starts[0].start if self.starts else {}
-        rows = [(n, e.value, e.unit, interval_text(e.ci95), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
+        rows = [(n, *_cells(e), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
         yield (
             Table(("parameter", "estimate", "unit", "95 % interval", "std", "start", "remark"), tuple(rows))
             if rows
             else ""
         )
-        own = [(x, n, e.value, e.unit, interval_text(e.ci95)) for x, table in self.nuisance.items() for n, e in table.items()]
+        own = [(x, n, *_cells(e)) for x, table in self.nuisance.items() for n, e in table.items()]
         yield Table(("experiment", "nuisance", "estimate", "unit", "95 % interval"), tuple(own)) if own else ""
         yield self._held()
         columns = (self.rmse_given, self.rmse_start, self.rmse)
@@ -205,3 +205,8 @@ class FitResult(Shown):
             "ci95_high": [high for _, high in ends],
         }
         return data_frame(columns, list(self.estimates), "parameter")
+
+
+def _cells(e: Estimate) -> tuple[str, str, str]:
+    """Return value, unit and interval as text."""
+    return estimate_texts(e.value, e.ci95)[0], e.unit, interval_text(e.ci95)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.colours import SERIES
 from hvdc_ident.display import axes_of
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.linearize.frequency import FrequencyResponse
@@ -20,14 +21,13 @@ from hvdc_ident.linearize.modal import Mode
 if TYPE_CHECKING:
     from hvdc_ident.linearize.modal import RootLocus
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
 MARK = "#777777"
 
 
 def look(k: int) -> dict[str, Any]:
     """Colour and line of the k-th curve: they differ in both, so that a print in grey reads too."""
-    return {"color": COLOURS[k % len(COLOURS)], "linestyle": LINES[(k // len(COLOURS) + k) % len(LINES)]}
+    return {"color": SERIES[k % len(SERIES)], "linestyle": LINES[(k // len(SERIES) + k) % len(LINES)]}
 
 
 def grid(axes: Any) -> None:
@@ -107,8 +107,8 @@ def poles(model: LinearModel, ax: Any = None) -> Any:
     """Return the axes: crosses for poles, circles for invariant zeros, rad/s; a symmetric log axis where they spread."""
     axes = axes_of(ax, 6.0, 5.0)
     p, z = model.poles(), model.zeros()
-    axes.plot(p.real, p.imag, "x", color=COLOURS[0], markersize=8, label="poles")
-    axes.plot(z.real, z.imag, "o", color=COLOURS[1], markerfacecolor="none", markersize=8, label="zeros")
+    axes.plot(p.real, p.imag, "x", color=SERIES[0], markersize=8, label="poles")
+    axes.plot(z.real, z.imag, "o", color=SERIES[1], markerfacecolor="none", markersize=8, label="zeros")
     if p.size and abs(p.real).max() > 100 * max(float(abs(p.imag).max()), 1.0):
         axes.set_xscale("symlog", linthresh=1.0)
     axes.set_xlabel("real part, rad/s")
@@ -169,7 +169,7 @@ def locus(found: RootLocus, left: float | None = None, ax: Any = None) -> Any:
         v = found.eigenvalues[:, k]
         if left is not None and v.real.max() < left:
             continue
-        colour = COLOURS[k % len(COLOURS)]
+        colour = SERIES[k % len(SERIES)]
         axes.plot(v.real, v.imag, color=colour, linewidth=1.2)
         axes.plot(v.real[:1], v.imag[:1], "o", color=colour, markersize=5)
         axes.plot(v.real[-1:], v.imag[-1:], "s", color=colour, markersize=5)

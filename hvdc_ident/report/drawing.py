@@ -14,29 +14,26 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.colours import DARK, LIGHT, style
 from hvdc_ident.data import Array
 from hvdc_ident.report.html import captioned, text
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 POINTS = 500
 """Points of a curve that are drawn: two for each point of the widest figure's axis are more than can be told apart."""
 WIDEST = 8.4
 """rem on the page for an inch of a figure: one of 7.4 inches fills it."""
-MEASURED, BEFORE, AFTER, EFFECT, MARK = "#222222", "#d08020", "#1f5fa8", "#1d7f4e", "#999999"
-"""Colours of the recording, of the model with the given values, fitted, and with what it lacks; and of lines that mark."""
 NAMED = {
-    MEASURED: "measured",
-    BEFORE: "given",
-    AFTER: "fitted",
-    EFFECT: "effect",
-    MARK: "mark",
+    **{colour: name for name, colour in LIGHT.items()},
+    "#999999": "mark",
     "#000000": "ink",
     "#ffffff": "paper",
     "#e4e4e4": "grid",
@@ -60,6 +57,40 @@ def figure(width: float, height: float, margins: Mapping[str, float] | None = No
     fig = Figure(figsize=(width, height))
     fig.subplots_adjust(**margins)
     return fig
+
+
+def bode_axes(fig: Figure, columns: int = 1) -> list[tuple[Axes, Axes]]:
+    """Axes for gain above phase over frequency, so many pairs beside each other, with their labels and grids."""
+    grid = fig.subplots(2, columns, sharex="col", squeeze=False)
+    for k, (above, below) in enumerate(zip(*grid, strict=True)):
+        below.set_xlabel("frequency, Hz")
+        for axes, label in ((above, "gain, dB"), (below, "phase, degrees")):
+            axes.set_ylabel(label if k == 0 else "")
+            axes.grid(True, color="#e4e4e4", linewidth=0.6)
+            axes.tick_params(labelsize=8)
+            axes.spines[["top", "right"]].set_visible(False)
+        fig.align_ylabels([above, below])
+    return list(zip(*grid, strict=True))
+
+
+def draw_response(
+    pair: tuple[Axes, Axes], omega: Array, values: NDArray[np.complex128], label: str | None = None, **style: Any
+) -> bool:
+    """Whether a response over frequency, rad/s, was drawn as gain and phase: one that is 0 everywhere is not."""
+    keep = (omega > 0) & (np.abs(values) > 0)
+    if not keep.any():
+        return False
+    hertz = omega[keep] / (2 * np.pi)
+    pair[0].semilogx(hertz, 20 * np.log10(np.abs(values[keep])), label=label, **style)
+    pair[1].semilogx(hertz, np.degrees(np.unwrap(np.angle(values[keep]))), **style)
+    for axes in pair:
+        axes.minorticks_off()  # over three decades nobody reads them, and they take half of the time to draw
+    return True
+
+
+def complex_of(real: Any, imaginary: Any) -> NDArray[np.complex128]:
+    """The complex numbers of two lists of a JSON."""
+    return np.asarray(np.array(real, dtype=float) + 1j * np.array(imaginary, dtype=float))
 
 
 def svg(fig: Figure, label: str) -> str:
@@ -205,6 +236,13 @@ def script(body: str) -> tuple[str, str]:
     code = asset("page.js")
     mark = base64.b64encode(hashlib.sha256(code.encode()).digest()).decode()
     return code, f"script-src 'sha256-{mark}'"
+
+
+@cache
+def style_sheet() -> str:
+    """Return the style sheet of a page, with the colours of its curves."""
+    dark = f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {style(DARK)} }} }}"
+    return f":root {{ {style(LIGHT)} }}\n{dark}\n{asset('page.css')}"
 
 
 @cache

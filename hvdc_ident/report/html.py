@@ -5,10 +5,17 @@ from __future__ import annotations
 import html
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from hvdc_ident.text import figures, figures_of, percentage
+from hvdc_ident.display import Table
+from hvdc_ident.summary import Results
+from hvdc_ident.text import estimate_texts, figures, interval_text
+
+_POWER = re.compile(r"(?<=\d)e([-+]\d+)\b")
+_MINUS = re.compile(r"(?<![\w.])-(?=\d)|(?<=<sup>)-")
+_BADGE = re.compile(r"\b(PASS|FAIL)\b")
 
 
 def text(value: Any) -> str:
@@ -25,56 +32,19 @@ def number(value: Any, digits: int = 4) -> str:
     """A number with so many significant digits; a dash where there is none."""
     if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
         return "–"
-    shown = figures(value, digits)
-    if "e" in shown:
-        mantissa, exponent = shown.split("e")
-        return f"{mantissa}·10<sup>{int(exponent)}</sup>".replace("-", "−")
-    return shown.replace("-", "−")
+    return typeset(figures(value, digits))
 
 
-def rough(value: Any, digits: int = 2) -> str:
-    """A number with exactly so many significant digits, zeros at its end too; a dash where there is none."""
-    if not isinstance(value, int | float) or not math.isfinite(value) or not 1e-4 <= abs(value) < 1e6:
-        return number(value, digits)
-    if abs(value) >= 10.0**digits:
-        return f"{float(f'{value:.{digits}g}'):.0f}".replace("-", "−")
-    return f"{value:#.{digits}g}".rstrip(".").replace("-", "−")
+def typeset(shown: str) -> str:
+    """Return text with numbers in it as HTML: with minus signs, and powers of ten; PASS and FAIL as badges."""
+    raised = _POWER.sub(lambda found: f"·10<sup>{int(found[1])}</sup>", text(shown))
+    signed = _MINUS.sub("−", raised)
+    return _BADGE.sub(lambda found: badge(found[0] == "PASS"), signed)
 
 
-def percent(share: float) -> str:
-    """A share of 1 in whole per cent; one that is nearly nothing, or nearly all, is said so."""
-    return "< 1 %" if 0 < share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 - 1e-9 else percentage(share)
-
-
-def decimals(low: float, high: float) -> int:
-    """Return the decimals that show two digits of half an interval's width: at least 0, at most 6."""
-    half = 0.5 * abs(high - low)
-    return min(max(1 - math.floor(math.log10(half)), 0), 6) if half > 0 and math.isfinite(half) else 6
-
-
-def estimate(value: Any, interval: Sequence[float | None] | None) -> tuple[str, str]:
-    """Return a value and its 95 % interval as text, with the digits that the interval leaves; a dash where there is none."""
-    low, high = interval or (None, None)
-    if not all(isinstance(v, int | float) and math.isfinite(v) for v in (value, low, high)) or not 0 < abs(value) < 1e6:
-        digits = figures_of(interval, 3) if all(isinstance(v, int | float) for v in (low, high)) else 3
-        ends = [number(v, digits) if v is not None else "" for v in (low, high)]
-        one_sided = f"below {ends[1]}" if low is None else f"above {ends[0]}" if high is None else " … ".join(ends)
-        return number(value), one_sided if interval and (low, high) != (None, None) else "–"
-    assert low is not None and high is not None
-    places = decimals(low, high)
-    if abs(value) < 10.0 ** (1 - places) or places == 6:
-        digits = figures_of((low, high), 4)
-        return number(value, digits), f"{number(low, digits)} … {number(high, digits)}"
-    shown = [f"{v:.{places}f}".replace("-", "−") for v in (value, low, high)]
-    return shown[0], f"{shown[1]} … {shown[2]}"
-
-
-def share(after: Any, before: Any) -> str:
-    """The change from before to after in per cent; a dash where it cannot be told."""
-    if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in (after, before)) or not before:
-        return "–"
-    change = 100.0 * (after / before - 1.0)
-    return "0.0 %" if abs(change) < 0.05 else f"{change:+.1f} %".replace("-", "−")
+def estimate(value: float | None, interval: Sequence[float | None] | None) -> tuple[str, str]:
+    """Return a value and its interval as HTML, with the digits that the interval leaves; a dash where there is none."""
+    return typeset(estimate_texts(value, interval)[0]) or "–", typeset(interval_text(interval)) or "–"
 
 
 def captioned(drawing: str, caption: str, attributes: str = "") -> str:
@@ -99,6 +69,19 @@ def badge(passed: bool | None) -> str:
     return "–" if passed is None else f"<b class='{'pass' if passed else 'fail'}'>{'PASS' if passed else 'FAIL'}</b>"
 
 
+def table_of(found: Table) -> str:
+    """Return a table of text and numbers as HTML; a number has four digits, and None is a dash."""
+    words = [k for k, numbers in enumerate(found.numeric) if not numbers]
+    rows = [[typeset(c) if isinstance(c, str) else number(c) for c in row] for row in found.rows]
+    return table([typeset(h) for h in found.header], rows, words=words)
+
+
+def rows_of(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return a table of text and numbers as HTML; "" without rows."""
+    cells = tuple(tuple(row) for row in rows)
+    return table_of(Table(tuple(header), cells)) if cells else ""
+
+
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, words: Sequence[int] = (0,)) -> str:
     """A table. header and cells are HTML already; `words` are the columns of text, the others are numbers.
 
@@ -117,3 +100,18 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, words: Sequen
 
 def _kind(column: int, words: Sequence[int]) -> str:
     return "" if column in words else ' class="n"'
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page that opens on demand.
+
+    order: its place. title: its heading. about: one sentence on what it shows, which stands beside the heading. render: its
+    HTML from the results (empty: the part is left out). printed: whether a print shows it; of the others it has the heading.
+    """
+
+    order: int
+    title: str
+    about: str
+    render: Callable[[Results], str]
+    printed: bool = False

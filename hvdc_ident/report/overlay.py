@@ -8,31 +8,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.colours import EFFECT, FITTED, GIVEN, MARK, RECORDED
 from hvdc_ident.data import Array, Trajectory
-from hvdc_ident.report.drawing import (
-    AFTER,
-    BEFORE,
-    EFFECT,
-    MARK,
-    MEASURED,
-    PlottedCurve,
-    figure,
-    svg,
-    visible,
-    visible_rows,
-    zoomable,
-)
-from hvdc_ident.report.results import Results
+from hvdc_ident.report.drawing import PlottedCurve, figure, svg, visible, visible_rows, zoomable
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.phrases import WORDS
+from hvdc_ident.summary.summarise import STAGES
 from hvdc_ident.text import with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STAGES = {"given": "simulation", "fitted": "fit", "effect": "discrepancy"}
-"""Sets of values in the order of a page, with the stage whose CSV files hold the runs with them."""
-WORDS = {"given": "given values", "fitted": "fitted", "effect": "with the effect"}
-STYLES = {"given": (BEFORE, (0, (5, 2))), "fitted": (AFTER, "-"), "effect": (EFFECT, (0, (1.5, 1.2)))}
+STYLES = {"given": (GIVEN, (0, (5, 2))), "fitted": (FITTED, "-"), "effect": (EFFECT, (0, (1.5, 1.2)))}
 SHARE = 0.995
 """Share of the squared error that a figure's span of time holds where it is cut to the disagreement."""
 
@@ -97,7 +85,7 @@ class Overlay:
         columns = {"x": shown.time, "measured": shown[f"{self.output}.measured"]}
         columns |= {n: t[self.output] for n, t in same.items()}
         rows = np.unique(np.concatenate([visible_rows(c) for c in columns.values()]))
-        found = [PlottedCurve("recorded", MEASURED, "measured")]
+        found = [PlottedCurve("recorded", RECORDED, "measured")]
         for name in same:
             found.append(PlottedCurve(WORDS[name], STYLES[name][0], name))
             found.append(PlottedCurve(f"error, {WORDS[name]}", STYLES[name][0], "measured", minus=name, lower=True))
@@ -117,6 +105,12 @@ def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[st
     window = about.get("window")
     unit = str(results.units.get(output, ""))
     return Overlay(experiment, output, unit, runs, about.get("event"), (window[0], window[1]) if window else None)
+
+
+def worst_signal(results: Results, name: str | None, sets: Sequence[str]) -> Overlay | None:
+    """The worst signal of the model with a set of values, with the runs that the folder holds of some; None where there is none."""
+    found = results.summary.sets.get(name or "")
+    return None if found is None or found.worst is None else overlay_of(results, found.worst[1], found.worst[0], sets)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +141,7 @@ class Sheet:
         """The overlay on the sheet, which is wiped first."""
         self._wipe()
         shown, output = overlay.record, overlay.output
-        self._line(self.top, shown.time, shown[f"{output}.measured"], span, MEASURED, "-", 1.0, "recorded")
+        self._line(self.top, shown.time, shown[f"{output}.measured"], span, RECORDED, "-", 1.0, "recorded")
         for name, run in overlay.runs.items():
             color, dashes = STYLES[name]
             self._line(self.top, run.time, run[output], span, color, dashes, 1.3, WORDS[name])
@@ -165,7 +159,7 @@ class Sheet:
             if overlay.event is not None:
                 axes.axvline(overlay.event, color=MARK, linewidth=0.8, linestyle=":")
             if overlay.window is not None:
-                axes.axvspan(*overlay.window, color=AFTER, alpha=0.05, linewidth=0)
+                axes.axvspan(*overlay.window, color=FITTED, alpha=0.05, linewidth=0)
             if span is not None:
                 axes.set_xlim(*span)
         self._explain()

@@ -14,10 +14,10 @@ from markupsafe import Markup
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_bytes, write_text
-from hvdc_ident.report.drawing import asset, on_paper, script
+from hvdc_ident.report.drawing import asset, on_paper, script, style_sheet
 from hvdc_ident.report.first_screen import first_screen
-from hvdc_ident.report.html import text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.html import Section, text
+from hvdc_ident.summary import Results
 from hvdc_ident.text import with_study
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:"
@@ -79,7 +79,7 @@ def document(title: str, subtitle: str, body: str) -> str:
         title=title,
         subtitle=Markup(subtitle),
         policy=Markup("; ".join(part for part in (POLICY, allowed) if part)),
-        style=Markup(asset("page.css")),
+        style=Markup(style_sheet()),
         body=Markup(body),
         code=Markup(code),
     )

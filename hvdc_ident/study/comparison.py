@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hvdc_ident.display import Shown, Table, rounded
+from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import InputError
-from hvdc_ident.report.answers import Answers
+from hvdc_ident.files import plain
 from hvdc_ident.report.comparison import comparison_page
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.values_that_count import estimates_that_count, values_that_count
 from hvdc_ident.study.stages import Stage, stages
-from hvdc_ident.text import figures, figures_of, listed, percentage
+from hvdc_ident.summary import Results, RunSummary
+from hvdc_ident.summary.phrases import by_place, note_text, verdict_sentence
+from hvdc_ident.summary.run_summary import ParameterSummary
+from hvdc_ident.text import change_text, estimate_texts, figures, interval_text, listed, percentage
 
 SIDES = ("first", "second")
 APART = (
@@ -23,8 +24,10 @@ APART = (
     "above 1, chance alone does not explain it."
 )
 """The unit of a distance, in words."""
-FIXED = (1e-3, 1e7)
-"""Sizes from and up to which a value and its interval are written without an exponent."""
+
+
+GAPS = {"given": "at the given values", "fitted": "fitted without an effect", "effect": "with the effects found"}
+"""The sets of values at which gaps are compared, and their names in text."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,10 +41,16 @@ class RunComparison(Shown):
         return dict(self.data)
 
     def _screen(self) -> Iterator[str | Table]:
-        data = self.data
-        yield "\n".join(f"{side}: {_heading(run)}" for side, run in zip(SIDES, data["runs"], strict=True))
+        values, gaps = self.values_table(), self.gaps_table()
+        heads = (
+            "study {study} in {folder}, model {model}, {software}, seed {seed}".format(**r) for r in self.data["runs"]
+        )
+        yield "\n".join(f"{side}: {head}" for side, head in zip(SIDES, heads, strict=True))
         yield "\n".join(self.input_lines)
-        yield from self._tables()
+        yield values if values.rows else ""
+        yield APART if any(v["apart"] is not None for v in self.data["values"]) else ""
+        yield "RMSE over the recordings that both have:" if gaps.rows else ""
+        yield gaps if gaps.rows else ""
         yield "\n".join(self.verdict_lines)
         yield self.conclusion
 
@@ -53,6 +62,11 @@ class RunComparison(Shown):
         if not beyond:
             if judged:
                 return "No value differs beyond both intervals."
+            if placed := [v["parameter"] for v in self.data["values"] if v["depends"]]:
+                plural = "s" if len(placed) == 1 else ""
+                return (
+                    f"{listed(placed)} depend{plural} on where the effect is, so that there is no one value to compare."
+                )
             fitted = any(None not in v["values"] for v in self.data["values"])
             return (
                 "No value has an interval in both, by which to judge it." if fitted else "No value was fitted in both."
@@ -61,30 +75,42 @@ class RunComparison(Shown):
         why = " One run is fitted with an effect and the other without one, which moves values too." if mixed else ""
         return f"Apart beyond both intervals: {listed(beyond)}.{why}"
 
-    def _tables(self) -> Iterator[str | Table]:
-        if self.data["values"]:
-            header = ("parameter", "unit", *SIDES, "change, %", "apart")
-            rows = tuple(
-                (v["parameter"], v["unit"], *value_texts(v), rounded(v["change_percent"], 3), rounded(v["apart"], 3))
-                for v in self.data["values"]
-            )
-            yield Table(header, rows).without_empty()
-            yield APART if any(v["apart"] is not None for v in self.data["values"]) else ""
-        for kind, title in GAPS.items():
-            rows = tuple(
-                (g["output"], g["unit"], *map(rounded, g["rmse"]), rounded(g["ratio"], 3), g["recordings"])
-                for g in self.data["gaps"]
-                if g["at"] == kind
-            )
-            if rows:
-                yield f"RMSE {title}, over the recordings that both have:"
-                yield Table(("output", "unit", *SIDES, "ratio", "recordings"), rows).without_empty()
+    def values_table(self, names: Sequence[str] = SIDES) -> Table:
+        """Return every candidate with both values that count, their intervals, and how far apart they are."""
+        rows = []
+        for v in self.data["values"]:
+            change = "" if v["change_percent"] is None else change_text(v["values"][1], v["values"][0])
+            apart = "" if v["apart"] is None else figures(v["apart"], 3)
+            given, without, with_it = (_both(v[k]) for k in ("given", "without_effect", "with_effect"))
+            rows.append((v["parameter"], v["unit"], given, *value_texts(v), change, apart, without, with_it))
+        header = ("parameter", "unit", "given", *names, "change", "apart", "without the effect", "with the effect")
+        return Table(header, tuple(rows)).without_empty() if rows else Table(header, ())
+
+    def gaps_table(self, names: Sequence[str] = SIDES) -> Table:
+        """Return the RMSE of each output at each set of values, over the recordings that both have."""
+        rows = []
+        for g in self.data["gaps"]:
+            ratio = "" if g["ratio"] is None else figures(g["ratio"], 3)
+            rows.append((GAPS[g["at"]], g["output"], g["unit"], *map(figures, g["rmse"]), ratio, str(g["recordings"])))
+        header = ("at", "output", "unit", *names, "ratio", "recordings")
+        return Table(header, tuple(rows)).without_empty() if rows else Table(header, ())
 
     @property
     def page(self) -> str:
         """The comparison as an HTML page in one file."""
-        texts = [value_texts(v) for v in self.data["values"]]
-        return comparison_page(self.data, texts, self.input_lines, self.conclusion, APART)
+        runs, keys = self.data["runs"], ("study", "folder", "model", "software", "seed")
+        heads = tuple((side, *(str(r[k]) for k in keys)) for side, r in zip(SIDES, runs, strict=True))
+        verdicts = tuple((n, *(v or "has not run" for v in both)) for n, both in self.data["verdicts"].items())
+        parts = {
+            "What is compared": (self.input_lines, Table(("", "study", "results", *keys[2:]), heads)),
+            "Values": ([self.conclusion, APART], self.values_table()),
+            "Gaps": ([], self.gaps_table()),
+            "Verdicts": ([], Table(("", *SIDES), verdicts)),
+            "What the model lacks": (finding_lines(self.data["findings"]), None),
+        }
+        names = [str(r["study"]) for r in runs]
+        title = f"{names[0]} and {names[1]}" if names[0] != names[1] else f"{names[0]}, twice"
+        return comparison_page(title, parts)
 
     @property
     def input_lines(self) -> list[str]:
@@ -101,7 +127,7 @@ class RunComparison(Shown):
 
     @property
     def verdict_lines(self) -> list[str]:
-        """The verdict of each stage, in one line where both are the same, and what each diagnosis found."""
+        """The verdict on the model and of each stage, in one line where both are the same, and what each diagnosis found."""
         lines = []
         for name, both in self.data["verdicts"].items():
             if both[0] == both[1]:
@@ -109,10 +135,6 @@ class RunComparison(Shown):
             else:
                 lines += [f"{name}, {side}: {v or 'has not run'}" for side, v in zip(SIDES, both, strict=True)]
         return lines + finding_lines(self.data["findings"])
-
-
-GAPS = {"given": "at the given values", "fitted": "fitted without an effect", "augmented": "with the effects found"}
-"""The sets of values at which gaps are compared, and their names in text."""
 
 
 def compare_runs(first: str | Path, second: str | Path) -> RunComparison:
@@ -132,6 +154,7 @@ def compare_runs(first: str | Path, second: str | Path) -> RunComparison:
     """
     folders = [folder_of(Path(p)) for p in (first, second)]
     results = [Results(f) for f in folders]
+    both = [r.summary for r in results]
     headings = [r.heading for r in results]
     runs = [
         {"folder": f.as_posix(), **{k: h.get(k) for k in ("study", "model", "software", "seed")}}
@@ -151,11 +174,11 @@ def compare_runs(first: str | Path, second: str | Path) -> RunComparison:
             "given_values": {
                 n: [given[0][n], given[1][n]] for n in given[0] if given[0][n] != given[1].get(n, given[0][n])
             },
-            "sets": [_set_of(r) for r in results],
-            "values": _values(*results),
-            "gaps": _gaps(*results),
-            "verdicts": {s.name: v for s in stages() if any(v := [_verdict(s, r) for r in results])},
-            "findings": [_findings(r) for r in results],
+            "sets": [_set_of(s) for s in both],
+            "values": _values(both),
+            "gaps": _gaps(both),
+            "verdicts": _verdicts(results),
+            "findings": [plain(s.findings) if s.diagnosis else None for s in both],
         }
     )
 
@@ -196,7 +219,7 @@ def distance(first: Mapping[str, Any], second: Mapping[str, Any]) -> float | Non
 
 
 def value_texts(line: Mapping[str, Any]) -> tuple[str, str]:
-    """Return both values of a parameter with their intervals as text, "31.39 ± 0.02"; why there is none where it is held."""
+    """Return both values of a parameter with their intervals as text, "31.39 (31.37 to 31.41)"; why there is none where it is held."""
     first, second = (
         _with_interval(v, ci) if v is not None else held
         for v, ci, held in zip(line["values"], line["ci95"], line["held"], strict=True)
@@ -204,19 +227,15 @@ def value_texts(line: Mapping[str, Any]) -> tuple[str, str]:
     return first, second
 
 
-def _with_interval(value: float, ci95: Sequence[float | None] | None) -> str:
-    """Return a value with the halves of its interval, all with as many decimals: two figures of the smaller half."""
-    low, high = ci95 or (None, None)
-    halves = [abs(end - value) for end in (low, high) if end is not None]
-    if len(halves) < 2 or min(halves) == 0.0 or not FIXED[0] <= max(abs(value), *halves) < FIXED[1]:
-        shown = figures(value, figures_of(ci95, 5))
-        down, up = (figures(half, 2) for half in halves) if len(halves) == 2 else ("", "")
-    else:
-        places = max(0, 1 - int(f"{min(halves):.1e}".split("e")[1]))  # of the half as rounded
-        shown, down, up = (f"{v:.{places}f}" for v in (value, *halves))
-    if not up:
-        return shown
-    return f"{shown} ± {up}" if down == up else f"{shown} +{up} -{down}"
+def _with_interval(value: float, interval: Sequence[float | None] | None) -> str:
+    ends = interval_text(interval)
+    return estimate_texts(value, interval)[0] + (f" ({ends})" if ends else "")
+
+
+def _both(values: Sequence[float | None]) -> str:
+    """Return one number where both are the same, else both; empty where there is none."""
+    first, second = ("–" if v is None else figures(v) for v in values)
+    return "" if first == second == "–" else first if first == second else f"{first} / {second}"
 
 
 def finding_lines(findings: Sequence[Sequence[Mapping[str, Any]] | None]) -> list[str]:
@@ -232,10 +251,6 @@ def finding_lines(findings: Sequence[Sequence[Mapping[str, Any]] | None]) -> lis
     return lines
 
 
-def _heading(run: Mapping[str, Any]) -> str:
-    return f"study {run['study']} in {run['folder']}, model {run['model']}, {run['software']}, seed {run['seed']}"
-
-
 def _sources(first: dict[str, str], second: dict[str, str]) -> dict[str, list[str]]:
     """The names of files that both read and that differ, and of those that one alone read."""
     return {
@@ -245,106 +260,87 @@ def _sources(first: dict[str, str], second: dict[str, str]) -> dict[str, list[st
     }
 
 
-def _set_of(results: Results) -> dict[str, str]:
+def _set_of(s: RunSummary) -> dict[str, str]:
     """Return which of the fitted values count: "fit" or "effect", "" where there are none, and the same in words."""
-    counts = values_that_count(results.get("fit"), results.get("discrepancy"))
-    if counts.name == "effect":
-        words = f"fitted with {counts.added}, as the diagnosis named it"
-    elif counts.name == "fit":
-        words = f"fitted without an effect{f'; {counts.doubt}' if counts.doubt else ''}"
-    else:
-        words = "not fitted"
-    return {"name": counts.name, "text": words}
+    words = "not fitted"
+    if s.counting.name == "effect":
+        words = f"fitted with {s.counting.added}, as the diagnosis named it"
+    elif s.counting.name == "fit":
+        words = f"fitted without an effect{f'; {s.counting.doubt}' if s.counting.doubt else ''}"
+    return {"name": s.counting.name, "text": words}
 
 
-def _values(first: Results, second: Results) -> list[dict[str, Any]]:
-    """Return every candidate of either fit with both values that count, their intervals and their distance."""
-    fits = [first.get("fit"), second.get("fit")]
-    counted = [estimates_that_count(r.get("fit"), r.get("discrepancy")) for r in (first, second)]
-    candidates = [f.get("candidates") or {} for f in fits]
-    after = [_with_effect(r.get("discrepancy")) for r in (first, second)]
+def _values(both: Sequence[RunSummary]) -> list[dict[str, Any]]:
+    """Return every candidate of either result with both values that count, their intervals and their distance."""
+    tables = [{p.name: p for p in s.parameters} for s in both]
     rows = []
-    for name in dict.fromkeys([*candidates[0], *candidates[1]]):
-        both = [estimates.get(name) or {} for estimates in counted]
-        values = [e.get("value") for e in both]
-        known = all(v is not None for v in values)
-        lines = [c.get(name) or {} for c in candidates]
+    for name in dict.fromkeys([*tables[0], *tables[1]]):
+        pair = [t.get(name) for t in tables]
+        known = [p for p in pair if p is not None]
+        values = [None if p is None else p.value for p in pair]
+        intervals = [None if p is None else p.interval for p in pair]
+        apart = None
+        if values[0] is not None and values[1] is not None:
+            apart = distance(*({"value": v, "ci95": ci} for v, ci in zip(values, intervals, strict=True)))
         rows.append(
             {
                 "parameter": name,
-                "unit": next((c["unit"] for c in lines if c.get("unit")), ""),
-                "given": [c.get("given") for c in lines],
+                "unit": next((p.unit for p in known if p.unit), ""),
+                "given": [None if p is None else p.given for p in pair],
                 "values": values,
-                "ci95": [e.get("ci95") for e in both],
-                "held": [_held(f, name) if not e else "" for f, e in zip(fits, both, strict=True)],
-                "change_percent": 100.0 * (values[1] / values[0] - 1.0) if known and values[0] else None,
-                "apart": distance(both[0], both[1]) if known else None,
-                "without_effect": [
-                    ((f.get("estimates") or {}).get(name) or {}).get("value") if a.get(name) is not None else None
-                    for f, a in zip(fits, after, strict=True)
-                ],
-                "with_effect": [a.get(name) for a in after],
+                "ci95": plain(intervals),
+                "depends": any(p.by_place for p in known),
+                "held": [_held(s, p) for s, p in zip(both, pair, strict=True)],
+                "change_percent": 100.0 * (values[1] / values[0] - 1.0)
+                if values[0] and values[1] is not None
+                else None,
+                "apart": apart,
+                "without_effect": [None if p is None or p.effect is None else p.fitted for p in pair],
+                "with_effect": [None if p is None else p.effect for p in pair],
             }
         )
     return rows
 
 
-def _with_effect(diagnosis: Mapping[str, Any]) -> dict[str, float]:
-    """The values with the effects of a diagnosis; none that depends on which of the likely effects and places is the true one."""
-    depend = diagnosis.get("values_by_place") or {}
-    return {n: v for n, v in (diagnosis.get("parameters_after") or {}).items() if n not in depend}
+def _held(s: RunSummary, p: ParameterSummary | None) -> str:
+    """Return why a parameter has no value that counts; empty where it has one."""
+    if p is None:
+        return "no candidate"
+    if p.value is not None:
+        return ""
+    return f"it is {by_place(p)}" if p.by_place else note_text(p) or ("not fitted" if s.fit else "no fit")
 
 
-def _held(fit: Mapping[str, Any], name: str) -> str:
-    if name not in (fit.get("candidates") or {}):
-        return "no candidate" if fit else "no fit"
-    return f"held, {str((fit.get('held') or {}).get(name, 'not fitted')).split(':')[0]}"
-
-
-def _gaps(first: Results, second: Results) -> list[dict[str, Any]]:
+def _gaps(both: Sequence[RunSummary]) -> list[dict[str, Any]]:
     """Return by output the RMSE of both, each recording that both have counting alike, at each set of values."""
-    tables = {kind: [_rmse(r, kind) for r in (first, second)] for kind in GAPS}
-    units = {**second.units, **first.units}
     rows = []
-    for kind, (a, b) in tables.items():
-        for output in (o for o in a if o in b):
-            names = [n for n, v in a[output].items() if v is not None and b[output].get(n) is not None]
-            if names:
-                both = [math.sqrt(sum(t[output][n] ** 2 for n in names) / len(names)) for t in (a, b)]
-                by = {n: [a[output][n], b[output][n]] for n in names}
-                ratio = both[1] / both[0] if both[0] else None
-                about = {"recordings": len(names), "by_recording": by}
-                rows.append(
-                    {"at": kind, "output": output, "unit": units.get(output, ""), "rmse": both, "ratio": ratio, **about}
-                )
+    units = {x.output: x.unit for s in reversed(both) for x in s.signals}
+    for kind in GAPS:
+        first, second = (
+            {(x.output, x.experiment): x.errors[kind].rmse for x in s.signals if kind in x.errors} for s in both
+        )
+        for output in dict.fromkeys(o for o, _ in first):
+            by = {e: [rmse, second[o, e]] for (o, e), rmse in first.items() if o == output and (o, e) in second}
+            if not by:
+                continue
+            rmse = [math.sqrt(sum(pair[k] ** 2 for pair in by.values()) / len(by)) for k in (0, 1)]
+            about = {"at": kind, "output": output, "unit": units.get(output, ""), "rmse": rmse}
+            ratio = rmse[1] / rmse[0] if rmse[0] else None
+            rows.append({**about, "ratio": ratio, "recordings": len(by), "by_recording": by})
     return rows
 
 
-def _rmse(results: Results, kind: str) -> Mapping[str, Mapping[str, Any]]:
-    """The RMSE by output and recording with one set of values; empty where that has not been computed."""
-    table: dict[str, dict[str, float]] = {}
-    for (output, experiment), about in Answers(results).signals("effect" if kind == "augmented" else kind).items():
-        table.setdefault(output, {})[experiment] = about["rmse"]
-    return table
+def _verdicts(results: Sequence[Results]) -> dict[str, list[str]]:
+    """Return the verdict on the model, then of each stage in one phrase; empty where it has not run."""
+    found = {"model": [verdict_sentence(r.summary) if r.summary.sets else "" for r in results]}
+    found |= {s.name: [_verdict(s, r) for r in results] for s in stages()}
+    return {name: both for name, both in found.items() if any(both)}
 
 
 def _verdict(stage: Stage, results: Results) -> str:
-    """The verdict of a stage in one phrase; empty where it has not run."""
     data = results.get(Path(stage.file).stem)
     if not data:
         return ""
     if not data.get("fingerprint"):
         return f"not finished: {data.get('message') or data.get('status') or 'no reason is kept'}"
     return stage.verdict(data)
-
-
-def _findings(results: Results) -> list[dict[str, Any]] | None:
-    """The findings of the diagnosis; None where none has run."""
-    data = results.get("discrepancy")
-    if "verdict" not in data:
-        return None
-    keys = ("effect", "probability", "parameters", "text")
-    return [
-        {**{k: f.get(k) for k in keys}, "places": [p["at"] for p in f.get("places") or []]}
-        for f in data.get("findings") or []
-    ]

@@ -8,16 +8,12 @@ open-loop transfers, at the frequency where the fitted model's has the gain 1, o
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from hvdc_ident.display import Table, rounded
 from hvdc_ident.linearize import loop, margins
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.study.run_summary import conditions, values_table
-from hvdc_ident.text import listed, percentage, quantity
 
 FILE = "truth.json"
 """Name of the file in the folder of results; the report reads it there."""
@@ -54,43 +50,3 @@ def equivalent_delay(plant: Model, model: Model, order: str) -> dict[str, Any] |
         return None
     late, prompt = (one.response(np.array([omega])).values.item() for one in (loop(plant, order), opened))
     return {"order": order, "seconds": float(-np.angle(late / prompt) / omega), "at_hz": omega / math.tau}
-
-
-def truth_table(truth: Mapping[str, Any], fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> Table:
-    """Return the candidates with their given values, those that were found, and the true ones."""
-    found = values_table(fit, diagnosis)
-    true = {n: rounded(p["value"], 6) for n, p in truth["parameters"].items()}
-    return Table((*found.header, "true"), tuple((*row, true.get(row[0])) for row in found.rows))
-
-
-def found_effect(diagnosis: Mapping[str, Any]) -> str:
-    """Return what was found missing, as a delay where it is one; "nothing" where nothing was."""
-    findings = diagnosis.get("findings") or []
-    said = []
-    for f in findings:
-        delay = f.get("equivalent_delay") or {}
-        size = f" that acts as a delay of {quantity(delay['value'], 's')}" if delay.get("value") else ""
-        said.append(f"{f['effect']}{size} ({percentage(f['probability'])})")
-    return "; ".join(said) or "nothing"
-
-
-def true_effect(truth: Mapping[str, Any]) -> str:
-    """Return what is missing in truth: the parts with further states, and the delay that they amount to in each loop."""
-    if not truth["lacking"]:
-        return "nothing"
-    by = [f"{d['order']} by {quantity(d['seconds'], 's')} (at {d['at_hz']:.3g} Hz)" for d in truth["delays"]]
-    late = f", which delay the loop of {listed(by)}" if by else ""
-    return f"{truth['plant']} has further states in its {listed(truth['lacking'])}{late}"
-
-
-def truth_lines(truth: Mapping[str, Any], fit: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[str]:
-    """Return the screen: the truth beside what was found."""
-    return [
-        f"The recordings were made by {truth['plant']}, so that the truth is known:",
-        "",
-        *str(truth_table(truth, fit, diagnosis)).splitlines(),
-        *conditions(fit, diagnosis),
-        "",
-        f"missing, found: {found_effect(diagnosis)}",
-        f"missing, true: {true_effect(truth)}",
-    ]

@@ -12,12 +12,12 @@ from xml.sax.saxutils import quoteattr
 from hvdc_ident.errors import ComputationError, LinearizationError, StudyError
 from hvdc_ident.model import Model, read_card
 from hvdc_ident.report.letter import STAGE, Letterhead, write_letter
-from hvdc_ident.report.results import Results
 from hvdc_ident.study.pipeline import Done, have_stage
 from hvdc_ident.study.schema import LetterTable
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.value_sets import ValueSet, value_set
+from hvdc_ident.summary import Results
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel

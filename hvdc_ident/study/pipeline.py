@@ -21,6 +21,8 @@ from hvdc_ident.study.quiescent_levels import quiescent_levels
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult, stage, stages
 from hvdc_ident.study.store import CachingExecutor, Store, exclusive, source_hash
 from hvdc_ident.study.study import Study
+from hvdc_ident.summary import Results, RunSummary, summarise
+from hvdc_ident.summary.summarise import SUMMARISED
 
 if TYPE_CHECKING:
     from hvdc_ident.study.executors.dask import DaskPool
@@ -58,13 +60,17 @@ def run_stage(study: Study, name: str, folder: Path, options: StageOptions) -> D
         rest = _rest_of(study, options)
         for before in wanted.after:
             earlier[before] = _kept_or_run(study, stage(before), folder, options, rest).data
-        return _run(study, wanted, folder, options, earlier, rest)
+        done = _run(study, wanted, folder, options, earlier, rest)
+        write_summary(folder, heading_of(study, options.seed))
+        return done
 
 
 def have_stage(study: Study, name: str, folder: Path, options: StageOptions) -> Done:
     """The stage's result, run only where the folder does not hold it for the same study, software and seed."""
     with exclusive(folder):
-        return _kept_or_run(study, stage(name), folder, options, _rest_of(study, options))
+        done = _kept_or_run(study, stage(name), folder, options, _rest_of(study, options))
+        write_summary(folder, heading_of(study, options.seed))
+        return done
 
 
 def run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
@@ -101,7 +107,9 @@ def run_study(study: Study, folder: Path, options: StageOptions) -> list[Done]:
     from hvdc_ident.report.page import write_report  # the templates are of use to a whole run alone
 
     done = run_all(study, folder, options)
-    write_run(folder, heading_of(study, options.seed), done)
+    heading = heading_of(study, options.seed)
+    write_run(folder, heading, done)
+    write_summary(folder, heading)
     options.progress(0, 1, "report: writing the page")
     write_report(folder)
     return done
@@ -116,6 +124,14 @@ def write_run(folder: Path, heading: Mapping[str, Any], done: Sequence[Done]) ->
     """Write `run.json`, which says what a run did: the heading, and each stage with its outcome."""
     rows = {d.stage.name: {"file": d.stage.file, "failed": d.failed} for d in done}
     write_text(folder / "run.json", json_text({**heading, "stages": rows}))
+
+
+def write_summary(folder: Path, heading: Mapping[str, Any]) -> RunSummary:
+    """Return the summary of the results in a folder, written there as `summary.json`. heading: of the run."""
+    stages = {name: data for name in SUMMARISED if (data := _read(folder / f"{name}.json"))}
+    summary = summarise(stages, Results(folder).swing, heading)
+    write_text(folder / "summary.json", json_text(summary.to_dict()))
+    return summary
 
 
 Rest = Callable[[], list[dict[str, Any]]]

@@ -11,8 +11,8 @@ from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.files import csv_text
 from hvdc_ident.model import Model
 from hvdc_ident.model.card import toml_key
-from hvdc_ident.report.values_that_count import estimates_that_count, values_that_count
 from hvdc_ident.study.augmented import augmented_model, use_of
+from hvdc_ident.summary.summarise import counting_of, estimates_that_count
 
 if TYPE_CHECKING:
     from hvdc_ident.model import AnyModel
@@ -26,7 +26,7 @@ def after_fit(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, 
     from hvdc_ident.study.pipeline import standing
 
     diagnosis, why = standing(study, "diagnose", folder)
-    if why or not data["fingerprint"] or values_that_count(data, diagnosis).name != "effect":
+    if why or not data["fingerprint"] or counting_of(data, diagnosis).name != "effect":
         return {}
     return value_files(study, data, diagnosis, folder)
 
@@ -49,7 +49,7 @@ def value_files(
     from hvdc_ident.study.export import ssv
 
     found = diagnosis or {}
-    counts, estimates = values_that_count(fit, found), estimates_that_count(fit, found)
+    counts, estimates = counting_of(fit, found), estimates_that_count(fit, found)
     model, uses = study.model, []
     values = {n: float(fit["values"][n]) for n in study.candidates if n in fit["values"]}
     if counts.name == "effect":

@@ -15,9 +15,10 @@ from typing import Any, Literal, get_args
 from hvdc_ident.errors import StudyError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
-from hvdc_ident.report.values_that_count import NO_ESTIMATES, ValuesThatCount, values_that_count
 from hvdc_ident.study.augmented import augmented_model
 from hvdc_ident.study.study import Study
+from hvdc_ident.summary.run_summary import Counting
+from hvdc_ident.summary.summarise import NO_ESTIMATES, counting_of
 from hvdc_ident.text import figures, listed, percentage
 
 SetName = Literal["given", "start", "fitted", "effect", "fit"]
@@ -131,9 +132,9 @@ class _Results:
         return cls(study, folder, {} if no_fit else fit, no_fit, {} if why else diagnosis, stale)
 
     @property
-    def counts(self) -> ValuesThatCount:
+    def counts(self) -> Counting:
         """Which values count."""
-        return values_that_count(self.fit, self.diagnosis)
+        return counting_of(self.fit, self.diagnosis)
 
     @property
     def no_effect(self) -> str:

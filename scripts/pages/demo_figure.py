@@ -17,6 +17,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import hvdc_ident as hi
+from hvdc_ident.colours import EFFECT, FITTED, GIVEN, RECORDED
 from pages.svg import HEIGHT, WIDTH, Curve, drawing
 
 EXPERIMENT, OUTPUT = "vdc-03-step", "Irorder1"
@@ -24,8 +25,8 @@ WINDOW = (0.08, 0.3)  # s: the step and its recovery
 TARGET = Path(__file__).resolve().parents[2] / "docs" / "images"
 STYLE = (
     "<style>text{font:12px sans-serif;fill:#444}.frame{fill:none;stroke:#bbb}.grid{stroke:#eee}"
-    ".curve{fill:none;stroke-width:2}.recorded{stroke:#222}.given{stroke:#999;stroke-dasharray:6 3}.fitted{stroke:#c2571a}"
-    ".effect{stroke:#2f6fdb}</style>"
+    f".curve{{fill:none;stroke-width:2}}.recorded{{stroke:{RECORDED}}}.given{{stroke:{GIVEN};stroke-dasharray:6 3}}"
+    f".fitted{{stroke:{FITTED}}}.effect{{stroke:{EFFECT}}}</style>"
 )
 
 

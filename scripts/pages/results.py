@@ -22,6 +22,7 @@ TITLES = {
     "fit": "`fit`: the estimates",
     "discrepancy": "`diagnose`: what the model lacks",
     "run": "`run`: which stages ran",
+    "summary": "`run` and every stage: what the results say, decided once; report, letter, screens and workbench show it",
 }
 
 

@@ -174,7 +174,7 @@ def test_the_commands(study) -> None:
     assert json.loads(result.stdout)["forced"] == ["flat"]
     result = call("report", study)
     page = (folder / "report.html").read_text()
-    assert "What the recordings determine" in page and "What to measure next" in page
+    assert "What the recordings determine" in page and "What to record next" in page
     study.write_text(study.read_text().replace("[fit]", '[identifiability]\npair = ["k", "flat"]\n[fit]'))
     assert call("identify", study, "--quiet").exit_code == 0
     notes = json.loads((folder / "identifiability.json").read_text())["notes"]

@@ -15,10 +15,11 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.report.drawing import visible
-from hvdc_ident.report.html import number, share
+from hvdc_ident.report.html import number, typeset
 from hvdc_ident.report.page import page, write_report
-from hvdc_ident.report.results import Results
 from hvdc_ident.report.sections.discrepancy import SECTION
+from hvdc_ident.summary import Results
+from hvdc_ident.text import change_text
 from tests.report.judgements import judgement
 from tests.report.test_letter import diagnosis, folder_with
 
@@ -119,7 +120,7 @@ def test_the_page_is_whole_and_needs_no_network(tmp_path: Path) -> None:
         "Waveforms",
         "Provenance",
         "its bound is open",
-        "1.80 … 2.20",
+        "1.80 to 2.20",
         "−90.0 %",
     ):
         assert words in text
@@ -204,8 +205,8 @@ def test_numbers(value: object, shown: str) -> None:
 
 
 def test_shares() -> None:
-    assert share(2.0, 1.0) == "+100.0 %"
-    assert share(2.0, 0.0) == share(None, 1.0) == "–"
+    assert change_text(2.0, 1.0) == "+100.0 %" and typeset(change_text(0.5, 1.0)) == "−50.0 %"
+    assert change_text(2.0, 0.0) == change_text(None, 1.0) == ""
 
 
 def test_a_curve_that_has_no_name_is_drawn_with_its_band(tmp_path: Path) -> None:

@@ -12,14 +12,15 @@ import numpy as np
 import pytest
 
 from hvdc_ident.fit.judgement import Count
-from hvdc_ident.report.answers import Answers, beyond_noise
 from hvdc_ident.report.first_screen import first_screen
 from hvdc_ident.report.html import estimate, number
 from hvdc_ident.report.letter import letter_of, write_letter
 from hvdc_ident.report.page import page
-from hvdc_ident.report.results import Results
 from hvdc_ident.report.sections.output_errors import SECTION as ERRORS
-from hvdc_ident.study.run_summary import run_lines, values_table
+from hvdc_ident.summary import Results, summarise
+from hvdc_ident.summary.screen import lines_of
+from hvdc_ident.summary.summarise import beyond_noise
+from hvdc_ident.summary.tables import values_table
 from hvdc_ident.text import figures, interval_text, span, times_text
 from tests.report.judgements import judgement
 from tests.report.test_first_screen import tile, words
@@ -124,7 +125,7 @@ def told(results: Results) -> str:
 
 def test_a_signal_without_limits_has_not_passed_the_windows(tmp_path: Path) -> None:
     results = hydro(tmp_path, discrepancy=lagging())
-    given = Answers(results).errors[0]
+    given = results.summary.sets["given"]
     assert given.in_limits == Count(passed=1, failed=0, not_judged=1)
     verdict = tile(first_screen(results), "verdict")
     assert "PASS 1, not judged 1" in verdict and f"1 signal not judged: Ut ({IN_KV})" in verdict
@@ -141,7 +142,7 @@ def test_a_signal_without_limits_has_not_passed_the_windows(tmp_path: Path) -> N
 
 def test_a_named_profile_that_judges_only_some_signals_gives_no_pass(tmp_path: Path) -> None:
     results = hydro(tmp_path, simulation={"judgement": judged(named=True)})
-    assert Answers(results).follows is None
+    assert results.summary.verdict == "not judged"
     verdict = tile(first_screen(results), "verdict")
     assert f"keeps the tolerance in the 1 signal that is judged; 1 signal not judged: Ut ({IN_KV})" in verdict
     assert not verdict.split("?")[1].strip().startswith("PASS")
@@ -157,7 +158,7 @@ def test_a_signal_of_unknown_noise_is_not_followed_to_it(tmp_path: Path) -> None
     known = {"jump": {"gate": {"std": 0.001, "source": "given"}, "Ut": {"std": 0.0, "source": "residual"}}}
     unknown = judged(noise={"gate": 0.001, "Ut": None})
     results = hydro(tmp_path, simulation={"noise": known, "judgement": unknown}, discrepancy=lagging(gap={}))
-    assert Answers(results).follows is None
+    assert results.summary.verdict == "not judged"
     assert "follows the 1 signal that is judged to the noise; 1 signal not judged: state the noise of Ut" in tile(
         first_screen(results), "verdict"
     )
@@ -170,7 +171,7 @@ def test_the_letter_judges_each_value_by_the_interval_that_counts(tmp_path: Path
     """Tg is moved most without the effect and right with it; Kd is wrong with it, and is the one to be told."""
     letter = told(hydro(tmp_path, discrepancy=lagging()))
     assert (
-        "With the effect, the recordings ask for other values than you gave: Kd = 2.4 (95 %: 2.39 to 2.41) in place of 1.5 (+60.0 %)."
+        "With the effect, the recordings ask for other values than you gave: Kd = 2.400 (95 %: 2.390 to 2.410) in place of 1.5 (+60.0 %)."
         in letter
     )
     assert "Your value of Tg lies within its 95 % interval." in letter
@@ -178,7 +179,7 @@ def test_the_letter_judges_each_value_by_the_interval_that_counts(tmp_path: Path
         "A fit without the effect moves Tg by +150.0 % to make up for it; with the effect the same fit moves it by +0.5 %."
         in letter
     )
-    assert "and the value Kd = 2.4 in place of 1.5." in letter
+    assert "and the value Kd = 2.400 in place of 1.5." in letter
     assert "not to blame" not in letter and "gain" not in letter
 
 
@@ -188,7 +189,7 @@ def test_without_an_effect_the_values_of_the_fit_are_judged(tmp_path: Path) -> N
     fit = {"status": "converged", "fitted": ["Tg", "Kd"], "values": {"Tg": 0.2, "Kd": 2.4}, "held": {}}
     fit["estimates"] = {"Tg": {"value": 0.2, "ci95": [0.19, 0.21]}, "Kd": {"value": 2.4, "ci95": [2.3, 2.5]}}
     letter = told(hydro(tmp_path, fit=fit, discrepancy=nothing))
-    assert "other values than you gave: Kd = 2.4 (95 %: 2.3 to 2.5) in place of 1.5 (+60.0 %)." in letter
+    assert "other values than you gave: Kd = 2.40 (95 %: 2.30 to 2.50) in place of 1.5 (+60.0 %)." in letter
     assert "Your value of Tg lies within its 95 % interval." in letter
     assert "nothing is missing" in letter and "p = " not in letter and "score" not in letter
 
@@ -239,11 +240,10 @@ def test_intervals_of_a_model_that_leaves_more_than_noise_claim_no_chance(tmp_pa
     assert "With the effect: They hold only if nothing else is missing" in whole  # beside the truth
     letter = words(write_letter(tmp_path).read_text("utf-8"))
     assert "95 %" not in letter and "The values hold only if nothing else is missing" in letter
-    assert "Kd = 2.4 in place of 1.5 (+60.0 %)" in letter and "That holds only if nothing else is missing." in letter
-    table = values_table(results.get("fit"), results.get("discrepancy"))
-    assert "interval if nothing else is missing" in table.header and "95 % interval" not in table.header
-    sure = values_table({**fit, "adequacy": {"verdict": "fits"}}, {})
-    assert "95 % interval" in sure.header
+    assert "Kd = 2.400 in place of 1.5 (+60.0 %)" in letter and "That holds only if nothing else is missing." in letter
+    assert "interval if nothing else is missing, with the effect" in values_table(results.summary).header
+    sure = summarise({"fit": {**fit, "adequacy": {"verdict": "fits"}}})
+    assert "95 % interval" in values_table(sure).header
 
 
 @pytest.mark.parametrize(
@@ -275,7 +275,7 @@ def test_a_value_on_its_bound_says_so(tmp_path: Path) -> None:
     held = {**lagging(), "verdict": "no-evidence", "effects": [], "findings": [], "augmented_model": None}
     results = hydro(tmp_path, fit=fit, discrepancy=held)
     row = re.search(r"<td>Tg</td>(.*?)</tr>", write_letter(tmp_path).read_text("utf-8"))
-    assert row is not None and "0.010 … 0.040; at its bound" in words(row[1])
+    assert row is not None and "0.010 to 0.040 at its bound" in words(row[1])
     assert "at its bound" in tile(first_screen(results), "values")
     also = hydro(tmp_path, fit={**fit, "fitted": [], "held": {"Kd": "insensitive: no output moves", "Tg": "at-bound"}})
     row = re.search(r"<td>Kd</td>(.*?)</tr>", write_letter(tmp_path).read_text("utf-8"))
@@ -319,7 +319,7 @@ def test_the_ends_of_an_interval_never_look_the_same(low: float, high: float, un
     first, last = interval_text((low, high)).split(" to ")
     assert float(first) < float(last) and float(first) == pytest.approx(low) and float(last) == pytest.approx(high)
     _, shown = estimate(0.5 * (low + high), (low, high))
-    first, last = (float(e.replace("−", "-")) for e in shown.split(" … "))
+    first, last = (float(e.replace("−", "-")) for e in shown.split(" to "))
     assert first < last and first == pytest.approx(low, abs=0.1 * (high - low))
 
 
@@ -330,18 +330,8 @@ def test_a_hundred_and_fifty_has_no_exponent() -> None:
     assert number(1486.2, 3) == "1486" and number(2.5e6, 2) == "2.5·10<sup>6</sup>"
 
 
-def test_the_screen_of_a_run_says_what_its_values_rest_on() -> None:
-    from types import SimpleNamespace
-
-    fit = {"candidates": {"Kd": {"given": 1.5, "unit": ""}}, "held": {}}
-    fit["estimates"] = {"Kd": {"value": 1.9, "ci95": [1.8, 2.0]}}
-
-    def screen(diagnosis: Mapping[str, Any]) -> str:
-        done = [
-            SimpleNamespace(stage=SimpleNamespace(name=n, verdict=lambda data: ""), data=d, failed="", fresh=True)
-            for n, d in (("fit", fit), ("diagnose", diagnosis))
-        ]
-        return "\n".join(run_lines(done))  # type: ignore[arg-type]
-
+def test_the_screen_of_a_run_says_what_its_values_rest_on(tmp_path: Path) -> None:
     condition = "The values with the effect hold only if nothing else is missing: what remains is more than the noise."
-    assert condition in screen(lagging(**MORE)) and condition not in screen(lagging())
+    for found, holds in ((lagging(**MORE), True), (lagging(), False)):
+        summary = hydro(tmp_path, discrepancy=found).summary
+        assert (condition in lines_of(summary)) is holds

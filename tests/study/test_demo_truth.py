@@ -10,7 +10,9 @@ from typing import Any
 import pytest
 
 from hvdc_ident import Model, apply_effects, load_model
-from hvdc_ident.study.demo_truth import equivalent_delay, found_effect, truth_lines, truth_of
+from hvdc_ident.study.demo_truth import equivalent_delay, truth_of
+from hvdc_ident.summary import summarise
+from hvdc_ident.summary.truth import found_effect, truth_lines
 
 LOOP = Model(
     "loop",
@@ -58,21 +60,28 @@ def test_the_screen_and_the_page_have_the_truth_beside_what_was_found(tmp_path: 
         "candidates": {"KIP": {"given": 28.0, "unit": "pu/s"}},
         "estimates": {"KIP": {"value": 31.25, "ci95": [31.0, 31.5]}},
         "held": {},
+        "status": "converged",
+        "fitted": ["KIP"],
+        "values": {"KIP": 31.25},
     }
     finding = {"effect": "lag", "probability": 0.98, "equivalent_delay": {"value": 1.4e-3, "ci95": [1.3e-3, 1.5e-3]}}
-    diagnosis = {"parameters_after": {"KIP": 29.875}, "augmented_model": "a.toml", "findings": [finding]}
-    lines = truth_lines(truth, fit, diagnosis)
+    lag = {"effect": "lag", "at": ["P2_m"], "text": "P2_m lags"}
+    diagnosis = {"verdict": "named", "effects": [lag], "parameters_after": {"KIP": 29.875}, "augmented_model": "a.toml"}
+    diagnosis["findings"] = [finding]
+    summary = summarise({"fit": fit, "discrepancy": diagnosis})
+    lines = truth_lines(truth, summary)
     assert lines[2].split()[-1] == "true"
-    assert lines[3].split() == ["KIP", "pu/s", "28", "31.25", "31", "to", "31.5", "29.875", "30"]
-    assert found_effect(diagnosis) == "lag that acts as a delay of 1.4 ms (98 %)" and found_effect({}) == "nothing"
+    assert lines[3].split() == ["KIP", "pu/s", "28", "31.25", "29.88", "30"]
+    assert found_effect(summary) == "lag that acts as a delay of 1.4 ms (98 %)"
+    assert found_effect(summarise({"fit": fit})) == "nothing"
     assert lines[-1].startswith("missing, true: vsc-hvdc-avm has further states in its dc link, current control, PLL, ")
     assert f"delay the loop of Irorder2 by {1e3 * truth['delays'][0]['seconds']:.4g} ms (at 4.77 Hz)" in lines[-1]
     heading = {"schema": 1, "study": "demo", "model": "vsc-hvdc-link", "software": "hvdc_ident"}
     for name, data in (("truth", truth), ("fit", fit), ("discrepancy", diagnosis)):
         (tmp_path / f"{name}.json").write_text(json.dumps({**heading, **data}))
-    from hvdc_ident.report.results import Results
     from hvdc_ident.report.sections.truth import SECTION
+    from hvdc_ident.summary import Results
 
     body = SECTION.render(Results(tmp_path))
     assert '<td class="n">28</td><td class="n">31.25</td><td class="n">29.88</td><td class="n">30</td>' in body
-    assert "found: lag" in body and "1.30 … 1.50" in body and "in the loop of Irorder2" in body
+    assert "found: lag that acts as a delay of 1.4 ms" in body and "delay the loop of Irorder2" in body

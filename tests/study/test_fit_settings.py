@@ -10,12 +10,12 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit.tolerance_profile import WINDOWS
-from hvdc_ident.report.results import Results
 from hvdc_ident.report.sections import gains, output_errors, residuals
 from hvdc_ident.study import fitting
 from hvdc_ident.study.examples import write_starter
 from hvdc_ident.study.stages import StageOptions, stage
 from hvdc_ident.study.study import load_study
+from hvdc_ident.summary import Results
 
 GAIN = "KIVDC = {start = 650, min = 550, max = 950}"
 OUTPUT = 'outputs = ["Irorder1"]'

@@ -13,12 +13,12 @@ from hvdc_ident.data import noise_estimate
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.fit import FitResult, Problem, fit
 from hvdc_ident.report.page import write_report
-from hvdc_ident.report.results import Results
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.pipeline import run_stage
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.summary import Summary
+from hvdc_ident.summary import Results
 
 CARD = """schema = 1
 name = "motor"

@@ -8,8 +8,8 @@ import io
 import numpy as np
 
 from hvdc_ident.files import csv_text
-from hvdc_ident.report.results import Results
 from hvdc_ident.study.value_files import values_csv
+from hvdc_ident.summary import Results
 
 
 def test_no_cell_of_the_fitted_values_is_a_formula():

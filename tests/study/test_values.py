@@ -26,9 +26,9 @@ from hvdc_ident import export, load_study
 from hvdc_ident.cli import app
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.report.letter import letter_of
-from hvdc_ident.report.results import Results
 from hvdc_ident.study.export import SSV
 from hvdc_ident.study.value_sets import value_set
+from hvdc_ident.summary import Results
 
 GIVEN = {"K": 11.0, "T": 0.05, "g": 1.0}
 START = {"K": 30.0, "T": 0.02, "g": 2.0}
@@ -178,7 +178,7 @@ def test_the_command_that_is_offered_next_works_where_it_is_pasted(
         result = run(command, path.relative_to(tmp_path), "--out", "other results")
         assert result.exit_code == 0
         line = next(n for n in result.output.splitlines() if "hvdc-ident diagnose" in n)
-        typed = shlex.split(line[line.index("hvdc-ident diagnose") :])
+        typed = shlex.split(line[line.index("hvdc-ident diagnose") :].partition("`")[0])
         assert typed[1:3] == ["diagnose", "my studies/s.toml"] and typed[3:5] == ["--out", "other results"]
         assert load_study(typed[2]).path.resolve() == path.resolve()
     for file in ("fit", "identifiability"):
@@ -250,7 +250,7 @@ def test_given_values_that_cannot_rest_do_not_keep_a_fit_from_running(tmp_path: 
     )
     result = run("simulate", path)
     assert result.exit_code == 1 and "at the given values" in result.output
-    assert "q = " in done("fit", path)
+    assert re.search(r"^q +-1 ", done("fit", path), flags=re.MULTILINE)
 
 
 # What every stage does with it.
@@ -278,7 +278,7 @@ def test_candidates_carry_all_of_it(study: Path, results: dict[str, Any]) -> Non
     for stage in ("fit", "identifiability"):
         found = results[stage]["candidates"]["K"]
         assert {k: found[k] for k in want} == want
-    assert re.search(r"^K = 1[12]\.\d+ 1/s \(given 11\)", done("fit", study), flags=re.MULTILINE)
+    assert re.search(r"^K +1/s +11 +1[12]\.\d+ ", done("fit", study), flags=re.MULTILINE)
 
 
 def test_the_diagnosis_compares_with_the_given_values(results: dict[str, Any]) -> None:
@@ -297,7 +297,7 @@ def test_letter_and_report_speak_of_the_given_values(study: Path, fitted: dict[s
     page = (study.parent / "s-results/report.html").read_text()
     assert "start values" not in page and "given values" in page
     for heading in ("<h2>The values</h2>", "<h2>Parameters</h2>"):
-        row = re.search(r"<tr><td><strong>K</strong>(?:, 1/s)?</td>(.*?)</tr>", page.split(heading)[1])
+        row = re.search(r"<tr><td>(?:<strong>)?K(?:</strong>)?(?:, 1/s)?</td>(.*?)</tr>", page.split(heading)[1])
         assert row is not None
         cells = re.findall(r"<td[^>]*>(.*?)</td>", row[1])
         assert cells[0] == "11" and cells[3] == f"{change:+.1f} %"

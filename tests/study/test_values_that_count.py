@@ -25,11 +25,10 @@ from typer.testing import CliRunner
 import hvdc_ident as hi
 from hvdc_ident.cli import app
 from hvdc_ident.errors import StudyError
-from hvdc_ident.report.answers import Answers
-from hvdc_ident.report.results import Results
-from hvdc_ident.report.values_that_count import values_that_count
 from hvdc_ident.study.export import SSV
 from hvdc_ident.study.value_sets import value_set
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.summarise import counting_of
 
 K, T, LAG = 12.0, 0.05, 0.03
 TIME = np.arange(0.0, 1.2, 0.008)
@@ -247,10 +246,10 @@ def test_an_ambiguous_diagnosis_decides_nothing(study: Path, tmp_path: Path, res
         assert "--values effect takes those with lag at" in found.note
     asked = value_set(loaded, "effect", folder)
     assert asked.of == "effect" and "not certain: the diagnosis is ambiguous" in asked.note
-    answers = Answers(Results(folder))
-    assert {v.name: v.value for v in answers.values} == fit
+    summary = Results(folder).summary
+    assert {p.name: p.value for p in summary.parameters} == fit
     # Without the effect the model does not fit.
-    assert next(v.interval for v in answers.values if v.name == "K") is None
+    assert next(p.interval for p in summary.parameters if p.name == "K") is None
     assert results["fit"]["estimates"]["K"]["ci95"] is None
     done("report", folder, "--quiet")
     page = (folder / "report.html").read_text()
@@ -260,8 +259,8 @@ def test_an_ambiguous_diagnosis_decides_nothing(study: Path, tmp_path: Path, res
 def test_the_report_and_the_screen_take_the_set_that_is_exported(
     study: Path, values: dict[str, float], results: dict[str, Any]
 ) -> None:
-    answers = Answers(Results(study.parent / "s-results"))
-    assert {v.name: v.value for v in answers.values} == {n: values[n] for n in ("K", "T")}
+    summary = Results(study.parent / "s-results").summary
+    assert {p.name: p.value for p in summary.parameters} == {n: values[n] for n in ("K", "T")}
     told = done("run", study)
     assert "The values that count are those with lag at" in told
     assert results["discrepancy"]["residual_tests_after"]["y"]["a"]["ljung_box"]["p"] > 0.001
@@ -310,8 +309,8 @@ def test_without_a_diagnosis_there_are_no_values_with_an_effect(study: Path, tmp
 def test_one_function_decides(verdict: str, name: str, doubt: str) -> None:
     effect = {"effect": "lag", "at": ["y"], "parameters": {"T": {"value": 0.03, "unit": "s"}}}
     diagnosis = {"verdict": verdict, "effects": [] if verdict == "no-evidence" else [effect]}
-    found = values_that_count({"status": "converged"}, diagnosis)
+    found = counting_of({"status": "converged"}, diagnosis)
     assert (found.name, found.doubt) == (name, doubt)
-    assert values_that_count({"status": "failed"}, diagnosis).name == ("effect" if name == "effect" else "")
-    assert values_that_count({"status": "converged"}, {}).name == "fit"
+    assert counting_of({"status": "failed"}, diagnosis).name == ("effect" if name == "effect" else "")
+    assert counting_of({"status": "converged"}, {}).name == "fit"
     assert re.fullmatch(r"(lag at y \(T = 30 ms\))?", found.added)

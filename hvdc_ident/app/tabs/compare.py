@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from nicegui import run, ui
 
@@ -12,10 +11,8 @@ from hvdc_ident.app.desk import Desk
 from hvdc_ident.app.result_panels import show_table
 from hvdc_ident.app.runs import folder_name, result_folders
 from hvdc_ident.app.server import Tab
-from hvdc_ident.display import Table, rounded
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.study.comparison import APART, GAPS, SIDES, RunComparison, value_texts
-from hvdc_ident.text import percentage
+from hvdc_ident.study.comparison import APART, SIDES, RunComparison
 
 
 class ComparedRuns:
@@ -72,48 +69,19 @@ class ComparedRuns:
             self._show(found, chosen)
 
     def _show(self, found: RunComparison, folders: list[Path]) -> None:
-        data = found.to_dict()
         self._place.clear()
         with self._place:
             ui.label(found.conclusion).classes("text-body1 text-bold")
-            if data["values"]:
-                rows = tuple(
-                    (
-                        v["parameter"],
-                        v["unit"],
-                        *value_texts(v),
-                        rounded(v["change_percent"], 3),
-                        rounded(v["apart"], 3),
-                    )
-                    for v in data["values"]
-                )
-                names = [f.name for f in folders]
-                show_table(Table(("parameter", "unit", *names, "change, %", "apart"), rows).without_empty())
+            names = [f.name for f in folders]
+            values, gaps = found.values_table(names), found.gaps_table(names)
+            if values.rows:
+                show_table(values)
                 ui.label(APART).classes("text-caption")
-            self._show_gaps(data, folders)
-            with ui.row().classes("w-full no-wrap items-stretch"):
-                for folder, findings in zip(folders, data["findings"], strict=True):
-                    self._show_findings(folder.name, findings)
-            for line in (*found.input_lines, *(n for n in found.verdict_lines if not n.startswith("missing"))):
+            if gaps.rows:
+                ui.label("RMSE over the recordings that both have").classes("text-subtitle2")
+                show_table(gaps)
+            for line in (*found.input_lines, *found.verdict_lines):
                 ui.label(line).classes("text-body2")
-
-    def _show_gaps(self, data: dict[str, Any], folders: list[Path]) -> None:
-        rows = tuple(
-            (GAPS[g["at"]], g["output"], g["unit"], *map(rounded, g["rmse"]), rounded(g["ratio"], 3), g["recordings"])
-            for g in data["gaps"]
-        )
-        if rows:
-            ui.label("RMSE over the recordings that both have").classes("text-subtitle2")
-            header = ("at", "output", "unit", *(f.name for f in folders), "ratio", "recordings")
-            show_table(Table(header, rows).without_empty())
-
-    def _show_findings(self, name: str, findings: list[dict[str, Any]] | None) -> None:
-        with ui.card().classes("col").props("flat bordered"):
-            ui.label(f"What is missing, by {name}").classes("text-subtitle2")
-            if not findings:
-                ui.label("No diagnosis has run." if findings is None else "Nothing was found.")
-            for f in findings or ():
-                ui.label(f"{f['effect']} ({percentage(f['probability'])}): {f['text']}")
 
     def _give(self) -> None:
         if self._found is not None:

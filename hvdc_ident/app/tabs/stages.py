@@ -10,7 +10,6 @@ import hvdc_ident as hi
 from hvdc_ident.app.desk import Desk
 from hvdc_ident.app.exports import ExportButtons
 from hvdc_ident.app.result_panels import PANELS, FoundResults, Panel
-from hvdc_ident.app.result_tables import on_page
 from hvdc_ident.app.runs import (
     RUNS,
     StageStanding,
@@ -24,7 +23,7 @@ from hvdc_ident.app.runs import (
 from hvdc_ident.app.server import Tab
 from hvdc_ident.app.worker import EVERYTHING, LETTER
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.study.run_summary import next_step
+from hvdc_ident.summary.phrases import next_sentence
 from hvdc_ident.text import percentage
 
 LOOK = 0.3
@@ -185,7 +184,7 @@ class StageDesk:
             if self._panel_keys.get(panel.title) != (key := panel.key(shown)):
                 self._panel_keys[panel.title] = key
                 panel.show(shown, place)
-        self._next.text = on_page(next_step(data))
+        self._next.text = " ".join(next_sentence(step, "page") for step in shown.summary.next)
 
     def _show_run(self, found: StudyRun | None) -> None:
         working = found is not None and found.outcome == "running"

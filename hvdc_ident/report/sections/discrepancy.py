@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.report.answers import beyond_noise, places_of
-from hvdc_ident.report.drawing import AFTER, EFFECT, MEASURED, figure, svg, visible
-from hvdc_ident.report.html import captioned, estimate, folded, number, percent, table, text
-from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import form_of, listed, one_of, percentage, span, value_by_place, with_unit
+from hvdc_ident.colours import EFFECT, RECORDED, ROLES
+from hvdc_ident.report.drawing import figure, svg, visible
+from hvdc_ident.report.html import Section, captioned, folded, number, rows_of, table_of, text, typeset
+from hvdc_ident.report.overlay import Sheet
+from hvdc_ident.summary import Results, RunSummary
+from hvdc_ident.summary.phrases import by_place, gained_sentence
+from hvdc_ident.summary.tables import findings_table
+from hvdc_ident.text import estimate_text, form_of, listed, percentage, quantity, span, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,27 +24,27 @@ MODELS = {"nominal": "given values", "refitted": "refitted, nothing added", "aug
 MOST = 12
 SHOWN = 5e-3
 """A smaller share of the gap is none."""
-PLACES = 4
-"""Likely places that are shown of each effect."""
 
 
 def _render(results: Results) -> str:
     found = results.get("discrepancy")
     if not found.get("verdict"):
         return ""
+    s = results.summary
     notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
     compared = "For specialists: what else was tried, and how far behind it is on the scale of the Bayesian information criterion (BIC)."
     return "".join(
         [
             _lead(found),
-            _effects(found),
-            _findings(found),
-            _advice(found),
+            _effects(s),
+            _findings(s),
             _curve(found),
-            _gap(found),
+            _gap(s, found),
             _slider(found.get("sizes")),
             folded(
-                "Where model and recordings differ", _where(found), "Signals, times, frequencies and levels of the gap."
+                "Where model and recordings differ",
+                _where(s, found),
+                "Signals, times, frequencies and levels of the gap.",
             ),
             folded("Hypotheses compared", _sets(found) + _candidates(found), compared),
             notes,
@@ -66,86 +69,48 @@ def _curve(found: dict[str, Any]) -> str:
     )
 
 
-def _effects(found: dict[str, Any]) -> str:
+def _effects(s: RunSummary) -> str:
     lines = []
-    for e in found.get("effects") or []:
-        sizes = []
-        for name, p in (e.get("parameters") or {}).items():
-            value, interval = estimate(p.get("value"), p.get("ci95"))
-            ends = f" (95 %: {interval})" if p.get("ci95") and not beyond_noise(found) else ""
-            sizes.append(f"{text(name)} = {value}{ends} {text(p.get('unit') or '')}".rstrip())
-        among = _one_of_several(found) + f"Chosen from {text(e.get('chosen_from'))} candidates that were refitted."
-        lines.append(f"<li>{text(str(e.get('text', '')).rstrip('.'))}: {'; '.join(sizes)}. {among}</li>")
+    depend = "; ".join(f"{p.name} is {by_place(p)}" for p in s.parameters if p.by_place)
+    among = f" This is one of several that the recordings do not tell apart: {depend}." if depend else ""
+    for e in s.effects:
+        kept = {n: None if s.remainder.more_than_noise else q.interval for n, q in e.sizes.items()}
+        sizes = [f"{n} = {estimate_text(q.value, q.unit, kept[n])}" for n, q in e.sizes.items()]
+        chosen = f" Chosen from {e.chosen_from} candidates that were refitted." if e.chosen_from else ""
+        lines.append(f"<li>{text(e.text)}: {typeset('; '.join(sizes))}.{text(among + chosen)}</li>")
     return f"<ul>{''.join(lines)}</ul>" if lines else ""
 
 
-def _one_of_several(found: dict[str, Any]) -> str:
-    """Sentence beside what was put into the model, where other places explain the recordings as well with other values."""
-    depend = found.get("values_by_place") or {}
-    if not depend:
-        return ""
-    values = "; ".join(f"{text(n)} is {text(value_by_place(each))}" for n, each in depend.items())
-    return f"This is one of several that the recordings do not tell apart: {values}. "
-
-
-def _findings(found: dict[str, Any]) -> str:
+def _findings(s: RunSummary) -> str:
     """Return the likely effects and, apart from them, their places, with probabilities, where there is more than one of either."""
-    rows = []
-    for f in found.get("findings") or []:
-        delay = f.get("equivalent_delay") or {}
-        places = places_of(f["places"], depend=found.get("values_by_place") or {})
-        where = "; ".join(f"{at} ({percent(p)})" for at, p in [*places.items()][:PLACES])
-        where += f"; and {len(places) - PLACES} more" if len(places) > PLACES else ""
-        value = None if found.get("values_by_place") else delay.get("value")
-        late = "" if value is None else number(1e3 * value, 3)
-        rows.append([text(one_of(f["same_as"])), text(f"{percent(f['probability'])}"), text(where), late])
-    if not rows or (len(rows) == 1 and len(found["findings"][0]["places"]) < 2):
+    if not s.findings or (len(s.findings) == 1 and len(s.findings[0].places) < 2):
         return ""
-    return "<h3>What may be missing, and where</h3>" + table(
-        ["effect", "probability", "likely at", "delay, ms"], rows, words=(0, 1, 2)
-    )
+    return "<h3>What may be missing, and where</h3>" + table_of(findings_table(s))
 
 
 def _sets(found: dict[str, Any]) -> str:
     parts = []
     for group in (g for g in found.get("ambiguity") or [] if len(g) > 1):
+        late = ["" if r.get("late") is None else quantity(r["late"], "s", 3) for r in group]
         rows = [
-            [
-                text(form_of(r)),
-                text(", ".join(r["at"])),
-                text(r.get("from", "")),
-                "" if r.get("late") is None else number(1e3 * r["late"], 3),
-                number(r["delta_bic"], 3),
-            ]
-            for r in group[:MOST]
+            (form_of(r), ", ".join(r["at"]), r.get("from") or "", delay, r["delta_bic"])
+            for r, delay in zip(group[:MOST], late, strict=False)
         ]
         more = f"<p class='small'>and {len(group) - MOST} more</p>" if len(group) > MOST else ""
-        parts.append(
-            "<h3>As good as what was put in</h3>"
-            + table(["effect", "at", "from", "late, ms", "behind the best, BIC"], rows, words=(0, 1, 2))
-            + more
-        )
+        shown = rows_of(["effect", "at", "from", "late", "behind the best, BIC"], rows)
+        parts.append(f"<h3>As good as what was put in</h3>{shown}{more}")
     return "".join(parts)
 
 
-def _advice(found: dict[str, Any]) -> str:
-    advice = (found.get("separating_experiment") or {}).get("text")
-    return f"<p><strong>What to measure.</strong> {text(advice.rstrip('.'))}.</p>" if advice else ""
-
-
-def _gap(found: dict[str, Any]) -> str:
+def _gap(s: RunSummary, found: dict[str, Any]) -> str:
     """Figure of the pooled residual before and after, and a sentence on the held-out recordings."""
     gap = found.get("gap") or {}
     if not gap.get("pooled"):
         return ""
     picture = svg(gap_bars(gap["pooled"]), "residual of the three models in noise units")
     caption = "Residual of all signals together in units of the noise, on fitted and on held-out recordings."
-    shrink = gap.get("shrink_holdout")
-    line = (
-        f"<p>On held-out recordings the effect shrinks the residual by {percentage(shrink)} against the refitted model.</p>"
-        if shrink is not None and (found.get("augmented_model") or found.get("effects"))
-        else ""
-    )
+    gained = gained_sentence(s)
+    line = f"<p>{text(gained)}</p>" if gained else ""
     note = "<p class='small'>Rows on a jump of an input are left out here: no recorder tells which side they show.</p>"
     return captioned(picture, caption) + line + note
 
@@ -169,25 +134,19 @@ def _slider(sizes: dict[str, Any] | None) -> str:
 def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
     """The drawing: recorded and simulated above, what is left below; the curves of one size are shown."""
     time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
-    fig = figure(7.4, 3.6)
-    top, strip = fig.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-    top.plot(*visible(time, measured), color=MEASURED, linewidth=1.0, label="recorded")
+    sheet = Sheet.new(7.4, 3.6, 0.5)
+    top, strip, unit = sheet.top, sheet.strip, sizes.get("output_unit") or ""
+    top.plot(*visible(time, measured), color=RECORDED, linewidth=1.0, label="recorded")
     for k, curve in enumerate(sizes["curves"]):
         values = np.asarray(curve, dtype=float)
         for axes, shown in ((top, values), (strip, measured - values)):
             label = "model" if k == chosen and axes is top else None
             (line,) = axes.plot(*visible(time, shown), color=EFFECT, linewidth=1.3, label=label)
             line.set_gid(f"size-{k}-{'top' if axes is top else 'strip'}")
-    unit = sizes.get("output_unit") or ""
     top.set_ylabel(with_unit(str(sizes["output"]), unit), fontsize=8)
     strip.set_ylabel(with_unit("error", unit), fontsize=8)
-    strip.set_xlabel("time, s", fontsize=8)
-    for axes in (top, strip):
-        axes.grid(True, color="#e4e4e4", linewidth=0.6)
-        axes.spines[["top", "right"]].set_visible(False)
-        axes.tick_params(labelsize=8)
     top.legend(frameon=False, fontsize=8)
-    drawn = svg(fig, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
+    drawn = svg(sheet.figure, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
     for k in range(len(sizes["curves"])):
         hidden = "" if k == chosen else ' style="display: none"'
         for place in ("top", "strip"):
@@ -195,8 +154,8 @@ def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
     return drawn
 
 
-def _where(found: dict[str, Any]) -> str:
-    place, left = found.get("location") or {}, found.get("remaining") or {}
+def _where(s: RunSummary, found: dict[str, Any]) -> str:
+    place = found.get("location") or {}
     outputs, experiments = _shares(place.get("outputs")), _shares(place.get("experiments"))
     window, band, region = place.get("time_window"), place.get("band_hz"), place.get("region")
     parts = [f"Share of the gap by output: {outputs}; by experiment: {experiments}."] if outputs else []
@@ -208,15 +167,9 @@ def _where(found: dict[str, Any]) -> str:
         parts.append(
             f"It is densest where {text(region['signal'])} lies between {span(region['from'], region['to'], '', 3)}."
         )
-    explained = left.get("explained_share")
-    rest = "not all noise" if beyond_noise(found) else "noise" if left.get("adequate") else "no louder than noise"
-    if explained is not None:
-        parts.append(f"{percentage(explained, 1)} of the gap is explained; what is left is {rest}.")
-    elif left:
-        parts.append(f"What is left is {rest}.")
-    if not parts:
-        return ""
-    return "<p>" + " ".join(parts) + "</p>"
+    if s.remainder.explained is not None:
+        parts.append(f"{percentage(s.remainder.explained, 1)} of the gap is explained.")
+    return f"<p>{' '.join(parts)}</p>" if parts else ""
 
 
 def _shares(found: dict[str, float] | None) -> str:
@@ -227,24 +180,14 @@ def _candidates(found: dict[str, Any]) -> str:
     lines = [c for c in found.get("candidates") or [] if c.get("delta_bic") is not None][:MOST]
     if not lines:
         return ""
-    rows = [
-        [
-            text(c["effect"]),
-            text(", ".join(c["at"])),
-            text(c.get("from", "")),
-            number(c["score"], 3),
-            number(c["p"], 2),
-            number(c["delta_bic"], 4),
-            number(c.get("holdout_rmse"), 4),
-        ]
-        for c in lines
-    ]
+    keys = ("score", "p", "delta_bic", "holdout_rmse")
+    rows = [(c["effect"], ", ".join(c["at"]), c.get("from") or "", *(c.get(k) for k in keys)) for c in lines]
     header = ["effect", "at", "from", "score", "p", "gain in BIC", "held out, noise units"]
     note = (
         "<p class='small'>Score: how much of the residuals the effect's signature takes at its best size, in noise units "
         "squared; p: the chance of such a score anywhere from noise alone.</p>"
     )
-    return "<h3>Candidates that were refitted</h3>" + table(header, rows, words=(0, 1, 2)) + note
+    return "<h3>Candidates that were refitted</h3>" + rows_of(header, rows) + note
 
 
 def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
@@ -253,13 +196,13 @@ def gap_bars(pooled: Mapping[str, Mapping[str, Any]]) -> Figure:
     axes = fig.subplots()
     names = [n for n in MODELS if n in pooled]
     for k, (part, label, colour) in enumerate(
-        (("fit", "fitted recordings", "#5f7386"), ("holdout", "held-out recordings", "#9fb0c0"))
+        (("fit", "fitted recordings", ROLES["fit"]), ("holdout", "held-out recordings", ROLES["holdout"]))
     ):
         values = [pooled[n].get(part) for n in names]
         axes.bar(
             np.arange(len(names)) + (k - 0.5) * 0.38, [v or np.nan for v in values], 0.38, label=label, color=colour
         )
-    axes.axhline(1.0, color=MEASURED, linestyle=":", linewidth=1.0, label="noise")
+    axes.axhline(1.0, color=RECORDED, linestyle=":", linewidth=1.0, label="noise")
     axes.set_yscale("log")
     axes.set_xticks(range(len(names)), [MODELS[n] for n in names], fontsize=8)
     axes.set_ylabel("residual, in noise units", fontsize=8)
@@ -275,8 +218,8 @@ def hidden_curve(at: str, curve: Mapping[str, Any]) -> Figure:
     axes = fig.subplots()
     x, y = np.array(curve["at"]), np.array(curve["value"])
     wide = 1.96 * np.array([np.nan if s is None else s for s in curve["std"]])
-    axes.fill_between(x, y - wide, y + wide, color=AFTER, alpha=0.25, linewidth=0.0)
-    axes.plot(x, y, color=AFTER, linewidth=1.4, marker=".", markersize=5)
+    axes.fill_between(x, y - wide, y + wide, color=EFFECT, alpha=0.25, linewidth=0.0)
+    axes.plot(x, y, color=EFFECT, linewidth=1.4, marker=".", markersize=5)
     # A level that the records hardly visit has a band that would hide all others.
     known = y[np.isfinite(wide) & (wide < np.ptp(y))] if np.ptp(y) > 0 else y
     room = 0.3 * max(float(np.ptp(known)) if known.size else 0.0, 1e-12)

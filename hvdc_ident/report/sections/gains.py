@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.answers import Answers
-from hvdc_ident.report.html import estimate, folded, number, share, table, text
-from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import interval_words, listed
+from hvdc_ident.report.html import Section, folded, number, rows_of, text
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.phrases import by_place, interval_name, remarks
+from hvdc_ident.summary.run_summary import Interval
+from hvdc_ident.text import capital, change_text, estimate_texts, figures, interval_text, interval_words
 
 
 def _render(results: Results) -> str:
@@ -15,8 +16,6 @@ def _render(results: Results) -> str:
     candidates = fit.get("candidates") or {}
     if not candidates:
         return ""
-    if results.get("discrepancy").get("verdict"):  # what is to be done next has been done
-        fit = {**fit, "adequacy": {**(fit.get("adequacy") or {}), "next": ""}}
     held = fit.get("held") or {}
     fixed = [n for n in held if n not in candidates]
     rest = f"<p class='small'>Not candidates, at the model's values: {text(', '.join(fixed))}.</p>" if fixed else ""
@@ -25,63 +24,38 @@ def _render(results: Results) -> str:
 
 def _by_name(results: Results, fit: dict[str, Any]) -> str:
     """Table of every value that a parameter has, each column with its name."""
-    found, diagnosis = Answers(results), results.get("discrepancy")
-    refitted = diagnosis.get("parameters_refitted") or {} if found.added else {}
+    s = results.summary
     rows = []
-    for v in found.values:
-        line, own = fit["candidates"][v.name], (fit.get("estimates") or {}).get(v.name) or {}
-        fitted, interval = estimate(v.fitted, own.get("ci95"))
-        after, later = estimate(v.effect, v.effect_interval) if v.effect is not None else (text(v.by_place), "")
-        rows.append(
-            [
-                f"<strong>{text(v.name)}</strong>",
-                number(line.get("given")),
-                fitted if v.fitted is not None else "–",
-                interval if v.fitted is not None else "–",
-                share(v.fitted, line.get("given")) if v.fitted is not None else "",
-                number(refitted.get(v.name)) if v.effect is not None or v.by_place else "",
-                after,
-                later,
-                share(v.effect, line.get("given")) if v.effect is not None else "",
-                text(v.unit),
-            ]
-        )
-    header = ["parameter", "given", "fitted", found.interval_words(effect=False), "change", "refitted by the diagnosis"]
-    header += ["with the effect", found.interval_words(effect=True), "change", "unit"]
-    conditions = ", if nothing else is missing: what remains is more than the noise" if found.conditional else ""
+    for p in s.parameters:
+        added = p.effect is not None or p.by_place
+        with_it = (by_place(p), "", "") if p.by_place else _cells(p.effect, p.effect_interval, p.given)
+        alone = _cells(p.fitted, p.fitted_interval, p.given)
+        rows.append((p.name, p.given, *alone, p.refitted if added else "", *with_it, p.unit))
+    header = ["parameter", "given", "fitted", interval_name(s, "fitted"), "change", "refitted by the diagnosis"]
+    header += ["with the effect", interval_name(s, "effect"), "change", "unit"]
+    if s.counting.name == "effect":
+        counting = "these are the values that count"
+    else:
+        counting = f"{text(s.counting.doubt)}, so exports take the fitted ones unless --values effect asks for these"
+    conditions = ", if nothing else is missing: what remains is more than the noise" if s.counts_conditional else ""
     told = (
         "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
-        f"effect: the same with the finding in the model; {_counting(found)}{conditions}.</p>"
+        f"effect: the same with the finding in the model; {counting}{conditions}.</p>"
     )
-    words = (0, 6, 9) if any(v.by_place for v in found.values) else (0, 9)
-    return table(header, rows, words=words) + (told if refitted else "") + _notes(fit)
+    return rows_of(header, rows) + (told if s.counting.kind else "") + _notes(fit)
 
 
-def _counting(found: Answers) -> str:
-    """Clause on which of the values count."""
-    counts = found.counting
-    if counts.name == "effect":
-        return "these are the values that count"
-    return f"{text(counts.doubt)}, so exports take the fitted ones unless --values effect asks for these"
+def _cells(value: float | None, interval: Interval | None, given: float | None) -> tuple[str, str, str]:
+    """A value, its interval and its change from the given one; empty where there is none."""
+    if value is None:
+        return "", "", ""
+    return estimate_texts(value, interval)[0], interval_text(interval) or "–", change_text(value, given)
 
 
 def _notes(fit: dict[str, Any]) -> str:
     """Why parameters are held, and on what the intervals rest."""
-    notes = {n: _note(n, (fit.get("estimates") or {}).get(n) or {}, fit) for n in fit["candidates"]}
-    lines = "".join(f"<li><strong>{text(n)}</strong>: {text(note)}.</li>" for n, note in notes.items() if note)
+    lines = "".join(f"<li><strong>{text(n)}</strong>: {text(said)}.</li>" for n, said in remarks(fit).items())
     return f"<ul class='small'>{lines}</ul>" if lines else ""
-
-
-def _note(name: str, own: dict[str, Any], fit: dict[str, Any]) -> str:
-    why = (fit.get("held") or {}).get(name)
-    notes = [f"held: {why}"] if why else []
-    if own.get("method") == "one-sided":
-        notes.append("on a bound, one-sided interval")
-    if own.get("conditional_on"):
-        notes.append(f"estimated with {listed(map(str, own['conditional_on']))} held")
-    if own.get("reason"):
-        notes.append(str(own["reason"]))
-    return "; ".join(notes)
 
 
 STATUS = {
@@ -99,10 +73,7 @@ def _outcome(fit: dict[str, Any]) -> str:
     judged = fit.get("adequacy") or {}
     word = "" if status == "converged" else f" ({text(status)})"
     said = f"<p><strong>{text(STATUS.get(status, status))}</strong>{word}: {text(fit.get('message', ''))}.</p>"
-    if judged.get("text"):
-        head = "The model does not fit these records" if judged["verdict"] == "does-not-fit" else "On the noise"
-        what = f" Next: {text(judged['next'])}." if judged.get("next") else ""
-        said += f"<p><strong>{head}</strong>: {text(judged['text'])}.{what}</p>"
+    said += f"<p>{text(capital(judged['text']))}.</p>" if judged.get("text") else ""
     if fit.get("roughness"):
         said += f"<p>{text(fit['roughness']['text'])}.</p>"
     return said
@@ -119,36 +90,28 @@ def _searched(fit: dict[str, Any]) -> str:
     """Table of the estimates' standard deviations and of the bounds of the search."""
     estimates, rows = fit.get("estimates") or {}, []
     for name, line in fit["candidates"].items():
-        bounds = f"{_end(line.get('min'), '−∞')} … {_end(line.get('max'), '∞')}"
-        std = number((estimates.get(name) or {}).get("std"), 2)
-        rows.append([text(name), std, bounds, number(line.get("start")), text(line.get("unit", ""))])
-    return table(["parameter", "standard deviation", "bounds", "search began at", "unit"], rows, words=(0, 4))
+        low, high = ("∞" if line.get(k) is None else figures(line[k]) for k in ("min", "max"))
+        std = (estimates.get(name) or {}).get("std")
+        rows.append((name, std, f"{'-' * (low == '∞')}{low} … {high}", line.get("start"), line.get("unit") or ""))
+    return rows_of(["parameter", "standard deviation", "bounds", "search began at", "unit"], rows)
 
 
 def _derived(fit: dict[str, Any]) -> str:
     lines = fit.get("derived") or {}
-    if not lines:
-        return ""
-    rows = [
-        [text(n), number(d["value"]), number(d.get("std"), 2), text(d.get("unit", "")), text(d["expression"])]
-        for n, d in lines.items()
-    ]
-    head = ["parameter", "value", "std", "unit", "expression"]
-    return "<h3>What follows from the estimates</h3>" + table(head, rows, words=(0, 3, 4))
+    rows = [(n, d["value"], d.get("std"), d.get("unit") or "", d["expression"]) for n, d in lines.items()]
+    shown = rows_of(["parameter", "value", "std", "unit", "expression"], rows)
+    return f"<h3>What follows from the estimates</h3>{shown}" if shown else ""
 
 
 def _nuisances(fit: dict[str, Any]) -> str:
     rows = []
     for experiment, line in (fit.get("nuisance") or {}).items():
         for name, e in line.items():
-            value, interval = estimate(e["value"], e.get("ci95"))
-            cells = [text(experiment), text(name), value, number(e.get("std"), 2), interval]
-            rows.append([*cells, text(e.get("unit", "")), text(e.get("reason", ""))])
-    if not rows:
-        return ""
+            value, ends = estimate_texts(e["value"], e.get("ci95"))[0], interval_text(e.get("ci95")) or "–"
+            rows.append((experiment, name, value, e.get("std"), ends, e.get("unit") or "", e.get("reason") or ""))
     words = interval_words(beyond_noise=(fit.get("adequacy") or {}).get("verdict") == "does-not-fit")
-    head = ["experiment", "unknown of it alone", "value", "std", words, "unit", "note"]
-    return "<h3>Unknown in single experiments</h3>" + table(head, rows, words=(0, 1, 5, 6))
+    shown = rows_of(["experiment", "unknown of it alone", "value", "std", words, "unit", "note"], rows)
+    return f"<h3>Unknown in single experiments</h3>{shown}" if shown else ""
 
 
 def _correlation(fit: dict[str, Any]) -> str:
@@ -156,8 +119,8 @@ def _correlation(fit: dict[str, Any]) -> str:
     names = [n for n in matrix if n in (fit.get("fitted") or [])]
     if len(names) < 2:
         return ""
-    rows = [[text(a), *(number(matrix[a].get(b), 2) for b in names)] for a in names]
-    return "<h3>Correlation of the estimates</h3>" + table(["", *map(text, names)], rows, words=(0,))
+    rows = [(a, *(None if matrix[a].get(b) is None else figures(matrix[a][b], 2) for b in names)) for a in names]
+    return "<h3>Correlation of the estimates</h3>" + rows_of(["", *names], rows)
 
 
 def _one_by_one(fit: dict[str, Any]) -> str:
@@ -171,18 +134,14 @@ def _one_by_one(fit: dict[str, Any]) -> str:
         return ""
     rows = []
     for name, d in lines.items():
-        mean, interval = estimate(d["mean"], d["ci95_of_mean"])
-        rows.append([text(name), number(d["n"]), mean, number(d["std"], 2), number(d["variance"], 2), interval])
-    head = ["parameter", "fits", "mean", "std over fits", "variance", "95 % interval of the mean"]
+        mean, ends = estimate_texts(d["mean"], d["ci95_of_mean"])[0], interval_text(d["ci95_of_mean"])
+        rows.append((name, d["n"], mean, d["std"], d["variance"], ends))
     told = (
         "<p class='small'>Each experiment fitted alone. The interval is of the mean over these fits: it shrinks with "
         "their number and is no interval of the parameter.</p>"
     )
-    return "<h3>Experiment by experiment</h3>" + table(head, rows, words=(0,)) + told
-
-
-def _end(value: Any, none: str) -> str:
-    return none if value is None else number(value)
+    head = ["parameter", "fits", "mean", "std over fits", "variance", "95 % interval of the mean"]
+    return f"<h3>Experiment by experiment</h3>{rows_of(head, rows)}{told}"
 
 
 def _weights(fit: dict[str, Any]) -> str:

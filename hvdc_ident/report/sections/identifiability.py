@@ -9,9 +9,10 @@ import numpy as np
 
 from hvdc_ident.axes import draw_intervals, draw_profile
 from hvdc_ident.report.drawing import figure, svg
-from hvdc_ident.report.html import captioned, estimate, folded, number, table, text
-from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import listed, with_unit
+from hvdc_ident.report.html import Section, captioned, folded, rows_of, table_of, text
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.tables import verdicts_table
+from hvdc_ident.text import capital, figures, listed, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -30,8 +31,7 @@ def _render(results: Results) -> str:
         return ""
     parts = [
         _lead(found),
-        _model(found),
-        _verdicts(found, parameters),
+        table_of(verdicts_table(found)),
         _next(found),
         folded(
             "Profiles of the cost",
@@ -55,19 +55,10 @@ def _render(results: Results) -> str:
 
 def _first(found: dict[str, Any], first: dict[str, Any]) -> str:
     """The first answer of a stage that was interrupted."""
-    rows = [
-        [
-            f"<strong>{text(n)}</strong>",
-            number(p["value"]),
-            number(p["std"], 2),
-            text(p["unit"]),
-            text(listed(p["conditional_on"])),
-        ]
-        for n, p in first["parameters"].items()
-    ]
-    said = "".join(f"<p>{text(_capital(words))}.</p>" for words in first["combinations"])
+    rows = [(n, p["value"], p["std"], p["unit"], listed(p["conditional_on"])) for n, p in first["parameters"].items()]
+    said = "".join(f"<p>{text(capital(words))}.</p>" for words in first["combinations"])
     header = ["parameter", "given", "std at first order", "unit", "with held"]
-    return f"<p><strong>{text(_capital(found['message']))}.</strong></p>{said}" + table(header, rows, words=(0, 3, 4))
+    return f"<p><strong>{text(capital(found['message']))}.</strong></p>{said}{rows_of(header, rows)}"
 
 
 def _lead(found: dict[str, Any]) -> str:
@@ -78,8 +69,10 @@ def _lead(found: dict[str, Any]) -> str:
     rest = f"; held: {text(', '.join(held))}" if held else ""
     structural = found.get("structural") or {}
     method = f" {_structure(structural)} ({text(structural.get('method', ''))})." if structural.get("status") else ""
-    combos = "".join(f"<p>{text(_capital(c['words']))}.</p>" for c in found.get("combinations") or [])
-    return f"<p><strong>{told}</strong>{rest}.{method}</p>{combos}"
+    combos = "".join(f"<p>{text(capital(c['words']))}.</p>" for c in found.get("combinations") or [])
+    signs = "; ".join((found.get("misspecification") or {}).get("signs") or ()) if found.get("misspecified") else ""
+    against = f"<p>What speaks against the model: {text(signs)}.</p>" if signs else ""
+    return f"<p><strong>{told}</strong>{rest}.{method}</p>{combos}{against}"
 
 
 def _structure(structural: dict[str, Any]) -> str:
@@ -92,41 +85,11 @@ def _structure(structural: dict[str, Any]) -> str:
     return f"What perfect data could tell: {text(structural['status'])}"
 
 
-def _verdicts(found: dict[str, Any], parameters: dict[str, Any]) -> str:
-    ratio = (found.get("pilot") or {}).get("chi2_per_dof") if found.get("misspecified") else None
-    interval = "95 % interval" if ratio is None else f"95 % interval (χ²/dof {number(ratio, 3)})"
-    rows = []
-    for name, v in parameters.items():
-        cells = {
-            "parameter": f"<strong>{text(name)}</strong>",
-            "verdict": text(v.get("verdict", "")),
-            "value": estimate(v.get("value"), v.get("ci95"))[0],
-            interval: estimate(v.get("value"), v.get("ci95"))[1],
-            "unit": text(v.get("unit", "")),
-            "why": text(v.get("reason", "")),
-        }
-        rows.append(cells)
-    header = list(rows[0])
-    words = [i for i, h in enumerate(header) if h in ("parameter", "verdict", "unit", "why")]
-    return table(header, [list(r.values()) for r in rows], words=words)
-
-
 def _collinearity(parameters: dict[str, Any]) -> str:
     """Table of the collinearity index of each parameter, with the one that resembles it most."""
-    rows = [
-        [text(n), number(v.get("collinearity"), 3), text(v.get("partner") or "–")]
-        for n, v in parameters.items()
-        if v.get("collinearity") is not None
-    ]
-    return table(["parameter", "collinearity index", "mostly with"], rows, words=(0, 2)) if rows else ""
-
-
-def _model(found: dict[str, Any]) -> str:
-    if not found.get("misspecified"):
-        return ""
-    detail = found.get("misspecification") or {}
-    signs = "; ".join(str(s) for s in detail.get("signs") or [])
-    return f"<p><strong>The model does not explain these data:</strong> {text(signs)}. {text(_capital(detail.get('next', '')))}.</p>"
+    known = {n: v for n, v in parameters.items() if v.get("collinearity") is not None}
+    rows = [(n, figures(v["collinearity"], 3), v.get("partner") or "–") for n, v in known.items()]
+    return rows_of(["parameter", "collinearity index", "mostly with"], rows)
 
 
 def _pictures(found: dict[str, Any]) -> str:
@@ -153,36 +116,34 @@ def _pictures(found: dict[str, Any]) -> str:
 def _experiments(found: dict[str, Any]) -> str:
     experiments = found.get("experiments") or {}
     names = list(dict.fromkeys(n for line in experiments.values() for n in line.get("information") or {}))
-    if not names:
-        return ""
-    rows = [[text(e), *(_percent(line["information"].get(n, 0.0)) for n in names)] for e, line in experiments.items()]
-    return table(["experiment", *map(text, names)], rows)
+    rows = [(e, *(_percent(line["information"].get(n, 0.0)) for n in names)) for e, line in experiments.items()]
+    return rows_of(["experiment", *names], rows) if names else ""
 
 
 def _percent(share: float) -> str:
-    return f"{number(100.0 * share, 3)} %" if share >= SHOWN else "–"
+    return f"{figures(100.0 * share, 3)} %" if share >= SHOWN else "–"
 
 
 def _next(found: dict[str, Any]) -> str:
     advice = found.get("recommended_experiment") or {}
     if not advice.get("text"):
         return ""
-    lead = f"<h3>What to measure next</h3><p>{text(advice['text'])}</p>"
     failed = advice.get("failed") or []
-    if failed:
-        lead += (
-            f"<p class='small'>Could not be simulated: {text('; '.join(failed[:3]))}{' …' if failed[3:] else ''}.</p>"
-        )
+    lead = (
+        f"<p class='small'>Could not be simulated: {text('; '.join(failed[:3]))}{' …' if failed[3:] else ''}.</p>"
+        if failed
+        else ""
+    )
     lines = [advice, *(advice.get("others") or [])]
     if not advice.get("moves") or len(lines) < 2:
         return lead
     rows = [
-        [
-            text("; then ".join(_move(m) for m in line["moves"])),
-            text(", ".join(line["new_signals"]) or "–"),
-            number(_times(line["smallest_eigenvalue"]), 3),
-            number(line["determinant_gain"], 3),
-        ]
+        (
+            "; then ".join(_move(m) for m in line["moves"]),
+            ", ".join(line["new_signals"]) or "–",
+            _times(line["smallest_eigenvalue"]),
+            line["determinant_gain"],
+        )
         for line in lines
     ]
     header = ["experiment", "also record", "smallest eigenvalue, times", "gain of ln determinant"]
@@ -191,7 +152,7 @@ def _next(found: dict[str, Any]) -> str:
         "signal not recorded so far, as on others of its unit.</p>"
     )
     about = "How much each experiment adds: eigenvalues of the information are the squared precision along its weakest direction."
-    return lead + folded("Experiments compared", table(header, rows, words=(0, 1)) + note, about)
+    return lead + folded("Experiments compared", rows_of(header, rows) + note, about)
 
 
 def _move(m: dict[str, Any]) -> str:
@@ -200,10 +161,6 @@ def _move(m: dict[str, Any]) -> str:
 
 def _times(eigenvalue: dict[str, Any]) -> float | None:
     return eigenvalue["then"] / eigenvalue["now"] if eigenvalue.get("now") and eigenvalue.get("then") else None
-
-
-def _capital(words: str) -> str:
-    return words[:1].upper() + words[1:]
 
 
 def profiles(found: Mapping[str, Mapping[str, Any]], parameters: Mapping[str, Mapping[str, Any]]) -> Figure:

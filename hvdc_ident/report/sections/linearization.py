@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.report.drawing import figure, svg
-from hvdc_ident.report.html import captioned, number, table, text
-from hvdc_ident.report.results import Results, Section
-from hvdc_ident.text import unstable_roots
+from hvdc_ident.colours import SERIES
+from hvdc_ident.report.drawing import bode_axes, complex_of, draw_response, figure, svg
+from hvdc_ident.report.html import Section, captioned, number, table, text
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.linear import locus_lines, margin_lines, other_lines, port_lines, stability
+from hvdc_ident.text import capital
 
 NEAREST = 5
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
 
 CHECKS = {
@@ -21,14 +22,6 @@ CHECKS = {
     "finite-difference": "differences of another step size",
 }
 """Second Jacobian that one of each method was compared with."""
-EARLIER = {
-    "verdict": "not decided",
-    "rightmost": None,
-    "unstable_roots": None,
-    "method": "an earlier version",
-    "reason": "these results are of an earlier version: hvdc-ident linearize makes them again",
-}
-"""Stands for the stability in results that have none."""
 
 
 def _render(results: Results) -> str:
@@ -49,7 +42,7 @@ def _render(results: Results) -> str:
         + _margins(shown)
         + _ports(shown)
         + _locus(shown)
-        + _others(shown)
+        + _said(other_lines(shown))
     )
 
 
@@ -69,22 +62,12 @@ def _which(given: dict[str, Any], fit: dict[str, Any], diagnosis: dict[str, Any]
 
 
 def _point(data: dict[str, Any], point: dict[str, Any]) -> str:
-    found = data.get("stability") or EARLIER
-    right = f", rightmost real part {number(found['rightmost'][0])} 1/s" if found["rightmost"] else ""
-    verdict = "not shown to be stable or unstable" if found["verdict"] == "not decided" else found["verdict"]
-    why = "" if found["method"] == "eigenvalues of A" else f"; {text(found['method'])}{_count(found)}"
-    return (
-        f"<p>{len(data['modes'])} modes; the operating point is <strong>{text(verdict)}</strong>{right}{why}. Largest "
-        f"scaled residual {number(point.get('residual'), 2)}; the Jacobian differs from "
-        f"{CHECKS[data.get('method', 'symbolic')]} by {number(data.get('jacobian_error'), 2)}.</p>"
-        + "".join(f"<p>{text(note)}</p>" for note in data.get("notes") or ())
-    )
-
-
-def _count(found: dict[str, Any]) -> str:
-    """Return the number of unstable roots after a colon, and why that cannot be told where it cannot."""
-    why = f" ({text(found['reason'])})" if found["reason"] else ""
-    return f": {'not decided' if found['verdict'] == 'not decided' else unstable_roots(found)}{why}"
+    verdict = stability(data) if data.get("stability") else "of an earlier version: hvdc-ident linearize makes it again"
+    check = CHECKS[data.get("method", "symbolic")]
+    about = f"Largest scaled residual {number(point.get('residual'), 2)}; the Jacobian differs from {check} by "
+    about += f"{number(data.get('jacobian_error'), 2)}."
+    notes = "".join(f"<p>{text(note)}</p>" for note in data.get("notes") or ())
+    return f"<p>{len(data['modes'])} modes; operating point <strong>{text(verdict)}</strong>. {about}</p>{notes}"
 
 
 def _modes(given: list[dict[str, Any]], fitted: dict[str, Any] | None) -> str:
@@ -138,43 +121,25 @@ def _bode(given: dict[str, Any], fitted: dict[str, Any] | None) -> str:
     if not drawn:
         return ""
     fig = figure(7.5, 4.8, {"left": 0.1, "right": 0.99, "bottom": 0.11, "top": 0.98, "hspace": 0.1})
-    axes = fig.subplots(2, 1, sharex=True)
-    count = sum(
-        _curves(axes, response, label, k if len(drawn) > 1 else None) for k, (label, response) in enumerate(drawn)
-    )
-    if count == 0:
+    (pair,) = bode_axes(fig)
+    seen = [_curves(pair, response, label, k if len(drawn) > 1 else None) for k, (label, response) in enumerate(drawn)]
+    if not any(seen):
         return ""
-    gain, phase = axes
-    gain.set_ylabel("gain, dB")
-    phase.set_ylabel("phase, degrees")
-    phase.set_xlabel("frequency, Hz")
-    gain.legend(fontsize="small")
-    for part in axes:
-        part.grid(True, color="#dddddd", linewidth=0.5)
-        part.yaxis.set_label_coords(-0.08, 0.5)
-    return captioned(
-        svg(fig, "Bode diagram of the linear model"), "Bode diagram of the linear model, gain above phase."
-    )
+    pair[0].legend(fontsize="small")
+    name = "Bode diagram of the linear model"
+    return captioned(svg(fig, name), f"{name}, gain above phase.")
 
 
-def _curves(axes: Any, response: dict[str, Any], label: str, which: int | None) -> int:
-    """Draw one model's channels, each in a colour of its own, and return how many. which: of several models, their line."""
-    omega = np.array(response["omega"], dtype=float)
-    values = np.array(response["real"], dtype=float) + 1j * np.array(response["imag"], dtype=float)
+def _curves(pair: Any, response: dict[str, Any], label: str, which: int | None) -> bool:
+    """Draw one model's channels, each in a colour of its own; whether there is one. which: of several models, their line."""
+    omega, values = np.array(response["omega"], dtype=float), complex_of(response["real"], response["imag"])
     channels = [(i, j) for i in range(len(response["outputs"])) for j in range(len(response["inputs"]))]
-    count = 0
+    seen = []
     for k, (i, j) in enumerate(channels):
-        v = values[:, i, j]
-        keep = (omega > 0) & (np.abs(v) > 0)
-        if not keep.any():
-            continue
+        name = f"{response['inputs'][j]} to {response['outputs'][i]}{label}"
         line = LINES[(k if which is None else which) % len(LINES)]
-        style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": line}
-        hertz, name = omega[keep] / (2 * np.pi), f"{response['inputs'][j]} to {response['outputs'][i]}{label}"
-        axes[0].semilogx(hertz, 20 * np.log10(np.abs(v[keep])), label=name, **style)
-        axes[1].semilogx(hertz, np.degrees(np.unwrap(np.angle(v[keep]))), **style)
-        count += 1
-    return count
+        seen.append(draw_response(pair, omega, values[:, i, j], name, color=SERIES[k % len(SERIES)], linestyle=line))
+    return any(seen)
 
 
 def _hertz(omega: Any) -> str:
@@ -195,50 +160,23 @@ def _margins(data: dict[str, Any]) -> str:
     found = data.get("margins")
     if not found:
         return ""
-    page = "<h3>Margins</h3>"
-    if found.get("stable") is False:
-        s = found.get("stability") or EARLIER
-        count = f" ({_count(s).removeprefix(': ')})" if s["verdict"] == "unstable" else ""
-        page += f"<p>The closed loops are {text(s['verdict'])}{count}: they have no margins.</p>"
-    elif found.get("stable") is None and found.get("loops"):
-        page += (
-            "<p>Whether the closed loops are stable cannot be told, so that no margins are given: "
-            f"{text((found.get('stability') or EARLIER)['reason'])}.</p>"
+    rows = []
+    for name, m in (found.get("loops") or {}).items() if found.get("stable") else ():
+        lower = m.get("lower_gain_margin")
+        rows.append(
+            [
+                text(name),
+                *_limit(m["gain_margin"]),
+                *(("unlimited", "") if lower and lower["value"] == 0 else _limit(lower)),
+                *_limit(m["phase_margin_deg"]),
+                _limit(m["delay_margin_s"], 1e3)[0],
+                number(m["modulus_margin"]["value"], 3),
+                number(m["disk_margin"]["value"], 3),
+            ]
         )
-    elif found.get("loops"):
-        rows = []
-        for name, m in found["loops"].items():
-            gain, lower, phase = m["gain_margin"], m.get("lower_gain_margin"), m["phase_margin_deg"]
-            delay, disk = m["delay_margin_s"], m["disk_margin"]
-            rows.append(
-                [
-                    text(name),
-                    *_limit(gain),
-                    *(("unlimited", "") if lower and lower["value"] == 0 else _limit(lower)),
-                    *_limit(phase),
-                    _limit(delay, 1e3)[0],
-                    number(m["modulus_margin"]["value"], 3),
-                    number(disk["value"], 3),
-                ]
-            )
-        header = ["loop opened at", "gain", "at, Hz", "lower gain", "at, Hz", "phase, degrees", "at, Hz", "delay, ms"]
-        header += ["modulus", "disk"]
-        page += table(header, rows)
-        if len(rows) > 1:
-            disk = found["disk_margin"]
-            page += (
-                f"<p>All loops at once: disk margin {number(disk['value'], 3)} at {_hertz(disk['omega'])} Hz, so every gain "
-                f"may change by a factor of {number(disk['gain'], 3)} and every phase by {number(disk['phase_deg'], 3)} "
-                "degrees, either way and independently.</p>"
-            )
-    if "ncf_margin" in found:
-        n = found["ncf_margin"]
-        page += (
-            f"<p>Between plant ({text(', '.join(n['inputs']))} to {text(', '.join(n['outputs']))}) and controller the "
-            f"normalised coprime factor margin is {number(n['value'])}; the largest that any controller attains is "
-            f"{number(n['attainable'])}.</p>"
-        )
-    return page
+    header = ["loop opened at", "gain", "at, Hz", "lower gain", "at, Hz", "phase, degrees", "at, Hz", "delay, ms"]
+    shown = table([*header, "modulus", "disk"], rows) if rows else ""
+    return f"<h3>Margins</h3>{shown}{_said(margin_lines(found))}"
 
 
 def _ports(data: dict[str, Any]) -> str:
@@ -248,29 +186,23 @@ def _ports(data: dict[str, Any]) -> str:
         return ""
     fig = figure(7.5, 2.9, {"left": 0.1, "right": 0.99, "bottom": 0.17, "top": 0.97})
     axes = fig.subplots()
-    k, words = 0, []
+    k = 0
     for port in ports:
         omega = np.array(port["omega"], dtype=float)
-        values = np.abs(np.array(port["real"], dtype=float) + 1j * np.array(port["imag"], dtype=float))
+        values = np.abs(complex_of(port["real"], port["imag"]))
         for i, o in enumerate(port["outputs"]):
             for j, u in enumerate(port["inputs"]):
-                style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "linestyle": LINES[k % len(LINES)]}
+                style: dict[str, Any] = {"color": SERIES[k % len(SERIES)], "linestyle": LINES[k % len(LINES)]}
                 label = port["name"] if len(port["inputs"]) == 1 else f"{port['name']} {o}{u}"
                 axes.loglog(omega / (2 * np.pi), np.maximum(values[:, i, j], 1e-12), label=label, **style)
                 k += 1
-        least = port["least_real_part"]
-        side = "passive over the band" if least["value"] >= 0 else "not passive"
-        words.append(
-            f"{text(port['name'])} is {side}: the least real part is {number(least['value'])} at "
-            f"{_hertz(least['omega'])} Hz"
-        )
     axes.set_xlabel("frequency, Hz")
     axes.set_ylabel("impedance")
     axes.legend(fontsize="small")
     axes.grid(True, color="#dddddd", linewidth=0.5)
     drawn = svg(fig, "Impedance of the ports over frequency")
     picture = captioned(drawn, "Size of the impedance at each port over frequency.")
-    return f"<h3>Impedance at ports</h3>{picture}<p>{'; '.join(words)}.</p>"
+    return f"<h3>Impedance at ports</h3>{picture}{_said(port_lines(data))}"
 
 
 def _locus(data: dict[str, Any]) -> str:
@@ -283,7 +215,7 @@ def _locus(data: dict[str, Any]) -> str:
     axes = fig.subplots()
     for k in range(values.shape[1]):
         re, im = values[:, k, 0], values[:, k, 1]
-        colour = COLOURS[k % len(COLOURS)]
+        colour = SERIES[k % len(SERIES)]
         axes.plot(re, im, color=colour, linewidth=1.2)
         axes.plot(re[:1], im[:1], "o", color=colour, markersize=4)
         axes.plot(re[-1:], im[-1:], "s", color=colour, markersize=4)
@@ -298,48 +230,13 @@ def _locus(data: dict[str, Any]) -> str:
     axes.grid(True, color="#dddddd", linewidth=0.5)
     unit = f" {text(found['unit'])}" if found["unit"] else ""
     span = f"{text(found['parameter'])} from {number(found['values'][0])} (dots) to {number(found['values'][-1])}{unit} (squares)"
-    limits = "; ".join(
-        f"stability is {text(x['direction'])} at {number(x['value'])}{unit} ({_hertz(abs(x['eigenvalue'][1]))} Hz)"
-        for x in found["limits"]
-    )
-    drawn = svg(fig, f"Eigenvalues along {found['parameter']}")
-    picture = captioned(drawn, f"Eigenvalues along {span}.")
-    return f"<h3>Eigenvalues along a parameter</h3>{picture}<p>{limits or 'Stability is neither lost nor won'}.</p>"
+    picture = captioned(svg(fig, f"Eigenvalues along {found['parameter']}"), f"Eigenvalues along {span}.")
+    return f"<h3>Eigenvalues along a parameter</h3>{picture}{_said(locus_lines(data))}"
 
 
-def _others(data: dict[str, Any]) -> str:
-    """The comparison with another model, and the reduced model, in a sentence each."""
-    page = ""
-    c = data.get("comparison")
-    if c:
-        winding = (
-            ""
-            if c["winding"] == 0
-            else "; the winding condition fails, so that no controller of one need suit the other"
-        )
-        attainable = c.get("attainable_margin")
-        room = (
-            "" if attainable is None else f" (any controller of this one has a margin of at most {number(attainable)})"
-        )
-        apart = c.get("difference")
-        gain = (
-            "" if not apart else f" The gains differ by up to {number(apart['value'])}, at {_hertz(apart['omega'])} Hz."
-        )
-        page += (
-            f"<p>Against {text(c['other'])}: nu-gap {number(c['nu_gap'])}{room}, largest at {_hertz(c['omega'])} Hz"
-            f"{winding}.{gain}</p>"
-        )
-    r = data.get("reduced")
-    if r:
-        dc = ", with the dc gain kept" if r["match_dc"] else ""
-        page += (
-            f"<p>Reduced from {r['states_before']} to {r['order']} states{dc}: the gain differs by up to "
-            f"{number(r['error']['value'])} (bound {number(r['bound'])}).</p>"
-        )
-    for f in data.get("formulas") or []:
-        shown = f.get("reason") or f"({f['numerator']}) / ({f['denominator']})"
-        page += f"<p>{text(f['output'])} from {text(f['input'])}: <code>{text(shown)}</code></p>"
-    return page
+def _said(lines: list[str]) -> str:
+    """Lines of the stage as sentences."""
+    return "".join(f"<p>{text(capital(line))}.</p>" for line in lines)
 
 
 SECTION = Section(

@@ -4,61 +4,38 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.answers import Answers, Signal
-from hvdc_ident.report.html import folded, number, share, table, text
-from hvdc_ident.report.results import Results, Section
-
-NAMES = {"given": "RMSE, given values", "fitted": "RMSE, fitted", "effect": "RMSE, with the effect"}
+from hvdc_ident.report.html import Section, folded, number, table, table_of, text
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.tables import signals_table
 
 
 def _render(results: Results) -> str:
-    found = Answers(results)
-    sets = {n: found.signals(n) for n in found.judgements}
-    if not sets:
+    s = results.summary
+    if not s.sets:
         return ""
-    signals = list(dict.fromkeys(s for line in sets.values() for s in line))
-    loud = [s for s in signals if not all(s in line and line[s]["follows"]["noise"] for line in sets.values())]
-    rest = [s for s in signals if s not in loud]
-    quiet = (
-        folded(f"{len(rest)} signals on their noise", _table(results, found, rest), "With every set of values.")
-        if rest
-        else ""
-    )
+    quiet = tuple(x for x in s.signals if all(n in x.errors and x.errors[n].on_noise == "pass" for n in s.sets))
+    loud = tuple(x for x in s.signals if x not in quiet)
+    plural = "s" if len(quiet) > 1 else ""
+    rest = table_of(signals_table(s, quiet)) if quiet else ""
     parts = [
-        _table(results, found, loud) if loud else "<p>Every signal is on its noise, with every set of values.</p>",
-        quiet,
+        table_of(signals_table(s, loud)) if loud else "<p>Every signal is on its noise, with every set of values.</p>",
+        folded(f"{len(quiet)} signal{plural} on their noise", rest, "With every set of values."),
     ]
-    windows = _windows(results, found)
-    named = found.profile.get("named")
-    return "".join([windows, *parts] if named else [*parts, windows]) + _held_out(results.get("fit"))
+    windows = _windows(results)
+    both = [windows, *parts] if s.profile.get("named") else [*parts, windows]
+    return "".join(both) + _held_out(results.get("fit"))
 
 
-def _table(results: Results, found: Answers, signals: list[Signal]) -> str:
-    """Table of the root mean square errors of some signals."""
-    sets = {n: found.signals(n) for n in found.judgements}
-    rows = []
-    for output, experiment in signals:
-        errors = {n: (line.get((output, experiment)) or {}).get("rmse") for n, line in sets.items()}
-        role = "held out" if (results.experiments.get(experiment) or {}).get("role") == "holdout" else "fit"
-        cells = [text(output), text(experiment), role, *(number(e, 3) for e in errors.values())]
-        change = share(errors["fitted"], errors.get("given")) if "fitted" in errors else ""
-        noise = found.noise((output, experiment))
-        rows.append([*cells, change, number(noise, 2) if noise else "", text(results.units.get(output, ""))])
-    header = ["output", "experiment", "role", *(NAMES[n] for n in sets), "change by the fit", "noise", "unit"]
-    return table(header, rows, words=(0, 1, 2, len(header) - 1))
-
-
-def _windows(results: Results, found: Answers) -> str:
+def _windows(results: Results) -> str:
     """Largest, mean and mean absolute error before, during and after the event, beside the profile's limits."""
-    judged = found.judged
-    profile, units = found.profile, results.units
+    s = results.summary
+    profile, units = s.profile, results.units
     over: list[list[str]] = []
     rows: list[list[str]] = []
     unjudged: list[list[str]] = []
     why: list[str] = []
     ends = set()
-    for (output, name), signal in found.signals(judged.name).items() if judged is not None else ():
-        about = signal["windows"]
+    for output, name, about in results.windows(s.about):
         ends.add(about.get("end_from"))
         if about.get("event") is None:
             continue

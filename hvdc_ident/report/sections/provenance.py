@@ -6,8 +6,8 @@ import base64
 import io
 import zipfile
 
-from hvdc_ident.report.html import table, text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.html import Section, table, text
+from hvdc_ident.summary import Results
 
 ARCHIVE = "results.zip"
 SUFFIXES = (".json", ".csv", ".toml")

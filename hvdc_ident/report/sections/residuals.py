@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.results import Results, Section
-from hvdc_ident.report.values_that_count import values_that_count
+from hvdc_ident.report.html import Section, number, table, text
+from hvdc_ident.summary import Results
 
 LOW = 0.01
 """A p below this is marked."""
@@ -38,7 +37,7 @@ def _render(results: Results) -> str:
 
     diagnosis = results.get("discrepancy")
     with_effect = diagnosis.get("residual_tests_after") or {}
-    if not with_effect or values_that_count(fit, diagnosis).name != "effect":
+    if not with_effect or results.summary.counting.name != "effect":
         return tested(tests, fit) + told
     return (
         f"<h3>With the effect, at the values that count</h3>{tested(with_effect, {})}"

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hvdc_ident.report.drawing import figure, svg
-from hvdc_ident.report.html import captioned, number, table, text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.colours import SERIES
+from hvdc_ident.report.drawing import bode_axes, complex_of, draw_response, figure, svg
+from hvdc_ident.report.html import Section, captioned, number, rows_of, text
+from hvdc_ident.summary import Results
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 STYLES = {"given": "--", "fitted": "-"}
 
 
@@ -52,38 +51,20 @@ def _remarks(r: dict[str, Any]) -> str:
     return f"<p>{' '.join(found)}</p>" if found else ""
 
 
-def _values(parts: dict[str, Any]) -> NDArray[np.complex128]:
-    return np.asarray(np.array(parts["real"], dtype=float) + 1j * np.array(parts["imag"], dtype=float))
-
-
 def _bode(r: dict[str, Any]) -> str:
     omega = np.array(r["omega"], dtype=float)
     fig = figure(7.5, 4.8, {"left": 0.1, "right": 0.99, "bottom": 0.11, "top": 0.98, "hspace": 0.1})
-    gain, phase = fig.subplots(2, 1, sharex=True)
-    curves = [("measured", _values(r["measured"]))]
-    curves += [(n, _values(m)) for n, m in r["models"].items() if "reason" not in m]
+    (pair,) = bode_axes(fig)
+    curves = {"measured": r["measured"], **{n: m for n, m in r["models"].items() if "reason" not in m}}
     for k, channel in enumerate(r["channels"]):
-        for name, values in curves:
-            v = values[:, k]
-            keep = (omega > 0) & (np.abs(v) > 0)
-            if not keep.any():
-                continue
-            style: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)]}
+        for name, parts in curves.items():
+            style: dict[str, Any] = {"linestyle": STYLES.get(name, "-."), "linewidth": 1.2}
             if name == "measured":
-                style |= {"linestyle": "none", "marker": ".", "markersize": 4}
-            else:
-                style |= {"linestyle": STYLES.get(name, "-."), "linewidth": 1.2}
+                style = {"linestyle": "none", "marker": ".", "markersize": 4}
             label = f"{channel}, {name}" if k == 0 or name == "measured" else None
-            hertz = omega[keep] / (2 * np.pi)
-            gain.semilogx(hertz, 20 * np.log10(np.abs(v[keep])), label=label, **style)
-            phase.semilogx(hertz, np.degrees(np.unwrap(np.angle(v[keep]))), **style)
-    gain.set_ylabel("gain, dB")
-    phase.set_ylabel("phase, degrees")
-    phase.set_xlabel("frequency, Hz")
-    gain.legend(fontsize="small")
-    for axes in (gain, phase):
-        axes.grid(True, color="#dddddd", linewidth=0.5)
-        axes.yaxis.set_label_coords(-0.08, 0.5)
+            values = complex_of(parts["real"], parts["imag"])[:, k]
+            draw_response(pair, omega, values, label, color=SERIES[k % len(SERIES)], **style)
+    pair[0].legend(fontsize="small")
     drawn = svg(fig, "Bode diagram of the measured response " + r["name"])
     return captioned(drawn, f"{text(r['name'])}: dots measured, lines of the model.")
 
@@ -92,32 +73,12 @@ def _errors(r: dict[str, Any]) -> str:
     rows = []
     for name, m in r["models"].items():
         for e in m.get("errors", ()):
-            share = "–" if e["relative"] is None else number(100 * e["relative"], 3)
-            chi2 = e["chi2_per_point"]
-            gain, phase = e["gain_db"], e["phase_deg"]
-            rows.append(
-                [
-                    text(e["channel"]),
-                    text(name),
-                    share,
-                    number(gain["value"], 3),
-                    number(gain["omega"] / (2 * np.pi)),
-                    number(phase["value"], 3),
-                    number(phase["omega"] / (2 * np.pi)),
-                    number(np.sqrt(chi2), 3) if chi2 is not None else "",
-                ]
-            )
-    header = [
-        "channel",
-        "values",
-        "error, %",
-        "gain off by, dB",
-        "at, Hz",
-        "phase off by, degrees",
-        "at, Hz",
-        "error / noise",
-    ]
-    return table(header, rows, words=(0, 1)) if rows else ""
+            share = None if e["relative"] is None else 100.0 * e["relative"]
+            off = [v for kind in ("gain_db", "phase_deg") for v in (e[kind]["value"], e[kind]["omega"] / (2 * np.pi))]
+            noise = "" if e["chi2_per_point"] is None else float(np.sqrt(e["chi2_per_point"]))
+            rows.append((e["channel"], name, share, *off, noise))
+    header = ["channel", "values", "error, %", "gain off by, dB", "at, Hz", "phase off by, degrees", "at, Hz"]
+    return rows_of([*header, "error / noise"], rows)
 
 
 SECTION = Section(

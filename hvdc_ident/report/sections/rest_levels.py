@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.html import Section, rows_of, text
+from hvdc_ident.summary import Results
+from hvdc_ident.text import figures, quantity, times_text
 
 
 def _render(results: Results) -> str:
@@ -18,7 +19,7 @@ def _render(results: Results) -> str:
     parts = [f"<p>{_summary(len(compared), len(told))}</p>"]
     if told:
         header = ["experiment", "output", "recorded", "model", "within the bounds", "noise", "what it suggests"]
-        parts.append(table(header, map(_row, told), words=(0, 1, 6)))
+        parts.append(rows_of(header, map(_row, told)))
     return "".join([*parts, *(f"<p class='small'>{text(r)}.</p>" for r in remarks)])
 
 
@@ -39,12 +40,11 @@ def _summary(compared: int, told: int) -> str:
 
 
 def _row(line: dict[str, Any]) -> list[str]:
-    low, high = line.get("low"), line.get("high")
-    within = f"{number(low)} to {number(high)}" if low is not None and high is not None and low < high else ""
-    unit = f" {text(line.get('unit') or '')}".rstrip()
-    noise = f"{number(line['noise_units'], 3)} times" if line.get("noise_units") is not None else ""
-    levels = [f"{number(line.get(k))}{unit}" if line.get(k) is not None else "" for k in ("recorded", "model")]
-    return [text(line["experiment"]), text(line["output"]), *levels, within, noise, text(line["text"])]
+    low, high, unit = line.get("low"), line.get("high"), line.get("unit") or ""
+    within = f"{figures(low)} to {figures(high)}" if low is not None and high is not None and low < high else ""
+    noise = times_text(line["noise_units"]) if line.get("noise_units") is not None else ""
+    levels = [quantity(line[k], unit) if line.get(k) is not None else "" for k in ("recorded", "model")]
+    return [line["experiment"], line["output"], *levels, within, noise, line["text"]]
 
 
 SECTION = Section(

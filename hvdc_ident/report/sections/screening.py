@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from hvdc_ident.report.html import number, table, text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.html import Section, number, table, text
+from hvdc_ident.summary import Results
 
 COLUMNS = {
     "morris": {"mu_star": "mean size of the effect", "mu": "mean effect", "sigma": "spread of the effect"},

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.colours import MARK, SERIES
 from hvdc_ident.data import Array
-from hvdc_ident.report.drawing import AFTER, BEFORE, MARK, MEASURED, figure, svg
-from hvdc_ident.report.html import captioned, number, table, text
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.report.drawing import bode_axes, draw_response, figure, svg
+from hvdc_ident.report.html import Section, captioned, number, table, text
+from hvdc_ident.summary import Results
 from hvdc_ident.text import with_unit
 
 if TYPE_CHECKING:
@@ -21,7 +22,6 @@ MOST = 2000
 CURVES, CHANNELS = 40, 4
 """Frequency responses drawn in one figure, and figures of them."""
 OTHERS = "#c4c4c4"
-COLORS = (AFTER, BEFORE, MEASURED, "#3a7d44", "#8a3ffc", "#b3261e")
 
 
 def _render(results: Results) -> str:
@@ -60,9 +60,11 @@ def _best(
 ) -> str:
     rows = []
     for (output, experiment), values in errors.items():
-        low = int(np.argmin(values))
-        at = [number(points[low]["values"][n], 5) for n in names]
         extremes = [number(float(values.min()), 3), number(float(values.max()), 3)]
+        best = points[int(np.argmin(values))]["values"]
+        at = [
+            "–" if extremes[0] == extremes[1] else number(best[n], 5) for n in names
+        ]  # of a flat line none is the best
         rows.append([text(output), text(experiment), *at, *extremes, text(units.get(output, ""))])
     header = ["output", "experiment", *(f"best {text(n)}" for n in names), "smallest RMSE", "largest", "unit"]
     return table(header, rows, words=(0, 1, len(header) - 1)) if rows else ""
@@ -127,8 +129,8 @@ def sweep_errors(
 
     Those that move most have colours and names, the others are grey.
     """
-    most = sorted(errors, key=lambda n: -float(np.ptp(errors[n])))[: len(COLORS)]
-    color = dict(zip([n for n in errors if n in most], COLORS, strict=False))
+    most = sorted(errors, key=lambda n: -float(np.ptp(errors[n])))[: len(SERIES)]
+    color = dict(zip([n for n in errors if n in most], SERIES, strict=False))
     lines = -(-(len(color) + (len(errors) > len(color))) // 3)
     high = 3.2 + 0.18 * lines
     fig = figure(
@@ -176,27 +178,13 @@ def sweep_bode(parameter: str, values: Array, omega: Array, response: np.ndarray
     from matplotlib.colors import Normalize
 
     fig = figure(7.4, 4.4)
-    gain, phase = fig.subplots(2, 1, sharex=True)
-    scale, hertz = Normalize(float(values.min()), float(values.max())), omega / (2 * np.pi)
+    (pair,) = bode_axes(fig)
+    scale = Normalize(float(values.min()), float(values.max()))
     for value, row in zip(values, response, strict=True):
-        color = colormaps["viridis"](scale(value))
-        size = np.abs(row)
-        gain.plot(hertz, 20 * np.log10(np.where(size > 0, size, np.nan)), color=color, linewidth=0.9)
-        phase.plot(hertz, np.degrees(np.unwrap(np.angle(row))), color=color, linewidth=0.9)
-    gain.set_xscale("log")
-    marks = [10.0**k for k in range(int(np.floor(np.log10(hertz[0]))), int(np.ceil(np.log10(hertz[-1]))) + 1)]
-    gain.set_xticks(marks, [f"{m:g}" for m in marks])
-    gain.set_xticks([], minor=True)
-    gain.set_xlim(hertz[0], hertz[-1])
-    gain.set_ylabel("gain, dB")
-    gain.set_title(channel, fontsize=8)
-    phase.set_ylabel("phase, deg")
-    phase.set_xlabel("frequency, Hz")
-    for axes in (gain, phase):
-        axes.grid(True, color="#e4e4e4", linewidth=0.6)
-        axes.tick_params(labelsize=8)
-        axes.spines[["top", "right"]].set_visible(False)
-    fig.colorbar(ScalarMappable(scale, "viridis"), ax=[gain, phase], label=parameter)
+        draw_response(pair, omega, row, color=colormaps["viridis"](scale(value)), linewidth=0.9)
+    pair[0].set_title(channel, fontsize=8)
+    pair[0].set_xlim(omega[0] / (2 * np.pi), omega[-1] / (2 * np.pi))
+    fig.colorbar(ScalarMappable(scale, "viridis"), ax=list(pair), label=parameter)
     return fig
 
 

@@ -7,9 +7,9 @@ from statistics import NormalDist
 import numpy as np
 
 from hvdc_ident.data import Array, recording_lines
-from hvdc_ident.report.html import text
+from hvdc_ident.report.html import Section, text
 from hvdc_ident.report.overlay import Overlay, Sheet, overlay_of
-from hvdc_ident.report.results import Results, Section
+from hvdc_ident.summary import Results
 from hvdc_ident.text import listed
 
 MOST = 60

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
-from hvdc_ident.text import form_of, percentage, value_by_place
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy import Diagnosis
@@ -121,40 +120,13 @@ def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str
 
 def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The verdict, what is missing, what it changes, and what to measure to be sure."""
-    from hvdc_ident.study.run_summary import counting_line
+    from hvdc_ident.summary import summarise
+    from hvdc_ident.summary.screen import lines_of as screen
 
     if "verdict" not in data:
         return [str(data.get("message", ""))]
-    lines = [f"{data['verdict']}: {data['text']}"]
-    findings = data.get("findings") or []
-    if data["verdict"] != "named" and data["effects"]:
-        lines += [f"Probability {percentage(f['probability'])}: {f['text']}" for f in findings]
-    pooled = data["gap"]["pooled"]
-    shown = [
-        f"{n} {pooled[n]['fit']:.3g}" for n in ("nominal", "refitted", "augmented") if pooled[n]["fit"] is not None
-    ]
-    lines.append(f"Residual in noise units: {', '.join(shown)}.")
-    if data["augmented_model"] and data["gap"]["shrink_holdout"] is not None:
-        lines.append(f"The held-out gap shrinks by {percentage(data['gap']['shrink_holdout'], 1)}.")
-    for group in (g for g in data["ambiguity"] if len(g) > 1):
-        members = "; ".join(f"{form_of(r)} at {', '.join(r['at'])} (+{r['delta_bic']:.1f})" for r in group[:8])
-        rest = f"; and {len(group) - 8} more" if len(group) > 8 else ""
-        lines.append(f"As good (delta BIC): {members}{rest}.")
-    advice = (data["separating_experiment"] or {}).get("text")
-    lines += [f"Measure next: {advice}"] if advice else []
-    depend = data.get("values_by_place") or {}
-    moved = [
-        f"{n} {data['parameters_refitted'][n]:.5g} -> {value_by_place(depend[n]) if n in depend else f'{v:.5g}'}"
-        for n, v in data["parameters_after"].items()
-        if n in data["parameters_refitted"] and data["augmented_model"]
-    ]
-    lines += [f"Parameters, refitted without and with it: {', '.join(moved)}."] if moved else []
-    if moved and data.get("beyond_noise"):
-        lines.append("These values hold only if nothing else is missing: what remains is more than the noise.")
-    counting = counting_line({"status": "converged"}, data) if moved else ""
-    lines += [counting] if counting else []
-    told = "Next: `hvdc-ident letter STUDY` writes one page on this for the model's owner."
-    return [*lines, *data["notes"], *([told] if data["augmented_model"] else [])]
+    said = f"{data['verdict']}: {data['text']}"
+    return [said, "", *screen(summarise({"discrepancy": data}), more=data["notes"])]
 
 
 def verdict(data: Mapping[str, Any]) -> str:

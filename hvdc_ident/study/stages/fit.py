@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
-from hvdc_ident.text import figures_of, interval_text, interval_words
 
 if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
@@ -80,37 +79,19 @@ def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str
 
 
 def lines_of(data: Mapping[str, Any]) -> list[str]:
-    """The status and the verdict on the residuals, then every estimate beside its given value, then what is held."""
-    from hvdc_ident.fit.result import FIT_WORDS
+    """The status and the verdict on the residuals, the values, what is to be said of each, and what to do next."""
     from hvdc_ident.study.measured_responses import response_lines
+    from hvdc_ident.summary import summarise
+    from hvdc_ident.summary.phrases import remarks
+    from hvdc_ident.summary.screen import lines_of as screen
+    from hvdc_ident.text import capital
 
-    lines = [f"{data['status']}: {data['message']}"]
-    judged = data.get("adequacy") or {}
-    lines += [f"{FIT_WORDS[judged['verdict']]}: {judged['text']}."] if judged.get("text") else []
-    lines += [f"Next: {judged['next']}"] if judged.get("next") else []
-    lines += [f"{data['roughness']['text']}."] if data.get("roughness") else []
-    chi2 = judged.get("chi2_per_dof")
-    # How large the residual is against the noise that every interval rests on.
-    beside = f"chi2/dof {chi2:.3g}" if chi2 is not None else "noise from the residual"
-    words = "95 %" if judged.get("verdict") != "does-not-fit" else interval_words(beyond_noise=True)
-    for name, e in data["estimates"].items():
-        unit = f" {e['unit']}" if e["unit"] else ""
-        given = f" (given {data['candidates'][name]['given']:.6g})"
-        value = f"{e['value']:.{figures_of(e['ci95'])}g}"
-        lines.append(f"{name} = {value}{unit}{given}{_interval(e['ci95'], words, beside)}" + _note(e))
-    held = [n for n in data["candidates"] if n not in data["estimates"]]
-    lines += [f"{n}: held, {data['held'][n]}" for n in held if n in data["held"]]
-    lines += _conditions(data)
-    lines += response_lines(data.get("responses", ()), "fitted")
-    lines += _searched(data)
-    if data["estimates"] and not judged.get("next"):
-        lines.append("Next: `hvdc-ident export STUDY --to FILE` writes the model with these values (.fmu, .mo, .toml).")
-    return lines
-
-
-def _interval(ci95: Sequence[float | None] | None, words: str, beside: str) -> str:
-    ends = interval_text(ci95)
-    return f", {words}: {ends} ({beside})" if ends else ""
+    judged = (data.get("adequacy") or {}).get("text")
+    more = [f"{capital(judged)}."] if judged else []
+    more += [f"{data['roughness']['text']}."] if data.get("roughness") else []
+    more += [f"{n}: {remark}." for n, remark in remarks(data).items()] + _conditions(data)
+    more += [*response_lines(data.get("responses", ()), "fitted"), *_searched(data)]
+    return [f"{data['status']}: {data['message']}", "", *screen(summarise({"fit": data}), more=more)]
 
 
 def _conditions(data: Mapping[str, Any]) -> list[str]:
@@ -125,19 +106,6 @@ def _conditions(data: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _note(estimate: Mapping[str, Any]) -> str:
-    """The reason that goes with an estimate, and the interval of independent residuals where it is a far smaller one."""
-    from hvdc_ident.fit.uncertainty import WIDER
-
-    plain, ci95 = estimate.get("ci95_independent"), estimate["ci95"]
-    text = estimate["reason"]
-    if plain and ci95 and None not in ci95 and ci95[1] - ci95[0] > WIDER * (plain[1] - plain[0]):
-        why = "" if "residuals are correlated" in text else "the residuals are correlated; "
-        text = f"{text.rstrip('.')}; {why}" if text else why
-        text += f"as if they were independent: {plain[0]:.6g} to {plain[1]:.6g}"
-    return f" ({text})" if text else ""
-
-
 def _searched(data: Mapping[str, Any]) -> list[str]:
     """The range of each fitted parameter that has a bound missing: the results speak of what lies in it."""
     rows = {n: c for n, c in data["candidates"].items() if n in data["fitted"] and None in (c["min"], c["max"])}
@@ -146,13 +114,8 @@ def _searched(data: Mapping[str, Any]) -> list[str]:
 
 
 def verdict(data: Mapping[str, Any]) -> str:
-    """Return any doubt about the search, the fit's status, and the verdict on its residuals."""
-    from hvdc_ident.fit.result import FIT_WORDS
-
-    judged = (data.get("adequacy") or {}).get("verdict")
-    words = FIT_WORDS[judged] if judged else ""
-    parts = (data.get("search_doubt"), data["status"], f"{words[:1].lower()}{words[1:]}")
-    return "; ".join(str(part) for part in parts if part)
+    """Return any doubt about the search, and the fit's status."""
+    return "; ".join(str(part) for part in (data.get("search_doubt"), data["status"]) if part)
 
 
 STAGE = Stage(

@@ -95,6 +95,9 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
 
     A misfit comes first and its size stands beside every interval: what is read alone is to be believed alone.
     """
+    from hvdc_ident.summary import summarise
+    from hvdc_ident.summary.phrases import next_sentence
+
     width = max(map(len, data["parameters"]), default=0)
     doubt = (data.get("pilot") or {}).get("search_doubt")
     lines = [f"{doubt[:1].upper()}{doubt[1:]}."] if doubt else []
@@ -108,8 +111,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     for name, v in data["parameters"].items():
         lines.append(f"{name:{width}}  {v['verdict']}: {v['reason']}{beside if v['ci95'] else ''}")
     lines += data["notes"]
-    advice = data["recommended_experiment"]
-    lines += [f"Measure next: {advice['text']}"] if advice else []
+    lines += map(next_sentence, summarise({"identifiability": data}).next)
     names = listed(data.get("identifiable") or ())
     return [*lines, f"Next: `hvdc-ident fit STUDY` estimates {names}."] if names else lines
 
@@ -121,8 +123,7 @@ def verdict(data: Mapping[str, Any]) -> str:
         groups.setdefault(v["verdict"], []).append(name)
     found = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
     doubt = (data.get("pilot") or {}).get("search_doubt")
-    found = f"{doubt}; {found}" if doubt else found
-    return f"{found}; the model does not explain these data" if data["misspecified"] else found
+    return f"{doubt}; {found}" if doubt else found
 
 
 STAGE = Stage(

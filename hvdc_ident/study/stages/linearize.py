@@ -127,8 +127,8 @@ def with_model(study: Study, selected: ValueSet) -> Study:
 
 def lines_of(data: Mapping[str, Any]) -> list[str]:
     """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
-    from hvdc_ident.study.linear_analysis import lines
     from hvdc_ident.study.measured_responses import response_lines
+    from hvdc_ident.summary.linear import lines
     from hvdc_ident.text import listed
 
     def described(found: Mapping[str, Any], of: str) -> list[str]:
@@ -149,7 +149,7 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
 
 def verdict(data: Mapping[str, Any]) -> str:
     """Return the stability of the operating point, and the least damped mode."""
-    from hvdc_ident.study.linear_analysis import stability
+    from hvdc_ident.summary.linear import stability
 
     swinging = [m for m in data["modes"] if m["eigenvalue"][1] > 0]
     least = min(swinging, key=lambda m: m["damping"], default=None)

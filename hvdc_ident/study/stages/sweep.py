@@ -116,7 +116,7 @@ def swept_names(tables: Sequence[schema.SweepTable]) -> tuple[Want, ...]:
 
 def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """Return the number of points, the reason of the first that failed, and where the error of each series is smallest."""
-    best: dict[tuple[str, str], tuple[float, Mapping[str, float]]] = {}
+    found: dict[tuple[str, str], list[tuple[float, Mapping[str, float]]]] = {}
     reason = ""
     for point in data["points"]:
         if point["status"] != "done":
@@ -124,13 +124,15 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
             continue
         for output, line in point["rmse"].items():
             for experiment, error in line.items():
-                if (output, experiment) not in best or error < best[output, experiment][0]:
-                    best[output, experiment] = error, point["values"]
+                found.setdefault((output, experiment), []).append((error, point["values"]))
     lines = [f"{data['count']} points of {', '.join(data['parameters'])}, {data['failed']} failed{reason}"]
-    for (output, experiment), (error, values) in best.items():
+    for (output, experiment), each in found.items():
+        (error, values), (largest, _) = min(each, key=lambda e: e[0]), max(each, key=lambda e: e[0])
         at = ", ".join(f"{n} = {v:.6g}" for n, v in values.items())
         size = f"{error:.4g} {data['units'].get(output, '')}".rstrip()
-        lines.append(f"{output} in {experiment}: smallest RMSE {size}, at {at}")
+        flat = f"{error:.3g}" == f"{largest:.3g}"
+        said = f"RMSE {size} at every point" if flat else f"smallest RMSE {size}, at {at}"
+        lines.append(f"{output} in {experiment}: {said}")
     return lines
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,8 @@ import numpy as np
 from hvdc_ident.data import Trajectory
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import csv_name
+from hvdc_ident.summary.run_summary import RunSummary
+from hvdc_ident.summary.summarise import STAGES, judgements_of, lines_of, summarise
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,11 @@ class Results:
         """The JSON of a stage, empty where it has not run."""
         return self.stages.get(stage, {})
 
+    @cached_property
+    def summary(self) -> RunSummary:
+        """What the results say."""
+        return summarise(self.stages, self.swing, self.heading)
+
     @property
     def units(self) -> dict[str, str]:
         """Unit of every recorded output, by its name."""
@@ -78,8 +85,21 @@ class Results:
 
     @property
     def heading(self) -> dict[str, Any]:
-        """Schema, study, model, software, seed and sources, from the last stage of the chain that has them."""
-        return self.get("run") or self.get("fit") or next(iter(self.stages.values()))
+        """Schema, study, model, software, seed and sources of the last run."""
+        return self.get("summary") or self.get("run") or self.get("fit") or next(iter(self.stages.values()))
+
+    def windows(self, name: str | None) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+        """Yield output, experiment and the errors within the windows of the profile, of every signal with a set of values."""
+        for output, experiment, about in lines_of(judgements_of(self.stages).get(name, {}) if name else {}):
+            yield output, experiment, about["windows"]
+
+    def swing(self, output: str, experiment: str) -> float | None:
+        """The peak-to-peak value of a recorded signal, in its unit; None where its recording is not at hand."""
+        for stage in STAGES.values():
+            table, column = self.table(f"{stage}.{experiment}.csv"), f"{output}.measured"
+            if table is not None and column in table.names and np.isfinite(table[column]).any():
+                return float(np.nanmax(table[column]) - np.nanmin(table[column]))
+        return None
 
     @cached_property
     def _tables(self) -> dict[str, Trajectory | None]:
@@ -113,18 +133,3 @@ def _filled(line: str) -> str:
     if ",," not in line and not line.rstrip().endswith(","):
         return line
     return ",".join(cell.strip() or "nan" for cell in line.split(","))
-
-
-@dataclass(frozen=True)
-class Section:
-    """A part of the page that opens on demand.
-
-    order: its place. title: its heading. about: one sentence on what it shows, which stands beside the heading. render: its
-    HTML from the results (empty: the part is left out). printed: whether a print shows it; of the others it has the heading.
-    """
-
-    order: int
-    title: str
-    about: str
-    render: Callable[[Results], str]
-    printed: bool = False

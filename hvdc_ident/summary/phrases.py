@@ -1,0 +1,289 @@
+"""The words of a summary: sentences that terminal, report, letter, notebook and workbench share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Literal
+
+from hvdc_ident.fit.uncertainty import WIDER
+from hvdc_ident.summary.run_summary import (
+    FindingSummary,
+    NextStep,
+    ParameterSummary,
+    Quantity,
+    Remainder,
+    RunSummary,
+    SetSummary,
+    SignalError,
+    SignalSummary,
+)
+from hvdc_ident.text import (
+    capital,
+    figures,
+    interval_text,
+    interval_words,
+    listed,
+    one_of,
+    percentage,
+    quantity,
+    times_text,
+    value_by_place,
+)
+
+WORDS: dict[str, str] = {"given": "given values", "fitted": "fitted", "effect": "with the effect"}
+"""Names of the sets of values."""
+SUBJECTS: dict[str, str] = {
+    "given": "The model with its given values",
+    "fitted": "The fitted model",
+    "effect": "The model with the effect",
+}
+AT_BOUND = "at its bound"
+Door = Literal["shell", "python", "page"]
+"""Where a sentence is read, which decides how a thing to do is called there."""
+TO_DO: dict[str, dict[Door, str]] = {
+    "diagnose": {"shell": "`hvdc-ident diagnose STUDY`", "python": "`hi.diagnose(...)`", "page": "the stage diagnose"},
+    "letter": {"shell": "`hvdc-ident letter STUDY`", "python": "`hvdc-ident letter`", "page": "the button Letter"},
+    "export": {
+        "shell": "`hvdc-ident export STUDY --to FILE`",
+        "python": "`hi.export(...)`",
+        "page": "a button below Take away",
+    },
+}
+PURPOSES = {
+    "diagnose": "looks for what the model lacks",
+    "letter": "writes one page on this for the model's owner",
+    "export": "writes the model with the values that count (.fmu, .mo, .toml)",
+}
+
+
+# --- whether the model follows ---
+
+
+def verdict_sentence(s: RunSummary) -> str:
+    """Return whether the model follows its recordings: with which values, against what, and whether it does with the effect."""
+    if s.judged is None or s.about is None:
+        return "No recording was compared with the model."
+    subject, judged = SUBJECTS[s.about], s.judged
+    count = judged.deciding
+    if not count.judged:
+        return f"{subject} is not judged: neither the noise of the recordings nor a tolerance is known."
+    rest = not_judged(s, judged, limits=judged.by != "noise")
+    if not count.failed:
+        return f"{subject} {kept(judged, rest)}{f'; {rest}' if rest else ''}."
+    kind = "does not follow the recordings to their noise" if judged.by == "noise" else "does not keep the tolerance"
+    if judged.by == "noise" and judged.in_limits.verdict:
+        kind += ", but keeps the windows of the tolerance profile"
+    return f"{subject} {kind}{_mended(s, judged)}."
+
+
+def kept(judged: SetSummary, rest: str) -> str:
+    """Return what a model does that passes. rest: the phrase on signals that are not judged."""
+    count = judged.deciding.judged
+    signals = f"the {count} signal{'s that are' if count > 1 else ' that is'} judged" if rest else ""
+    if judged.by == "noise":
+        return f"follows {signals} to the noise" if rest else "follows every recorded signal to its noise"
+    return f"keeps the tolerance{f' in {signals}' if rest else ''}"
+
+
+def _mended(s: RunSummary, judged: SetSummary) -> str:
+    if "effect" not in s.sets:
+        return ""
+    after = s.sets["effect"].on_noise if judged.by == "noise" else s.sets["effect"].in_limits
+    some = ", where it is judged" if after.not_judged else ""
+    return f"; with the effect it does{some}" if after.passed and not after.failed else ""
+
+
+def not_judged(s: RunSummary, judged: SetSummary, *, limits: bool) -> str:
+    """Return a phrase on the signals without a verdict, in the limits or else by their noise, and what to state; "" without any."""
+    count = (judged.in_limits if limits else judged.on_noise).not_judged
+    if not count:
+        return ""
+    said = f"{count} signal{'s' if count > 1 else ''} not judged"
+    if not limits:
+        return f"{said}: state the noise of {listed(judged.noise_unknown)}"
+    if s.limits == "tolerance":
+        return f"{said}: the study states no tolerance for {listed(o for each in judged.not_judged.values() for o in each)}"
+    reasons = [f"{one_of(outputs)} ({reason})" for reason, outputs in judged.not_judged.items()]
+    return f"{said}: {'; '.join(reasons)}" if reasons else said
+
+
+def windows_name(s: RunSummary) -> str:
+    """Return the standard that the windows come from, else the name of their profile."""
+    return str(s.profile.get("source", "")).split(" (")[0] or str(s.profile.get("name", ""))
+
+
+def error_text(signal: SignalSummary, error: SignalError) -> str:
+    """Return the RMSE of a signal in its unit and as a multiple of its noise."""
+    size = f"{figures(error.rmse, 2)} {signal.unit}".rstrip()
+    times = f", {times_text(error.times_noise)} the noise of the recording" if error.times_noise is not None else ""
+    return f"{size}{times}"
+
+
+def worst_text(s: RunSummary) -> str:
+    """Return the worst signal with its error at the values that the verdict is about; empty without one."""
+    signal = s.signal(s.judged.worst) if s.judged is not None else None
+    if signal is None or s.about is None:
+        return ""
+    return f"{signal.output} in {signal.experiment}, RMSE {error_text(signal, signal.errors[s.about])}"
+
+
+# --- the values ---
+
+
+def size_text(q: Quantity) -> str:
+    """Return a quantity with its unit and the digits that its interval leaves."""
+    return quantity(q.value, q.unit, interval=q.interval)
+
+
+def sizes_text(sizes: Mapping[str, Quantity]) -> str:
+    """Return quantities by their names, without the digits of an interval: "T = 350 ms and k = 2"."""
+    return listed(f"{n} = {quantity(q.value, q.unit)}" for n, q in sizes.items())
+
+
+def interval_name(s: RunSummary, name: str) -> str:
+    """Return what the intervals of a set of values are called: of a model that leaves more than noise none has a chance of 95 %."""
+    return interval_words(beyond_noise=s.conditional[name])
+
+
+def by_place(p: ParameterSummary) -> str:
+    """Return the values of a parameter that depend on what is missing where, in words; empty for another one."""
+    return value_by_place([{**vars(v), "from": v.source} for v in p.by_place])
+
+
+def asked_text(p: ParameterSummary, *, interval: bool = False, change: bool = True) -> str:
+    """Return the value that the recordings ask for in place of the given one; on demand with its interval and the change."""
+    assert p.asked is not None and p.given is not None
+    both = p.asked.interval is not None and None not in p.asked.interval
+    ends = f" (95 %: {interval_text(p.asked.interval)})" if interval and both else ""
+    moved = f" ({signed_text(p.change)})" if change and p.change is not None else ""
+    return f"{p.name} = {size_text(p.asked)}{ends} in place of {figures(p.given, 6)}{moved}"
+
+
+def signed_text(share: float) -> str:
+    """Return a share with its sign in per cent; nothing has no sign."""
+    shown = f"{100.0 * share:+.1f} %"
+    return "0.0 %" if shown[1:] == "0.0 %" else shown
+
+
+def note_text(p: ParameterSummary) -> str:
+    """Return that a value is on a bound, or why it is held, in a few words; empty for another one."""
+    return AT_BOUND if p.at_bound else f"held, {p.reason.split(':')[0]}" if p.reason else ""
+
+
+def remarks(fit: Mapping[str, Any]) -> dict[str, str]:
+    """Return by candidate why it is held, or what its interval rests on; nothing of one without a remark. fit: the JSON."""
+    found = {}
+    for name in fit.get("candidates") or ():
+        own, why = (fit.get("estimates") or {}).get(name) or {}, (fit.get("held") or {}).get(name)
+        notes = [f"held: {why}"] if why else []
+        notes += ["on a bound, one-sided interval"] if own.get("method") == "one-sided" else []
+        notes += [f"estimated with {listed(own['conditional_on'])} held"] if own.get("conditional_on") else []
+        notes += [str(own["reason"]).rstrip(".")] if own.get("reason") else []
+        alone, ends = own.get("ci95_independent"), own.get("ci95")
+        if alone and ends and None not in ends and ends[1] - ends[0] > WIDER * (alone[1] - alone[0]):
+            notes.append(f"as if the residuals were independent: {interval_text(alone)}")
+        if notes:
+            found[name] = "; ".join(notes)
+    return found
+
+
+def condition(s: RunSummary, subject: str = "They") -> str:
+    """Return what the values that count rest on, in sentences; empty where the search was sure and what is left is noise."""
+    found = []
+    if s.counting.name == "fit" and s.search_doubt:
+        found.append(f"{subject} may not be the best there are: {s.search_doubt}.")
+        subject = "They"
+    if s.counting.name and s.counts_conditional:
+        found.append(f"{subject} hold only if nothing else is missing: what remains is more than the noise.")
+    return " ".join(found)
+
+
+def counting_sentence(s: RunSummary, door: Door = "shell") -> str:
+    """Return which of the fitted values count, and what takes them; empty where there is only one set of them."""
+    counts, export = s.counting, TO_DO["export"][door].replace(" STUDY --to FILE", "")
+    if counts.name == "effect":
+        return f"The values that count are those with {counts.added}: fitted-values.* and {export} take them."
+    if counts.name == "fit" and counts.doubt:
+        with_it = f" --values effect takes those with {counts.added}." if counts.added and door == "shell" else ""
+        return f"The values that count are those of the fit without an effect: {counts.doubt}.{with_it}"
+    return ""
+
+
+def which_values(s: RunSummary) -> str:
+    """Return which values the ones that count are, in a sentence."""
+    if s.counting.name == "fit" and s.counting.doubt:
+        return f"Fitted without an effect: {s.counting.doubt}. They may make up for what is missing."
+    if s.counting.kind and any(p.effect is not None or p.by_place for p in s.parameters):
+        kind = "" if s.counting.kind == "effect" else f" ({s.counting.kind})"
+        return f"Fitted together with what the model lacks{kind}."
+    if s.counting.name == "fit" and any(p.fitted is not None for p in s.parameters):
+        return "Fitted; the model has no effect added."
+    return "The fit has no estimates: the model keeps its given values." if s.fit else ""
+
+
+# --- what is missing ---
+
+
+def finding_name(f: FindingSummary) -> str:
+    """Return the effects that a finding may be; of values that are off, that."""
+    return "values that are off" if f.effect == "parameter" else one_of(f.same_as)
+
+
+def place_texts(f: FindingSummary, join: Callable[[Iterable[str]], str] = ", ".join) -> dict[str, float]:
+    """Return likely places with their probabilities, each once, with the signal that is brought in where that tells them apart,
+    and with what the place implies for the values that depend on it."""
+    sources: dict[str, set[str]] = {}
+    for p in f.places:
+        sources.setdefault(join(p.at), set()).add(p.source)
+    found: dict[str, float] = {}
+    for p in f.places:
+        at = join(p.at)
+        at += f" from {p.source}" if p.source and len(sources[at]) > 1 else ""
+        at += f" (then {sizes_text(p.values)})" if p.values else ""
+        found[at] = found.get(at, 0.0) + p.probability
+    return found
+
+
+def remainder_sentence(s: RunSummary) -> str:
+    """Return what is left with the findings in the model; empty where that is noise, or where nothing was added."""
+    r: Remainder = s.remainder
+    if not s.counting.kind or not r.more_than_noise:
+        return ""
+    parts = []
+    if r.share is not None:
+        at = f"; an unknown input at {r.at} would explain it" if r.at else ""
+        parts.append(f"{percentage(r.share)} of the gap is left and is not noise{at}")
+    if r.held_out is not None:
+        times = f" ({times_text(r.record_times)} the noise)" if r.record_times else ""
+        where = f", most of it in {r.record}{times}" if r.record else ""
+        parts.append(f"on held-out recordings {percentage(r.held_out)} is left{where}")
+    told = ". ".join([*parts[:1], *map(capital, parts[1:])])
+    return told or ("" if r.adequate else "what is left is still not noise")
+
+
+def gained_sentence(s: RunSummary) -> str:
+    """Return what the addition does to the error on recordings that no fit has seen; empty where that is not known."""
+    r = s.remainder
+    if r.shrink is None:
+        return ""
+    rest = f"; what is left there is {times_text(r.times)} the noise" if r.times is not None else ""
+    where = "experiments that no fit has seen" if r.against == "experiments" else r.against
+    return (
+        f"Adding it shrinks the error on {where} by {percentage(r.shrink)}, measured against the same model with its "
+        f"parameters fitted and nothing added{rest}."
+    )
+
+
+# --- what to do next ---
+
+
+def next_sentence(step: NextStep, door: Door = "shell") -> str:
+    """Return what to do, as a sentence for a terminal, a notebook or the workbench."""
+    if step.text:
+        return f"Measure next: {step.text}"
+    return f"Next: {TO_DO[step.kind][door]} {PURPOSES[step.kind]}."
+
+
+def advice(s: RunSummary) -> str:
+    """Return what to record next; empty where nothing is advised."""
+    return next((step.text for step in s.next if step.text), "")
