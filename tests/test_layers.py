@@ -20,8 +20,8 @@ fmu linearize sensitivity fit identifiability discrepancy summary report study a
 # Rooms with rooms inside, and the order of those.
 INSIDE = {
     "discrepancy": """
-options result candidates movable nominal hypothesis screen location residual_checks implied evidence pushes stand explain
-stand_ins moves remainder forms met search candidate_table classes findings verdict diagnosis
+options result candidates movable nominal prediction hypothesis screen location residual_checks implied evidence pushes rounds explain
+stand_ins moves remainder forms size_search search candidate_table classes findings verdict diagnosis
 """
 }
 

@@ -7,6 +7,7 @@ of one diagnosis through the modules:
     candidates, movable     every effect at every place in a few sizes; an effect compiled once whose place is chosen at run time
     screen, rounds          all of them simulated, with the parameters' answer; the best refitted in a race
     hypothesis, evidence    effects with sizes and the model's parameters, refitted together; what that gains and leaves
+    prediction              how likely records that it has not seen are under a refit
     size_search             sizes that no slope leads to: levels of a quantiser, periods of a sampler
     search                  one effect after the other, each looked for again beside the others, or done without
     moves                   parameters that were held, and clocks, set free where the records speak against their values
