@@ -6,6 +6,7 @@ filters the power reference with 20 ms.
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import tomllib
 from dataclasses import replace
@@ -93,3 +94,17 @@ def test_responses(case) -> None:
             apart = np.abs(run[output] - expected) / reach
             compared = times == times[-1] if (name, step) in ENDS_ALONE else times != 0.5
             assert apart[compared].max() < 1e-3, (step, output, times[compared][apart[compared].argmax()], apart.max())
+
+
+@pytest.mark.parametrize("name", ["sexs", "ieeeg1", "reeca1-q"])
+def test_the_numbers_are_those_of_andes_where_it_is_installed(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("andes", reason="andes is not installed: pip install '.[bench]'")
+    script = HERE.parents[1] / "benchmarks" / "plants_against_andes.py"
+    spec = importlib.util.spec_from_file_location(script.stem, script)
+    assert spec is not None and spec.loader is not None
+    andes = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(andes)
+    found, recorded = (
+        np.array(e) @ [1.0, 1.0j] for e in (andes.eigenvalues(CASES[name], tmp_path), ANDES[name]["eigenvalues"])
+    )
+    assert np.sort_complex(found) == pytest.approx(np.sort_complex(recorded), rel=1e-6, abs=1e-9)
