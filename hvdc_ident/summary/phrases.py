@@ -194,8 +194,19 @@ def condition(s: RunSummary, subject: str = "They") -> str:
         found.append(f"{subject} may not be the best there are: {s.search_doubt}.")
         subject = "They"
     if s.counting.name and s.counts_conditional:
-        found.append(f"{subject} hold only if nothing else is missing: what remains is more than the noise.")
+        found.append(f"{subject} hold only if nothing else is missing: {why_conditional(s)}.")
     return " ".join(found)
+
+
+def why_conditional(s: RunSummary) -> str:
+    """Return why the values that count hold only if nothing else is missing, as a sentence goes on."""
+    left = s.remainder
+    if s.counting.name == "effect" and left.held_out and not left.share and left.record:
+        return f"in the held-out recording {left.record} more than the noise remains"
+    fitted = s.sets.get("fitted")
+    if s.counting.name == "fit" and s.counting.doubt and fitted is not None and fitted.verdict == "pass":
+        return s.counting.doubt
+    return "what remains is more than the noise"
 
 
 def counting_sentence(s: RunSummary, door: Door = "shell") -> str:

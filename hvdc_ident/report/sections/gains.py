@@ -6,7 +6,7 @@ from typing import Any
 
 from hvdc_ident.report.html import Section, folded, number, rows_of, text
 from hvdc_ident.summary import Results
-from hvdc_ident.summary.phrases import by_place, interval_name, remarks
+from hvdc_ident.summary.phrases import by_place, interval_name, remarks, why_conditional
 from hvdc_ident.summary.run_summary import Interval
 from hvdc_ident.text import capital, change_text, estimate_texts, figures, interval_text, interval_words
 
@@ -37,7 +37,7 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
         counting = "these are the values that count"
     else:
         counting = f"{text(s.counting.doubt)}, so exports take the fitted ones unless --values effect asks for these"
-    conditions = ", if nothing else is missing: what remains is more than the noise" if s.counts_conditional else ""
+    conditions = f", if nothing else is missing: {text(why_conditional(s))}" if s.counts_conditional else ""
     told = (
         "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
         f"effect: the same with the finding in the model; {counting}{conditions}.</p>"
