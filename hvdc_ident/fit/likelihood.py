@@ -23,10 +23,12 @@ from hvdc_ident.errors import StudyError, require_known
 class Loss:
     """A loss of the residual in units of sigma.
 
-    rho: from r, (n,), to the loss, r^2/2 for small r. psi: its derivative. slope: the derivative of that.
+    summary: in words, for the reference. rho: from r, (n,), to the loss, r^2/2 for small r. psi: its derivative. slope: the derivative
+    of that.
     """
 
     name: str
+    summary: str
     rho: Callable[[Array], Array]
     psi: Callable[[Array], Array]
     slope: Callable[[Array], Array]
@@ -58,26 +60,29 @@ class Loss:
 
 
 HUBER, SOFT, CAUCHY = 1.345, 1.287, 2.385
-"""Sizes, in sigma: from the square to a line there; smoothly about there; the logarithm beyond, which may have several optima."""
+"""Sizes of the losses, in sigma."""
 
 LOSSES = {
     loss.name: loss
     for loss in (
-        Loss("linear", lambda r: 0.5 * r**2, lambda r: r, np.ones_like),
+        Loss("linear", "half the square: least squares", lambda r: 0.5 * r**2, lambda r: r, np.ones_like),
         Loss(
             "huber",
+            f"the square up to {HUBER:g} sigma, then a line",
             lambda r: np.asarray(special.huber(HUBER, r)),
             lambda r: np.clip(r, -HUBER, HUBER),
             lambda r: (np.abs(r) <= HUBER).astype(float),
         ),
         Loss(
             "soft-l1",
+            f"a smooth way from the square to a line about {SOFT:g} sigma",
             lambda r: np.asarray(special.pseudo_huber(SOFT, r)),
             lambda r: r / np.sqrt(1.0 + (r / SOFT) ** 2),
             lambda r: (1.0 + (r / SOFT) ** 2) ** -1.5,
         ),
         Loss(
             "cauchy",
+            f"the logarithm beyond {CAUCHY:g} sigma; may have several optima",
             lambda r: 0.5 * CAUCHY**2 * np.log1p((r / CAUCHY) ** 2),
             lambda r: r / (1.0 + (r / CAUCHY) ** 2),
             lambda r: (1.0 - (r / CAUCHY) ** 2) / (1.0 + (r / CAUCHY) ** 2) ** 2,

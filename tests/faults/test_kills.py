@@ -13,7 +13,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="processes canno
 
 
 @pytest.mark.parametrize(
-    ("stage", "kills"), [("sweep", (1, 17, 20)), ("identify", (3, 6, 90)), ("diagnose", (2, 212, 9))]
+    ("stage", "kills"), [("sweep", (1, 17, 20)), ("identify", (3, 6, 9)), ("diagnose", (2, 100, 9))]
 )
 def test_after_kills_the_tables_are_those_of_an_undisturbed_run(tmp_path, stage, kills):
     path = cases.write_study(tmp_path, hidden=0.02 if stage == "diagnose" else 0.0)

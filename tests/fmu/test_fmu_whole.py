@@ -130,7 +130,7 @@ def test_the_page_has_every_stage_and_its_figures(whole):
         "From perfect data of these signals every candidate could be told (numerical, local)",
         "y of the plant follows that of the model with a first-order lag",
         "The model is closed inside",
-        "the effect shrinks the residual by",
+        "Adding it shrinks the error on",
         "differs from central differences by",
     ):
         assert words in re.sub(r"<[^>]+>", "", page), words
