@@ -153,7 +153,7 @@ class Round:
     signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: every refit,
     the best first. ruler: what BIC counts by. forms: the refits of forms outside the catalogue; None where none was looked for.
     form: the one that leaves next to nothing but noise, where no effect that was refitted does. led: by candidate the cost of the refit
-    from whose gains others were looked for.
+    from whose gains others were looked for. promised: candidates that were run beside such gains because they promised most there.
     """
 
     before: Refit
@@ -169,6 +169,7 @@ class Round:
     forms: tuple[CandidateFit, ...] | None = None
     form: FoundForm | None = None
     led: Mapping[int, float] = field(default_factory=dict)
+    promised: frozenset[int] = frozenset()
 
     def answers(self) -> Mapping[str, Pushed]:
         """Return the model's runs with their answers to pushes, by experiment; none of a model that is closed inside."""

@@ -244,7 +244,7 @@ def _neighbours(round_model: RoundModel, opened: Round, lead: CandidateFit, numb
     parts = [k for k in same if len(found[k].at) == 1 and any(found[k].at[0] in found[f].at for f in around)]
     here = [k for k, c in enumerate(found) if set(c.at) <= set(own.at) and not c.still]
     theta = gains_of(opened.before, lead.refit)
-    promising = round_model.order(opened.screen, found, theta)[:FIELD]
+    promising = [k for k in round_model.order(opened.screen, found, theta)[:FIELD] if k not in opened.promised]
     which = list(dict.fromkeys((*here, *like[: 2 * REFITS_PER_EFFECT], *parts, *around, *promising)))
     late = effects()[own.effect].delay_with(sizes)
     for k in promising:  # bends are missed between two sizes
@@ -263,7 +263,8 @@ def _neighbours(round_model: RoundModel, opened: Round, lead: CandidateFit, numb
         # Of an effect in proportion to its size the fall is exact in that, and at the leader's gains hardly moves with them.
         and s.fall >= (Race().near if in_proportion(found[s.candidate], s.probe) else Race().reach) * best
     ]
-    return replace(opened, candidates=tuple(found)), _field(round_model.search, found, near)
+    opened = replace(opened, candidates=tuple(found), promised=opened.promised | frozenset(promising))
+    return opened, _field(round_model.search, found, near)
 
 
 def _denser(candidate: CandidateEffect) -> CandidateEffect:
