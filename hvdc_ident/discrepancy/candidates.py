@@ -24,7 +24,7 @@ from hvdc_ident.effects import (
 )
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model, insertion_point
+from hvdc_ident.model import AnyModel, Model, insertion_point, reached
 
 Signals = Mapping[str, tuple[Array, ...]]
 """By place: the signal in each fitted experiment."""
@@ -291,18 +291,9 @@ def _moves(model: AnyModel, place: str) -> bool:
     kind, name = kind_of(model, place), place
     if kind in ("input", "state", "output", "algebraic") or not isinstance(model, Model):
         return True
-    seen: set[str] = set()
-    stack = [name]
-    while stack:
-        n = stack.pop()
-        if n in seen:
-            continue
-        seen.add(n)
-        if n in model.signals:
-            stack.extend(s.name for s in model.signals[n].value.free_symbols)
-        elif n not in model.parameters:
-            return True
-    return False
+    signals = model.signals
+    found = reached([name], lambda n: [s.name for s in signals[n].value.free_symbols] if n in signals else [])
+    return any(n not in signals and n not in model.parameters for n in found)
 
 
 def source_signals(model: AnyModel, signals: Signals) -> tuple[str, ...]:

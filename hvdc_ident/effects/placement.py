@@ -26,6 +26,7 @@ from hvdc_ident.model import (
     fresh,
     insertion_point,
     insertion_point_of,
+    reached,
     rewritten,
     with_derivative_signal,
 )
@@ -253,15 +254,11 @@ def _at_one(
 def leads_back(model: Model, name: str) -> bool:
     """Return True where a signal or unknown is computed from itself, through other signals and unknowns alone."""
     equations = {n: s.value for n, s in model.signals.items()} | {n: a.equation for n, a in model.algebraic.items()}
-    seen: set[str] = set()
-    stack = [name]
-    while stack:
-        used = {s.name for s in equations[stack.pop()].free_symbols} & equations.keys()
-        if name in used:
-            return True
-        stack.extend(used - seen)
-        seen |= used
-    return False
+
+    def used(n: str) -> set[str]:
+        return {s.name for s in equations[n].free_symbols} & equations.keys()
+
+    return name in reached(used(name), used)
 
 
 def _parameters(use: EffectUse, effect: Effect, where: str) -> Mapping[str, EffectParameter]:

@@ -1,7 +1,7 @@
 """Models, their text form, and models made from models."""
 
 from hvdc_ident.model.card import parse_card, read_card, save_card, write_card
-from hvdc_ident.model.check import coerced, dependency_order, ordered_signals, used_names
+from hvdc_ident.model.check import coerced, dependency_order, ordered_signals, reached, used_names
 from hvdc_ident.model.definition import (
     Algebraic,
     AnyModel,
@@ -48,6 +48,7 @@ __all__ = [
     "insertion_point_of",
     "ordered_signals",
     "parse_card",
+    "reached",
     "read_card",
     "recording",
     "rewritten",

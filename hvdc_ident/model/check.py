@@ -290,6 +290,18 @@ def used_names(model: Model) -> frozenset[str]:
     return frozenset().union(*(_used(e) for _, _, _, e, _ in _expressions(model)))
 
 
+def reached(begin: Iterable[str], onwards: Callable[[str], Iterable[str]]) -> Iterator[str]:
+    """Yield the names that some lead to step by step, these included, each once. onwards: the names that one leads to at once."""
+    found: set[str] = set()
+    left = list(begin)
+    while left:
+        name = left.pop()
+        if name not in found:
+            found.add(name)
+            yield name
+            left.extend(onwards(name))
+
+
 def _check_symbols(model: Model) -> None:
     names = {*model.names, "time"}
     for section, name, part, expression, only_parameters in _expressions(model):

@@ -8,10 +8,12 @@ from fnmatch import fnmatchcase
 import sympy as sp
 
 from hvdc_ident.expression import symbol
-from hvdc_ident.model import Model, insertion_point
+from hvdc_ident.model import Model, insertion_point, reached
 
 
-def block_signals(model: Model, patterns: Sequence[str], moving: Collection[str], outputs: Collection[str]) -> tuple[str, ...]:
+def block_signals(
+    model: Model, patterns: Sequence[str], moving: Collection[str], outputs: Collection[str]
+) -> tuple[str, ...]:
     """Return the insertion points that one of the patterns matches and that are signals of the block diagram.
 
     moving: inputs that move; outputs: that are seen. With the parameters at their values, so that the flags choose branches, a signal
@@ -35,7 +37,7 @@ def block_signals(model: Model, patterns: Sequence[str], moving: Collection[str]
 
 
 class _Diagram:
-    """What each signal, state and output of a model depends on, with the parameters at their values."""
+    """Dependences of the signals, states and outputs of a model on each other, with the parameters at their values."""
 
     def __init__(self, model: Model) -> None:
         self._model = model
@@ -58,24 +60,14 @@ class _Diagram:
     def reached_from(self, inputs: Iterable[str]) -> set[str]:
         """Return what moves: the inputs, the states with a derivative that is not 0, and what depends on them."""
         states = {n for n in self._model.states if self._own[n] != 0} | set(self._model.algebraic)
-        found, left = set[str](), [*inputs, *states]
         users = self._users()
-        while left:
-            name = left.pop()
-            if name not in found:
-                found.add(name)
-                left += [n for n in users.get(name, ()) if n not in self._model.states]
-        return found
+        return set(
+            reached([*inputs, *states], lambda name: [n for n in users.get(name, ()) if n not in self._model.states])
+        )
 
     def leading_to(self, outputs: Iterable[str]) -> set[str]:
         """Return what the outputs depend on."""
-        found, left = set[str](), list(outputs)
-        while left:
-            name = left.pop()
-            if name not in found:
-                found.add(name)
-                left += self._uses.get(name, ())
-        return found
+        return set(reached(outputs, lambda name: self._uses.get(name, ())))
 
     def unit(self, name: str) -> str:
         """Return the unit of a signal, a state or an unknown; empty where it has none."""

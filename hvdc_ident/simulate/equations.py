@@ -18,7 +18,7 @@ import sympy as sp
 
 from hvdc_ident.errors import require_known, unknown_name
 from hvdc_ident.expression import symbol
-from hvdc_ident.model import Model, dependency_order
+from hvdc_ident.model import Model, dependency_order, reached
 from hvdc_ident.simulate.codegen import Elimination, Function, Row, eliminate, function_text, solve_text
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.object_code import Code
@@ -51,17 +51,10 @@ def _names(e: sp.Expr) -> set[str]:
 
 
 def _leads_back(start: str, uses: dict[str, set[str]], cut: set[str]) -> bool:
-    seen: set[str] = set()
-    stack = [n for n in uses[start] if n in uses]
-    while stack:
-        n = stack.pop()
-        if n == start:
-            return True
-        if n in seen or n in cut:
-            continue
-        seen.add(n)
-        stack.extend(k for k in uses[n] if k in uses)
-    return False
+    def onwards(n: str) -> set[str]:
+        return set() if n in cut else uses[n] & uses.keys()
+
+    return start in reached(onwards(start), onwards)
 
 
 @dataclass(frozen=True)
