@@ -40,7 +40,7 @@ class Table:
 
     @property
     def numeric(self) -> list[bool]:
-        """Whether each column holds numbers alone."""
+        """By column True where it holds numbers alone."""
         return [all(_is_number(row[k]) for row in self.rows) for k in range(len(self.header))]
 
     def without_empty(self) -> Table:

@@ -226,7 +226,7 @@ EXPECTED = {
     "string_too_short": "a name",
     "string_too_long": "at most {max_length} characters",
 }
-"""What was expected, by pydantic's kind of error and in its numbers."""
+"""Words for what was expected, by pydantic's kind of error and with its numbers."""
 
 
 def validated(kind: type[Table], table: dict[str, Any], where: str, error: type[InputError]) -> Table:

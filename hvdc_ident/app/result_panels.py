@@ -50,7 +50,7 @@ class FoundResults:
 
     @cached_property
     def summary(self) -> RunSummary:
-        """What the results say."""
+        """Summary of the results."""
         return summarise({Path(stage(n).file).stem: data for n, data in self.data.items()})
 
 

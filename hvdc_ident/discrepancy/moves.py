@@ -28,7 +28,7 @@ from hvdc_ident.text import listed, quantity
 
 STATED_ERROR = 0.02
 """Share by which the stated value of a parameter that is no candidate may be off: data sheets and tests are no better."""
-LEAST_INDEPENDENT = 1e-6
+LEAST_INDEPENDENT_POWER = 1e-6
 """Share of its squared derivative that the others must not make good, for a parameter to be determined at all."""
 DIFFERENCE_STEP = 1e-3
 """Share of a value, or of its range where that is 0, by which it is moved for a derivative."""
@@ -126,7 +126,7 @@ def _most_wanted(search: SearchContext, here: Refit, held: Sequence[FitParameter
     whole = np.column_stack([_derivative(here, f, nominal.residual) for f in held])
     columns = nominal.projected(whole)
     power = np.sum(columns**2, axis=0)
-    determined = power > LEAST_INDEPENDENT * np.sum(whole**2, axis=0)
+    determined = power > LEAST_INDEPENDENT_POWER * np.sum(whole**2, axis=0)
     falls = np.where(determined, (columns.T @ nominal.residual) ** 2 / np.where(determined, power, 1.0), 0.0)
     k = int(np.argmax(falls))
     # In chi2 of the noise: of a misfit its own size is no measure of what may be left.

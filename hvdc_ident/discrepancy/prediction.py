@@ -1,4 +1,4 @@
-"""What a refit predicts of data that it has not seen: the held-out experiments, or each part of the fitted ones from the others.
+"""Predictions of data that a refit has not seen: the held-out experiments, or each part of the fitted ones from the others.
 
 A prediction is scored by -2 log p of the rows under the refitted model (to first order, Gaussian), less that of noise alone at 0:
 e' S^-1 e + log det S, with the error e in noise units and its covariance S = I + J C J'. C is that of the unknowns by the data of the

@@ -186,7 +186,7 @@ class RoundModel:
 
     @classmethod
     def of(cls, search: SearchContext, before: Refit, found: Sequence[CandidateEffect], number: int) -> RoundModel:
-        """Return the stand for some candidates on a model; number: of the round, for its noise."""
+        """Return what candidates are compared on, on a model; number: of the round, for its noise."""
         nominal = before.nominal()
         fewer = thinned(nominal)
         noise = fewer.projected(fewer.drawn(search.options.bootstraps, search.seed + number))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,6 +159,13 @@ SKETCHED = 1024
 """Sums of rows that are kept of an answer: products of two answers are those of all rows to a thirtieth of their lengths."""
 
 
+@lru_cache(maxsize=4)
+def _sums(rows: int) -> tuple[NDArray[np.intp], Array]:
+    """Return the sum that each row goes to, and its sign, both (rows,)."""
+    random = np.random.default_rng(0)
+    return random.integers(SKETCHED, size=rows), random.choice([-1.0, 1.0], size=rows)
+
+
 @dataclass(frozen=True)
 class Sketch:
     """Sums of rows with random signs, which keep the products of columns about as they are (Charikar, Chen and Farach-Colton 2002).
@@ -168,16 +175,11 @@ class Sketch:
 
     rows: int
 
-    @cached_property
-    def _sums(self) -> tuple[NDArray[np.intp], Array]:
-        random = np.random.default_rng(0)
-        return random.integers(SKETCHED, size=self.rows), random.choice([-1.0, 1.0], size=self.rows)
-
     def __call__(self, column: Array) -> Array:
         """Return (m,) of a column (N,)."""
         if self.rows <= SKETCHED:
             return column
-        to, sign = self._sums
+        to, sign = _sums(self.rows)
         return np.asarray(np.bincount(to, sign * column, SKETCHED), dtype=float)
 
     def kept(self, answer: Array) -> NDArray[np.float32]:
@@ -452,7 +454,9 @@ class _Runner:
         known = own.values(theta) if candidate.named else {}
         named = {n: known.get(str(p), setup.model.parameters[str(p)].value) for n, p in candidate.named.items()}
         values = moved.placed(candidate) | moved.sized({**probe.values, **named})
-        if effects()[candidate.effect].self_exciting:  # what it does at the first row is no state that the plant rests in
+        if effects()[
+            candidate.effect
+        ].self_exciting:  # what it does at the first row is no state that the plant rests in
             return _residual(self._from_rest[loop], theta, values)
         try:
             return _residual(self._problems[loop], theta, values)

@@ -125,7 +125,7 @@ _WORDS = {
     "or": "where(c or d, a, b) is written where(c, a, where(d, a, b))",
     "not": "where(not c, a, b) is written where(c, b, a)",
 }
-"""What other languages choose by, and how it is written here."""
+"""Choices as other languages write them, and how they are written here."""
 _MARKS = {"?": "?", "&": "and", "|": "or", "!": "not", "~": "not"}
 _CHOICES = (r"(?P<a>.+?)\bif\b(?P<c>.+?)\belse\b(?P<b>.+)", r"(?P<c>.+?)\?(?P<a>.+?):(?P<b>.+)")
 

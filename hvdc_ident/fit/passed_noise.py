@@ -26,7 +26,7 @@ SIZE = 2.0
 
 @dataclass(frozen=True, eq=False)
 class PassedNoise:
-    """What the noise of an experiment's recorded inputs makes of its outputs.
+    """Noise of an experiment's recorded inputs as it stands in its outputs.
 
     time: (n,) instants of the inputs' rows, s; level: (n,) weights with which they make the level that the model starts from.
     noise, held: of each input, and whether it holds its rows' values. spacing: s; steps: by output (inputs, m) the answers to a step of

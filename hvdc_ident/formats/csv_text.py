@@ -39,7 +39,7 @@ _MAX_LINE = 32 * 1024**2  # characters
 _SEPARATORS = (";", "\t", ",")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _DATED = re.compile(r":|[^\W\d_]{3}.*\d|\d[-/ ]\w+[-/ ]\d|\d{1,2}\.\d{1,2}\.\d{2,4}\b|\d{8}[T ]\d")
-"""What a date or time of day looks like, in whatever order."""
+"""Pattern of a date or time of day, in whatever order."""
 _DATES = "as in 2026-11-21 10:15:00.020, 21/11/2026 10:15:00 or 21-Nov-2026 10:15:00"
 _MISSING = {
     "", "nan", "-nan", "+nan", "na", "n/a", "#n/a", "#na", "#nv", "#n/d", "null", "none", "<na>", "1.#qnan", "-1.#qnan",

@@ -22,7 +22,7 @@ UNCONNECTED = FrozenMap(
     {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0"}
     | {"wg": "1", "wt": "1", "wref": "1", "theta": "0", "theta_start": "0", "dPm": "0"}
 )
-"""What an input is that no other component gives: no stabiliser, no limiter (a gate stays open), nominal frequency and speed, no
+"""Values of inputs that no other component gives: no stabiliser, no limiter (a gate stays open), nominal frequency and speed, no
 turbine and no pitch."""
 AHEAD = FrozenMap({"Pref0": "Pref"})
 """Inputs that follow a signal of another name, ahead of the part that takes it and gives it on changed: the torque controller of a wind
@@ -43,8 +43,8 @@ SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", 
 
 
 METER = "freq.dwn"
-"""What controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts. A machine, which
-has a speed of its own in the frame, takes that of the frame."""
+"""Signal that controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts. A
+machine, which has a speed of its own in the frame, takes that of the frame."""
 MACHINE = "gen"
 NAMES = FrozenMap(
     {"Ir": MACHINE, "wg": "drive", "dPm": "aero", "theta": "pitch", "wref": "torque"}

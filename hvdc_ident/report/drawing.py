@@ -76,7 +76,7 @@ def bode_axes(fig: Figure, columns: int = 1) -> list[tuple[Axes, Axes]]:
 def draw_response(
     pair: tuple[Axes, Axes], omega: Array, values: NDArray[np.complex128], label: str | None = None, **style: Any
 ) -> bool:
-    """Whether a response over frequency, rad/s, was drawn as gain and phase: one that is 0 everywhere is not."""
+    """Return whether a response over frequency, rad/s, was drawn as gain and phase: one that is 0 everywhere is not."""
     keep = (omega > 0) & (np.abs(values) > 0)
     if not keep.any():
         return False

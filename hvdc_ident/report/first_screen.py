@@ -135,7 +135,7 @@ def _value_row(p: ParameterSummary) -> list[str]:
 
 
 def _moved(s: RunSummary) -> str:
-    """What a fit without the effect, or with it where the other counts, does to the parameter that the former moves most."""
+    """Return what a fit without the effect, or with it where the other counts, does to the parameter that the former moves most."""
     p = s.most_moved
     if p is None or p.effect is None or p.fitted is None:
         return ""
@@ -203,7 +203,7 @@ def _undiagnosed(s: RunSummary) -> str:
 
 
 def _next(s: RunSummary) -> str:
-    """What to record next; where nothing is advised, why, and what else to do."""
+    """Return what to record next; where nothing is advised, why, and what else to do."""
     if said := advice(s):
         return f"<p class='answer'>{prose(said)}</p>"
     if not s.parameters:

@@ -220,7 +220,7 @@ def _request(s: RunSummary) -> str:
 
 
 def _asked_of(f: FindingSummary) -> str:
-    """What an owner knows of an effect, where it may be, and its size where that does not depend on the place."""
+    """Return what an owner knows of an effect, where it may be, and its size where that does not depend on the place."""
     places = list(place_texts(f, listed))
     where = " or ".join(places[:2]) + (f" or one of {len(places) - 2} more places" if len(places) > 2 else "")
     what = f"{ASKED.get(f.effect, f'the {f.effect}')} at {where}"

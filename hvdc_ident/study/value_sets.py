@@ -133,7 +133,7 @@ class _Results:
 
     @property
     def counts(self) -> Counting:
-        """Which values count."""
+        """Set of values that counts."""
         return counting_of(self.fit, self.diagnosis)
 
     @property

@@ -11,7 +11,7 @@ from hvdc_ident.summary.run_summary import (
     NextStep,
     ParameterSummary,
     Quantity,
-    Remainder,
+    RemainderSummary,
     RunSummary,
     SetSummary,
     SignalError,
@@ -39,7 +39,7 @@ SUBJECTS: dict[str, str] = {
 }
 AT_BOUND = "at its bound"
 Door = Literal["shell", "python", "page"]
-"""Where a sentence is read, which decides how a thing to do is called there."""
+"""Places where a sentence is read: each has its own name for a thing to do."""
 TO_DO: dict[str, dict[Door, str]] = {
     "diagnose": {"shell": "`hvdc-ident diagnose STUDY`", "python": "`hi.diagnose(...)`", "page": "the stage diagnose"},
     "letter": {"shell": "`hvdc-ident letter STUDY`", "python": "`hvdc-ident letter`", "page": "the button Letter"},
@@ -257,7 +257,7 @@ def place_texts(f: FindingSummary, join: Callable[[Iterable[str]], str] = ", ".j
 
 def remainder_sentence(s: RunSummary) -> str:
     """Return what is left with the findings in the model; empty where that is noise, or where nothing was added."""
-    r: Remainder = s.remainder
+    r: RemainderSummary = s.remainder
     if not s.counting.kind or not r.more_than_noise:
         return ""
     parts = []

@@ -53,7 +53,7 @@ class Results:
 
     @cached_property
     def summary(self) -> RunSummary:
-        """What the results say."""
+        """Summary of the results."""
         return summarise(self.stages, self.swing, self.heading)
 
     @property

@@ -86,7 +86,7 @@ class SetSummary:
 
 @dataclass(frozen=True)
 class Counting:
-    """Which values count. name: "effect" for those fitted together with what a diagnosis named, "fit" for those of the fit without
+    """Set of values that counts. name: "effect" for those fitted together with what a diagnosis named, "fit" for those of the fit without
     it, "" where nothing was fitted.
 
     added: what the model with the effect has that the model lacks, in words; empty where nothing was put in. kind: "effect",
@@ -143,12 +143,12 @@ class ParameterSummary:
 
     @property
     def asked_with_effect(self) -> bool:
-        """Whether `asked` is the value with the effect."""
+        """True where `asked` is the value with the effect."""
         return self.asked is not None and self.effect is not None and self.asked.value == self.effect
 
     @property
     def change(self) -> float | None:
-        """What `asked` is over the given value, less 1; None where there is none, or the given one is 0."""
+        """Change from the given value to `asked`, as a share of the given one; None where there is none, or the given one is 0."""
         return self.asked.value / self.given - 1.0 if self.asked is not None and self.given else None
 
     @property
@@ -158,7 +158,7 @@ class ParameterSummary:
 
     @property
     def determined(self) -> bool:
-        """Whether the interval is narrow."""
+        """True where the interval is narrow."""
         return self.value is not None and self.interval is not None and narrow(self.value, self.interval)
 
 
@@ -169,7 +169,7 @@ def narrow(value: float, interval: Interval) -> bool:
 
 
 @dataclass(frozen=True)
-class Place:
+class PlaceSummary:
     """A likely place of an effect. source: the signal brought in there. values: the sizes of the effect there, and the values of
     the parameters that depend on the place."""
 
@@ -191,7 +191,7 @@ class FindingSummary:
     text: str
     probability: float
     sizes: Mapping[str, Quantity]
-    places: tuple[Place, ...]
+    places: tuple[PlaceSummary, ...]
     delay: float | None = None
 
 
@@ -211,7 +211,7 @@ class AddedEffect:
 
 
 @dataclass(frozen=True)
-class Rival:
+class RivalSummary:
     """An effect at a place that the recordings cannot tell from what was added."""
 
     name: str
@@ -219,8 +219,8 @@ class Rival:
 
 
 @dataclass(frozen=True)
-class Remainder:
-    """What is left with the findings in the model. more_than_noise: whether something else is missing.
+class RemainderSummary:
+    """Gap that is left with the findings in the model. more_than_noise: whether something else is missing.
 
     explained: share of the gap that they explain. share: of the gap that is left and is no noise; held_out: of that on held-out
     recordings, most of it in `record`, where it is `record_times` its noise. at: where an unknown input would explain it. doubt: what
@@ -244,7 +244,7 @@ class Remainder:
 
 @dataclass(frozen=True)
 class NextStep:
-    """What to do next. kind: run the diagnosis; record what tells likely effects apart ("separate"); write the letter to the model's
+    """Step to take next. kind: run the diagnosis; record what tells likely effects apart ("separate"); write the letter to the model's
     owner; record what narrows the intervals; export the values. text: of a recording, what to record."""
 
     kind: NextKind
@@ -253,7 +253,7 @@ class NextStep:
 
 @dataclass(frozen=True, repr=False)
 class RunSummary(Shown):
-    """What the results of a study say, decided once; `to_dict` is `summary.json`, and printed it is the screen of a run.
+    """Summary of the results of a study, decided once; `to_dict` is `summary.json`, and printed it is the screen of a run.
 
     verdict: whether the model follows its recordings, with the values that `about` names: the fitted ones where there are some, else
     the given ones. by: what it is held against; limits: whether a study's tolerance or the windows of a profile are the limits.
@@ -283,10 +283,10 @@ class RunSummary(Shown):
     said: str
     findings: tuple[FindingSummary, ...]
     effects: tuple[AddedEffect, ...]
-    rivals: tuple[Rival, ...]
+    rivals: tuple[RivalSummary, ...]
     late: tuple[float, float] | None
     stand_ins: tuple[str, ...]
-    remainder: Remainder
+    remainder: RemainderSummary
     conditional: Mapping[str, bool]
     fit: str
     search_doubt: str
@@ -320,12 +320,12 @@ class RunSummary(Shown):
 
     @property
     def by_limits(self) -> bool:
-        """Whether the study states the limits that the verdict is against."""
+        """True where the study states the limits that the verdict is against."""
         return bool(self.tolerance) or bool(self.profile.get("named"))
 
     @property
     def counts_conditional(self) -> bool:
-        """Whether the values that count hold only if nothing else is missing."""
+        """True where the values that count hold only if nothing else is missing."""
         return self.conditional["effect" if self.counting.name == "effect" else "fitted"]
 
     @property

@@ -1,4 +1,4 @@
-"""What the results of a study say: the one place that decides it, from the JSON of its stages."""
+"""Summary of the results of a study: the one place that decides it, from the JSON of its stages."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from hvdc_ident.summary.run_summary import (
     NextStep,
     Outcome,
     ParameterSummary,
-    Place,
     PlacedValue,
+    PlaceSummary,
     Quantity,
-    Remainder,
-    Rival,
+    RemainderSummary,
+    RivalSummary,
     RunSummary,
     SetSummary,
     Signal,
@@ -365,7 +365,7 @@ def _findings(diagnosis: Json) -> tuple[FindingSummary, ...]:
     found = []
     for f in diagnosis.get("findings") or ():
         places = tuple(
-            Place(
+            PlaceSummary(
                 tuple(p["at"]),
                 float(p.get("probability") or 0.0),
                 str(p.get("from") or ""),
@@ -401,12 +401,12 @@ def _effects(diagnosis: Json) -> tuple[AddedEffect, ...]:
     return tuple(found)
 
 
-def _rivals(diagnosis: Json) -> tuple[Rival, ...]:
+def _rivals(diagnosis: Json) -> tuple[RivalSummary, ...]:
     """Return what the recordings cannot tell from the effects in the model, each once."""
     own = [(e["effect"], list(e["at"]), e.get("from", "")) for e in diagnosis.get("effects") or ()]
     each = [r for group in diagnosis.get("ambiguity") or () for r in group]
     others = [r for r in each if (r["effect"], list(r["at"]), r.get("from", "")) not in own]
-    return tuple(dict.fromkeys(Rival(form_of(r), tuple(r["at"])) for r in others))
+    return tuple(dict.fromkeys(RivalSummary(form_of(r), tuple(r["at"])) for r in others))
 
 
 def _late(diagnosis: Json) -> tuple[float, float] | None:
@@ -418,7 +418,7 @@ def _late(diagnosis: Json) -> tuple[float, float] | None:
     return min(late), max(late)
 
 
-def _remainder(diagnosis: Json, counting: Counting) -> Remainder:
+def _remainder(diagnosis: Json, counting: Counting) -> RemainderSummary:
     """Return what is left with the additions in the model; nothing where nothing was added."""
     more = beyond_noise(diagnosis)
     remaining = diagnosis.get("remaining") or {}
@@ -437,7 +437,9 @@ def _remainder(diagnosis: Json, counting: Counting) -> Remainder:
     record = str(left.get("record") or "") if held_out is not None else ""
     times = left.get("record_units") if record else None
     at = str(left.get("at") or "") if share is not None else ""
-    return Remainder(more, adequate, explained, share, held_out, record, times, at, doubt, shrink, against, pooled)
+    return RemainderSummary(
+        more, adequate, explained, share, held_out, record, times, at, doubt, shrink, against, pooled
+    )
 
 
 def _share(value: Any) -> float | None:
