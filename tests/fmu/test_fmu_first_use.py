@@ -61,7 +61,7 @@ def test_the_cheapest_restart_that_repeats_a_run_is_taken(tmp_path, way, model, 
     [
         ("instance", begun("waiting", "AT_RESET for (;;)")),
         ("process", begun("stuck", "SPOILT ({ while (runs > 1 && r[0] < 0.5); 0.0; })")),
-        ("process", begun("stuck-at-once", "INITIALIZE(r) while (runs++)")),
+        ("process", begun("stuck-at-once", "INITIALIZE(r) if (runs++) for (;;)")),
     ],
     ids=lambda x: getattr(x, "name", x),
 )
