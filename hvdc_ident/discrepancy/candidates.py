@@ -255,7 +255,7 @@ def additive(effect: Effect) -> bool:
 def _halved(found: tuple[Probe, ...]) -> tuple[Probe, ...]:
     """Of sizes that differ in sign alone the positive ones: the answer to the others is the same, reversed."""
     kept: list[Probe] = []
-    for p in found:
+    for p in sorted(found, key=lambda p: sum(v < 0.0 for v in p.values.values())):
         mirrored = {n: -v for n, v in p.values.items()}
         if not any(dict(q.values) == mirrored for q in kept):
             kept.append(p)

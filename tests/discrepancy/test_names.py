@@ -73,6 +73,14 @@ def test_reactive_power_that_lowers_a_voltage_is_a_droop() -> None:
     assert first.text.startswith("er droops by 0.06")
 
 
+def test_reactive_power_that_raises_a_voltage_is_a_coupling() -> None:
+    free = (FitParameter("K", 25.0, 1.0, 200.0), FitParameter("T", 0.1, 0.01, 1.0))
+    found = diagnose(parse_card(PLANT), records(-0.06), free)
+    first = found.findings[0]
+    assert first.effect == "coupling" and (first.places[0].at, first.places[0].source) == (("er",), "Q")
+    assert first.parameters["k"].value == pytest.approx(0.06, rel=0.03)
+
+
 def test_a_signal_is_told_by_its_unit_or_its_letter() -> None:
     plant = parse_card(PLANT)
     names = {p: quantity(plant, p) for p in ("Vref", "E", "V", "Q", "er", "outputs.Q")}
