@@ -1,7 +1,7 @@
-"""Sizes that have to be met: levels of a quantiser and periods of a sampler, to which no slope leads.
+"""Sizes that have to be met: levels of a quantiser and periods of a sampler, to which no slope leads, and those that bend a signal.
 
-Each is run in all its sizes from the gains as they are; the best are refitted, and run again ever closer beside the size that they came
-to, from the gains that they came to.
+The first are run in all their sizes from the gains as they are, and the best refitted. Beside what the best refits came to sizes are
+run ever closer: between two plays of a backlash chi2 has hills, and a refit stands in the next valley.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import CandidateFit, best_each, by_cost
+from hvdc_ident.discrepancy.evidence import CandidateFit, best_each, by_cost, exceeds_noise
 from hvdc_ident.discrepancy.hypothesis import Refit, with_given_gains
+from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
 from hvdc_ident.discrepancy.rounds import Race, Round, RoundModel, gains_of
 from hvdc_ident.discrepancy.screen import Score
@@ -28,6 +29,8 @@ COARSE_STRIDE = 3
 """Of levels, which stand a tenth of one apart in the grid, the first look takes every third; then those between the best."""
 REFINEMENT = 4
 """Times closer that the sizes stand at each further look."""
+BESIDE = 0.5
+"""Share of a size beside which others are looked for: half way to the next in a grid of three a decade."""
 N_REFINEMENTS = 4
 """Further looks: after the last the sizes stand REFINEMENT ** N_REFINEMENTS times closer than in the grid, 1e-5 of the size."""
 SIMILAR_DELAY = 0.3
@@ -42,10 +45,39 @@ def with_searched_sizes(
     A quantiser is looked for at the places that promise most, where nothing else explains the records. A sampler is a delay to first
     order: it is looked for in periods that delay as long as what was refitted, or as a quantiser is where no other delay is tried.
     """
-    grids = _grids(opened, trials, far=far)
-    if not grids:
-        return opened, trials
     text = f"round {number}: sizes to be met"
+    grids = _grids(opened, trials, far=far)
+    if grids:
+        opened, trials = _with_best_of_all_sizes(round_model, opened, trials, grids, text)
+    for turn in range(1, N_REFINEMENTS + 1):
+        for t in _to_be_refined(trials, grids):
+            if round_model.search.spent:
+                break
+            k, size = t.pick.candidate, _size(t.refit)
+            away = np.delete(np.arange(-REFINEMENT, REFINEMENT + 1), REFINEMENT) / REFINEMENT**turn
+            sizes = size + away * (_spacing(grids[k], size) if k in grids else BESIDE * size)
+            near = _best_sizes(round_model, opened, {k: sizes}, text, [gains_of(opened.before, t.refit)])
+            opened, trials = _refitted(round_model, opened, trials, near, text)
+    return opened, trials
+
+
+def _to_be_refined(trials: Sequence[CandidateFit], grids: Mapping[int, Array]) -> list[CandidateFit]:
+    """Return the best refits of effects whose size has to be met; and while the best of all leaves more than noise, those of the best
+    that have one size and bend their signal."""
+    ranked = by_cost(trials)
+    rough = ranked[:BEAM] if ranked and exceeds_noise(ranked[0].refit) else []
+    bent = [t for t in rough if _bends(t.refit.placed[-1].candidate) and t.pick.candidate not in grids]
+    return [*[t for t in ranked if t.pick.candidate in grids][:BEAM], *bent]
+
+
+def _bends(candidate: CandidateEffect) -> bool:
+    return len(candidate.probes[0].free) == 1 and not in_proportion(candidate, 0)
+
+
+def _with_best_of_all_sizes(
+    round_model: RoundModel, opened: Round, trials: list[CandidateFit], grids: Mapping[int, Array], text: str
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the round and its trials with the best of all sizes refitted."""
     # Beside the gains of what explains most of the misfit; where nothing does, beside those without an effect.
     best_of_all = [t.refit for t in by_cost(trials)[:1] if t.refit.chi2 < 0.5 * opened.before.chi2]
     points: list[Array | None] = [*(gains_of(opened.before, r) for r in best_of_all)] or [None]
@@ -58,20 +90,7 @@ def with_searched_sizes(
     rough = _best_sizes(round_model, opened, coarse, text, points, most=SHORTLIST)
     beside = {k: _beside(grids[k], [size for size, _ in own]) for k, own in rough.items()}
     best |= _best_sizes(round_model, opened, beside, text, points)
-    opened, trials = _refitted(round_model, opened, trials, best, text)
-    for turn in range(1, N_REFINEMENTS + 1):
-        for t in [t for t in by_cost(trials) if t.pick.candidate in grids][:BEAM]:
-            if round_model.search.spent:
-                break
-            k, size = t.pick.candidate, _size(t.refit)
-            away = (
-                np.delete(np.arange(-REFINEMENT, REFINEMENT + 1), REFINEMENT)
-                * _spacing(grids[k], size)
-                / REFINEMENT**turn
-            )
-            near = _best_sizes(round_model, opened, {k: size + away}, text, [gains_of(opened.before, t.refit)])
-            opened, trials = _refitted(round_model, opened, trials, near, text)
-    return opened, trials
+    return _refitted(round_model, opened, trials, best, text)
 
 
 def _grids(opened: Round, trials: Sequence[CandidateFit], *, far: bool) -> dict[int, Array]:
@@ -136,7 +155,8 @@ def _alike(one: float, other: float) -> bool:
 
 def _named(candidate: CandidateEffect) -> str:
     """Return the name of the size that has to be met."""
-    return next(n for n, q in effects()[candidate.effect].parameters.items() if q.grid is not None)
+    grids = [n for n, q in effects()[candidate.effect].parameters.items() if q.grid is not None]
+    return grids[0] if grids else next(iter(candidate.probes[0].free))
 
 
 def _size(refit: Refit) -> float:
