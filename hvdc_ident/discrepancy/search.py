@@ -61,7 +61,7 @@ from hvdc_ident.discrepancy.remainder import is_small
 from hvdc_ident.discrepancy.residual_checks import tones
 from hvdc_ident.discrepancy.rounds import LEFT_BEHIND, REFITS_PER_EFFECT, Race, Round, RoundModel, gains_of, refits_of
 from hvdc_ident.discrepancy.screen import Score, ranked
-from hvdc_ident.discrepancy.size_search import with_searched_sizes
+from hvdc_ident.discrepancy.size_search import with_closer_sizes, with_searched_sizes
 from hvdc_ident.effects import effects
 from hvdc_ident.model import AnyModel
 
@@ -186,7 +186,7 @@ def _field(search: SearchContext, found: Sequence[CandidateEffect], scores: Sequ
 def _with_neighbours_of_leaders(
     round_model: RoundModel, opened: Round, trials: Sequence[CandidateFit], number: int
 ) -> tuple[Round, list[CandidateFit]]:
-    """Return the trials with what is found from the gains of the best, again while something comes nearer."""
+    """Return the trials with what is found from the gains and beside the sizes of the best, again while something comes nearer."""
     trials, led = best_each(trials), dict(opened.led)
     for _ in range(MAX_FOLLOWED):
         leaders = [t for t in _leaders(opened, trials) if cost_of(t) < led.get(t.pick.candidate, math.inf) - TIED]
@@ -199,7 +199,7 @@ def _with_neighbours_of_leaders(
             opened, scores = _neighbours(round_model, opened, t, number)
             scores = _promising(opened.before, scores, [*trials, *more])
             more += round_model.refitted(opened.candidates, scores, f"round {number}: neighbours", [*trials, *more])
-        trials = best_each([*trials, *more])
+        opened, trials = with_closer_sizes(round_model, opened, best_each([*trials, *more]), number)
         if cost_of(by_cost(trials)[0]) > least - TIED:
             break
     return replace(opened, led=led), trials

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -47,27 +47,47 @@ def with_searched_sizes(
     """
     text = f"round {number}: sizes to be met"
     grids = _grids(opened, trials, far=far)
-    if grids:
-        opened, trials = _with_best_of_all_sizes(round_model, opened, trials, grids, text)
+    if not grids:
+        return opened, trials
+    opened, trials = _with_best_of_all_sizes(round_model, opened, trials, grids, text)
+    return _refined(
+        round_model, opened, trials, text, lambda ranked: [t for t in ranked if t.pick.candidate in grids], grids
+    )
+
+
+def with_closer_sizes(
+    round_model: RoundModel, opened: Round, trials: list[CandidateFit], number: int
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the round and its trials with those of the best effects that have one size and bend their signal refined, while the best
+    of all leaves more than noise."""
+
+    def bent(ranked: Sequence[CandidateFit]) -> list[CandidateFit]:
+        rough = ranked[:BEAM] if ranked and exceeds_noise(ranked[0].refit) else ()
+        return [t for t in rough if _bends(t.refit.placed[-1].candidate)]
+
+    return _refined(round_model, opened, trials, f"round {number}: sizes beside", bent)
+
+
+def _refined(
+    round_model: RoundModel,
+    opened: Round,
+    trials: list[CandidateFit],
+    text: str,
+    which: Callable[[Sequence[CandidateFit]], list[CandidateFit]],
+    grids: Mapping[int, Array] | None = None,
+) -> tuple[Round, list[CandidateFit]]:
+    """Return the round and its trials with refits from ever closer beside the sizes that some refits came to, by their rank."""
+    known = grids or {}
     for turn in range(1, N_REFINEMENTS + 1):
-        for t in _to_be_refined(trials, grids):
+        for t in which(by_cost(trials))[:BEAM]:
             if round_model.search.spent:
                 break
             k, size = t.pick.candidate, _size(t.refit)
             away = np.delete(np.arange(-REFINEMENT, REFINEMENT + 1), REFINEMENT) / REFINEMENT**turn
-            sizes = size + away * (_spacing(grids[k], size) if k in grids else BESIDE * size)
+            sizes = size + away * (_spacing(known[k], size) if k in known else BESIDE * size)
             near = _best_sizes(round_model, opened, {k: sizes}, text, [gains_of(opened.before, t.refit)])
             opened, trials = _refitted(round_model, opened, trials, near, text)
     return opened, trials
-
-
-def _to_be_refined(trials: Sequence[CandidateFit], grids: Mapping[int, Array]) -> list[CandidateFit]:
-    """Return the best refits of effects whose size has to be met; and while the best of all leaves more than noise, those of the best
-    that have one size and bend their signal."""
-    ranked = by_cost(trials)
-    rough = ranked[:BEAM] if ranked and exceeds_noise(ranked[0].refit) else []
-    bent = [t for t in rough if _bends(t.refit.placed[-1].candidate) and t.pick.candidate not in grids]
-    return [*[t for t in ranked if t.pick.candidate in grids][:BEAM], *bent]
 
 
 def _bends(candidate: CandidateEffect) -> bool:
