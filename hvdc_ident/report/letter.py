@@ -13,6 +13,7 @@ from pathlib import Path
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
+from hvdc_ident.fit.uncertainty import MOVED
 from hvdc_ident.report.html import badge, table_of, text
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
@@ -30,7 +31,7 @@ from hvdc_ident.summary.phrases import (
     sizes_text,
     windows_name,
 )
-from hvdc_ident.summary.run_summary import MOVED, AddedEffect, FindingSummary, SetSummary
+from hvdc_ident.summary.run_summary import AddedEffect, FindingSummary, SetSummary
 from hvdc_ident.summary.tables import values_table
 from hvdc_ident.text import listed, quantity, span
 

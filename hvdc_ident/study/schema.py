@@ -117,6 +117,15 @@ Role = Literal["fit", "holdout"]
 Spacing = Literal["linear", "log"]
 
 
+class InputsTable(TomlTable):
+    """[inputs]: what a person can do with the model's inputs."""
+
+    settable: list[Name] | None = optional(
+        "The inputs that a person can move for an experiment; what to record next moves no other. [] for none. If left out, those that "
+        "the model does not declare otherwise: of shipped models all but grid voltages, grid frequencies and measured signals.",
+        'settable = ["Vdcref1", "Pref2"]', of="input")
+
+
 class EffectTable(TomlTable):
     """[[model.effect]]: an effect that the model has from the start."""
 
@@ -646,6 +655,7 @@ class StudyFile(TomlTable):
     model: ModelTable = key("The model and what differs from it.", 'model = {source = "vsc-hvdc-link"}')
     parameters: Annotated[dict[Name, ParameterTable], ByName(own=("prior",), tables=True)] = optional(
         "The parameters that may be estimated, by name. All others keep the model's values.", "[parameters]", default={})
+    inputs: InputsTable | None = optional("What a person can do with the model's inputs.", "[inputs]")
     experiment: list[ExperimentTable] = optional("The recordings: one table for each.", "[[experiment]]", default=[])
     response: list[ResponseTable] = optional("Measured frequency responses: one table for each.", "[[response]]", default=[])
     linearize: LinearizeTable | None = optional("The linear model at an operating point.", "[linearize]")
