@@ -24,7 +24,7 @@ from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.parameters import Input
 from hvdc_ident.sensitivity import independent, standard_deviations
-from hvdc_ident.text import figures, listed
+from hvdc_ident.text import figures, listed, percentage
 
 Shape = Literal["step", "ramp", "multisine"]
 FACTORS = (1.0, -1.0, 2.0)
@@ -455,7 +455,8 @@ class _Widths:
             )
         return (
             f"No experiment is advised: of {count} tried (steps, ramps, multisines and pairs of steps) none narrows the interval of "
-            f"{listed(self.open)} further than the same recordings made once more."
+            f"{listed(self.open)} further than the same recordings made once more, by more than the {percentage(self.uncertain)} by "
+            "which a width is uncertain."
         )
 
 
