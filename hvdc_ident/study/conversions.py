@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import permutations
 from math import pi, sqrt
 
@@ -194,6 +194,13 @@ class Suggestion:
     gain: float
 
     @property
+    def distance(self) -> float:
+        """The mean mismatch of level and movement at the given values, once the conversion is undone."""
+        at_given = [replace(e, levels=e.levels[:1], slopes=e.slopes[:1]) for e in self.explained]
+        c = self.conversion
+        return sum(e.level_mismatch(c) + e.slope_mismatch(c) for e in at_given) / len(at_given)
+
+    @property
     def reason(self) -> str:
         """What the recording holds, as a question."""
         return f"{self.conversion.name}?"
@@ -211,17 +218,18 @@ def suggest_conversion(
     table = conversions(unit, parameters)
     tried = [(SIGN, 1), *((c, len(table)) for c in table)]
     tried += [(c, 2) for e in evidence if (c := _free_factor(e)) is not None]
-    best, most = None, math.log(POSITIVE)
+    found: list[tuple[float, Suggestion]] = []
     for c, tries in tried:
         gains = {e: gain for e in evidence if (gain := e.gain_of(c)) is not None and gain > math.log(2.0)}
         total = sum(gains.values()) - math.log(tries) - math.log(2.0) * len(gains)
         if gains and c.gain:  # a free number explains one level by itself
             total -= max(math.log(e.level_mismatch() / e.level_mismatch(c)) for e in gains)
-        # A unit is suspected only where that is clearly more likely than a gain of the model.
-        weighed = total + math.log(POSITIVE) if c.gain else total
-        if gains and total > math.log(POSITIVE) and weighed > most:
-            best, most = Suggestion(c, tuple(gains), total), weighed
-    return best
+        if gains and total > math.log(POSITIVE):
+            # A unit is suspected only where that is clearly more likely than a gain of the model.
+            found.append((total + math.log(POSITIVE) if c.gain else total, Suggestion(c, tuple(gains), total)))
+    # Of those that candidates let fit about as well, the one that is nearest at the given values.
+    most = max((weighed for weighed, _ in found), default=0.0) - math.log(POSITIVE)
+    return min((s for weighed, s in found if weighed >= most), key=lambda s: s.distance, default=None)
 
 
 def _free_factor(e: Evidence) -> Conversion | None:
