@@ -24,10 +24,7 @@ POSITIVE = 3.0
 POWERS = ("W", "var", "VA")
 ELECTRICAL = ("V", "A", *POWERS)
 RATIOS: tuple[tuple[tuple[str, ...], str, float, float], ...] = (
-    (("pu",), "a factor of 100", 100.0, 0.0),
-    (("pu",), "a factor of 1/100", 0.01, 0.0),
-    (("pu",), "a factor of 1000", 1e3, 0.0),
-    (("pu",), "a factor of 1/1000", 1e-3, 0.0),
+    *((("pu",), f"a factor of {n}", a, 0.0) for n, a in (("100", 100.0), ("1/100", 0.01), ("1000", 1e3), ("1/1000", 1e-3))),
     (("pu",), "in degrees", 180.0 / pi, 0.0),
     (("pu", "V", "A"), "a factor of sqrt(2): peak for rms", sqrt(2.0), 0.0),
     (("pu", "V", "A"), "a factor of 1/sqrt(2): rms for peak", 1.0 / sqrt(2.0), 0.0),
@@ -43,8 +40,7 @@ RATIOS: tuple[tuple[tuple[str, ...], str, float, float], ...] = (
     (("pu", *ELECTRICAL), "a factor of 1/2: one pole for both", 0.5, 0.0),
     (("pu",), "the quantity itself and not its deviation from 1", 1.0, 1.0),
     (("pu",), "the deviation from 1 and not the quantity itself", 1.0, -1.0),
-    (("Hz",), "in rad/s", 2.0 * pi, 0.0),
-    (("Hz",), "in 1/min", 60.0, 0.0),
+    *((("Hz",), f"in {u}", a, 0.0) for u, a in (("rad/s", 2.0 * pi), ("1/min", 60.0))),
     (("rad/s",), "in Hz", 0.5 / pi, 0.0),
     *((("pu",), f"in Hz of {f:g}", f, 0.0) for f in (50.0, 60.0)),
     *((("pu",), f"in rad/s of {f:g} Hz", 2.0 * pi * f, 0.0) for f in (50.0, 60.0)),

@@ -336,9 +336,7 @@ def _value(c: Comparison, conversion: Conversion | None, cause: Cause | None, qu
     """Return the value with what is said of it: the conversion, the common cause, or the plain difference."""
     slope, slope_error = c.evidence.slopes[0] if c.evidence.slopes else (None, math.inf)
     record, recorded = c.record, c.evidence.recorded
-    value = InitialValue(
-        record.experiment, record.output, record.unit, recorded, slope=slope, channel=record.output
-    )  # fmt: skip
+    value = InitialValue(record.experiment, record.output, record.unit, recorded, slope=slope, channel=record.output)
     if recorded is not None and c.model is not None:
         difference, levels = recorded - c.model, c.evidence.levels
         value = replace(
@@ -428,13 +426,7 @@ def _exchanged(
         total = gains[0] + gains[1] - math.log(STRONG * math.comb(len(comparisons), 2))
         if total > max(math.log(POSITIVE), own.get(a, 0.0) + own.get(b, 0.0)):
             one, other = a.record.output, b.record.output
-            text = f"{one} moves as the model's {other} does and {other} as its {one}"
-            if None not in (a.evidence.recorded, b.evidence.recorded, a.model, b.model):
-                text = (
-                    f"before the event {one} reads {a.evidence.recorded:+.4g} and {other} {b.evidence.recorded:+.4g}, "
-                    f"the model rests at {a.model:+.4g} and {b.model:+.4g}"
-                )
-            text += f": are the columns of {one} and {other} exchanged?"
+            text = f"{one} follows the model's {other} and {other} its {one}: are the columns of {one} and {other} exchanged?"
             found |= dict.fromkeys((a, b), Cause(f"{one}, {other}", "columns exchanged", text, total))
     return found
 
