@@ -98,8 +98,8 @@ CUT = """() => [...document.querySelectorAll(".tile .wide, .letter .wide")].filt
 
 def test_on_a_phone_no_column_of_the_first_screen_and_the_letter_is_cut(browser: Any, like_the_demo: Path) -> None:
     tab = browser.new_page(viewport={"width": 390, "height": 800})
-    for page in (like_the_demo / "report.html", write_letter(like_the_demo, Letterhead())):
-        tab.goto(page.as_uri())
+    for shown in (like_the_demo / "report.html", write_letter(like_the_demo, Letterhead())):
+        tab.goto(shown.as_uri())
         assert tab.locator(".tile .wide, .letter .wide").count() and tab.evaluate(CUT) == []
     tab.close()
 
