@@ -54,11 +54,15 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Input:
-    """A signal that enters the model from outside; `value` is what it is where an experiment does not say."""
+    """A signal that enters the model from outside; `value` is what it is where an experiment does not say.
+
+    settable: whether a person can move it for an experiment. A set-point is; the voltage of a grid is not.
+    """
 
     value: float = 0.0
     unit: str = ""
     description: str = ""
+    settable: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "value", float(self.value))

@@ -185,6 +185,8 @@ def parsed(text: str, what: str, where: str, error: type[InputError], hint: str 
         if path and re.match(r"Invalid hex value|Unescaped|Escaped character is not", str(e)):
             why = f"\\ begins an escape sequence in double quotes: {why}"
             hint = f"'{path[1]}' in single quotes, or \"{path[1].replace(chr(92), '/')}\""
+        elif comma := re.search(r"=\s*([+-]?\d+),(\d+)\s*([}#]|$)", line):
+            hint = f"a decimal point: {comma[1]}.{comma[2]}"
         elif word := re.search(r"=\s*([^\s\"'#{}\[\],]*[A-Za-z./-][^\s\"'#{}\[\],]*)", line):
             hint = f'text in quotes: "{word[1]}"'
     except RecursionError:

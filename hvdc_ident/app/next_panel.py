@@ -52,7 +52,7 @@ def planned_run(
 
 
 class NextExperiment:
-    """The experiments that the analysis recommends, and a button that simulates the chosen one.
+    """The experiments that the analysis recommends, or that could be made, and a button that simulates the chosen one.
 
     fitted: values of the study's model. rivals: models with what a diagnosis found.
     """
@@ -71,7 +71,7 @@ class NextExperiment:
         self._models = (best, *rivals[:MOST])
 
     def build(self) -> None:
-        """Build the choice and the button; nothing where no experiment is recommended."""
+        """Build the choice and the button; nothing where no input can be moved."""
         if not self._planned:
             return
         with ui.row().classes("w-full items-center gap-3"):

@@ -194,7 +194,7 @@ def _diagnosed(found: FoundResults) -> None:
 def _next(found: FoundResults) -> None:
     """Build what to record next, simulated before it is made."""
     identified, diagnosis = found.of("identify"), found.of("diagnose")
-    ui.label(advice(found.summary) or "The results ask for no further record.").classes("text-body2")
+    ui.label(advice(found.summary) or found.summary.unadvised or "The results ask for no further record.").classes("text-body2")
     try:
         rivals = suppositions(found.study, diagnosis, found.folder)
     except HvdcIdentError as error:

@@ -13,7 +13,7 @@ import hvdc_ident as hi
 from hvdc_ident.data import Experiment
 from hvdc_ident.errors import ComputationError, HvdcIdentError
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.identifiability.experiment_design import ExperimentDesign, Move
+from hvdc_ident.identifiability.experiment_design import ExperimentDesign, Move, single_input_designs
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.augmented import use_of
@@ -103,7 +103,7 @@ def _sizes(study: hi.Study, model: AnyModel) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class PlannedExperiment:
-    """An experiment that the results say to make. words: what to do. record: signals to record; new: not recorded so far."""
+    """An experiment that could be made. words: what to do. record: signals to record; new: not recorded so far."""
 
     words: str
     design: ExperimentDesign
@@ -116,10 +116,19 @@ class PlannedExperiment:
 
 
 def planned_experiments(study: hi.Study, identified: Mapping[str, Any]) -> tuple[PlannedExperiment, ...]:
-    """Return the experiments that an identifiability analysis recommends, the best first; none where it has none."""
-    units = {n: i.unit for n, i in study.model.inputs.items()}
+    """Return the experiments that an identifiability analysis recommends, the best first; where it has none, those that could be made:
+    the moves of each input that a person can set."""
+    inputs = study.model.inputs
+    units = {n: i.unit for n, i in inputs.items()}
     advice = identified.get("recommended_experiment") or {}
-    return tuple(dict.fromkeys(_planned((advice, *(advice.get("others") or ())), units)))
+    told = tuple(dict.fromkeys(_planned((advice, *(advice.get("others") or ())), units)))
+    if told or not study.experiments:
+        return told
+    record = tuple(dict.fromkeys(o for e in study.experiments for o in e.outputs))
+    values = {n: i.value for n, i in inputs.items() if i.settable}
+    longest = max(study.experiments, key=lambda e: float(np.ptp(e.time)))
+    designs = single_input_designs(study.experiments, values, units, longest)
+    return tuple(PlannedExperiment(d.text(units), d, record, ()) for d in designs)
 
 
 def _planned(told: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> Iterator[PlannedExperiment]:

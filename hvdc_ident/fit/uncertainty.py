@@ -34,6 +34,8 @@ TWO_SIDED = 0.5 * float(chdtri(1.0, 0.05))
 """Rise of the negative log-likelihood at the ends of a 95 % interval: half the quantile of chi-square, 1 degree; 1.92."""
 ONE_SIDED = 0.5 * float(chdtri(1.0, 0.10))
 """Rise at the one limit of a parameter whose optimum lies on a bound: half the 90 % quantile; 1.353."""
+MOVED = 0.02
+"""Share of the given value from which on a fitted value is said to differ from it."""
 NO_INTERVAL = "no interval: the model lacks something"
 """Remark on an estimate where the residual is more than noise."""
 WIDER = 2.0
@@ -42,6 +44,12 @@ SINGULAR = 1e-7
 """Singular values of the normalised columns below this share of the largest are the sensitivities' own error."""
 UNSEEN = 1e-9
 """A parameter whose whole range moves the residual by less than this has no effect."""
+
+
+def narrow(value: float, interval: tuple[float | None, float | None]) -> bool:
+    """Return whether an interval is narrower, either way, than a change that is told (`MOVED`)."""
+    low, high = interval
+    return low is not None and high is not None and max(high - value, value - low) <= MOVED * abs(value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -178,6 +178,7 @@ def _assembled(
     several = last is not None and len(last.problem.fitted_experiments) > 1
     tests = heterogeneity(last) if last is not None and several else FrozenMap()
     matrix = first.information.matrix
+    advice = _recommended(assessment, whole, misfit=first.adequacy.systematic)
     return IdentifiabilityReport(
         parameters=FrozenMap({n: assessment.verdicts[n] for n in assessment.free}),
         identifiable=fitted,
@@ -189,7 +190,8 @@ def _assembled(
         shares=whole.information.shares(),
         heterogeneity=tests,
         misspecification=misspecification(last, tests, assessment.units) if last else Misspecification(False, ()),
-        recommended=_recommended(assessment, whole, misfit=first.adequacy.systematic),
+        recommended=advice if isinstance(advice, Recommendation) else None,
+        not_recommended=advice if isinstance(advice, str) else "",
         thresholds=FrozenMap(assessment.thresholds),
         pilot={
             "status": result.status,
@@ -266,15 +268,18 @@ def _sensitivities(assessment: Assessment, whole: LocalAnalysis) -> LocalSensiti
         return None
 
 
-def _recommended(assessment: Assessment, whole: LocalAnalysis, *, misfit: bool) -> Recommendation | None:
-    """Return what to measure next, where there is an input to move. misfit: whether more than a known noise is left."""
+def _recommended(assessment: Assessment, whole: LocalAnalysis, *, misfit: bool) -> Recommendation | str:
+    """Return what to measure next, or why nothing is advised. misfit: whether more than a known noise is left."""
     assessment.report_stage("what to measure next")
     inputs = inputs_of(assessment.problem.simulator, assessment.problem.fitted_experiments)
+    ends = {n: v.profile.ci95 for n, v in assessment.verdicts.items() if v.profile is not None}
+    told = {n: 0.5 * (high - low) for n, (low, high) in ends.items() if low is not None and high is not None}
     try:
-        return recommend(whole, inputs, assessment.units, thresholds=assessment.thresholds, misfit=misfit)
+        return recommend(
+            whole, inputs, assessment.units, thresholds=assessment.thresholds, told=told, misfit=misfit
+        )
     except SimulationError as error:
-        assessment.notes.append(f"What to measure next cannot be told: {error.what}.")
-        return None
+        return f"What to measure next cannot be told: {error.what}."
 
 
 def identifiability_by_group(
@@ -310,7 +315,7 @@ def identifiability_by_group(
     notes = [f"To measure next for {', '.join(r.parameters)}: {text}" for r, text in others]
     if pair and not any(set(pair) <= set(g.parameters) for g in groups):
         notes.append(f"No common profile of {' and '.join(pair)}: they stand in two groups.")
-    whole = joined([replace(r, recommended=None) for r in reports])
+    whole = joined([replace(r, recommended=None, not_recommended="") for r in reports])
     decided = all(r.structure.status == "decided" for r in reports)
     return replace(
         whole,
@@ -318,6 +323,7 @@ def identifiability_by_group(
         identifiable=tuple(n for n in at if n in whole.identifiable),
         structure=replace(whole.structure, status="decided" if decided else "not decided"),
         recommended=advised.recommended,
+        not_recommended=advised.not_recommended,
         notes=(*whole.notes, *notes),
     )
 

@@ -1,14 +1,17 @@
-"""The next experiment to make: designs of steps, ramps and multisines, ranked by the information that they would add.
+"""The next experiment to make: designs of steps, ramps and multisines, ranked by how far they would narrow the widest interval.
 
-Best is the design with the largest smallest eigenvalue of the information matrix in scaled coordinates (E-optimal); the one
-with the largest determinant (D-optimal) is named beside it.
+The design with the largest determinant of the information matrix (D-optimal) is named beside the best. A design is advised only
+where it narrows an interval by more than the width of that interval is uncertain, and further than the recordings made so far
+would if they were made once more.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -16,12 +19,12 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.frequency_data import in_time
-from hvdc_ident.fit.uncertainty import TWO_SIDED
+from hvdc_ident.fit.uncertainty import TWO_SIDED, narrow
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.parameters import Input
 from hvdc_ident.sensitivity import independent, standard_deviations
-from hvdc_ident.text import listed
+from hvdc_ident.text import figures, listed, percentage
 
 Shape = Literal["step", "ramp", "multisine"]
 FACTORS = (1.0, -1.0, 2.0)
@@ -33,11 +36,9 @@ PER_PERIOD = 20
 """Points of the fastest sine in a period."""
 HOPELESS = 1e3
 """A half-width of more than so many units of the scaled coordinate is no knowledge."""
-WORTH = 0.9
-"""An interval that does not shrink below this share of what it is now is no gain to speak of."""
 NAMED = 3
-GAIN = WORTH**-2.0
-"""Factor of the information that narrows an interval so far: recording another signal, or a second step, is advised from it on."""
+EFFORT = 0.9**-2.0
+"""Factor of the information that narrows an interval by a tenth: from it on another signal to record, or a second step, is worth it."""
 BEGUN_WITH = 3
 """So many of the best single steps are tried with a second step of every other input."""
 LISTED = 8
@@ -225,7 +226,8 @@ def half_widths(matrix: Array, per_std: Array, names: Sequence[str], error: floa
 class RankedDesign:
     """A design with the signals to record, and what would be known of the candidates with it added.
 
-    criteria: of the information with it added. gain: (p, p) the information it adds, in scaled coordinates.
+    criteria: of the information with it added. gain: (p, p) the information it adds, in scaled coordinates. half_width: of the
+    interval that the advice is on, None where it stays open.
     """
 
     design: ExperimentDesign
@@ -233,21 +235,30 @@ class RankedDesign:
     new: tuple[str, ...]
     criteria: OptimalityCriteria
     gain: Array
+    half_width: float | None = None
+
+    @property
+    def order(self) -> tuple[float, ...]:
+        """The less, the better: directions seen, the interval to two digits, what it takes, and the determinant."""
+        half = float(f"{math.inf if self.half_width is None else self.half_width:.2g}")
+        return (-self.criteria.directions, half, len(self.new), len(self.design.moves), -self.criteria.log_determinant)
 
 
 @dataclass(frozen=True, eq=False)
 class Recommendation:
-    """The experiment that raises the smallest eigenvalue of the information most (E-optimal), of those tried.
+    """The experiment that narrows the widest interval most, of those tried.
 
-    best: the experiment. by_determinant: the one that raises the determinant most (D-optimal). now: the criteria of the
-    information without either. half_widths_now, half_widths: of the 95 % intervals by parameter, in its unit, to first
-    order, at the values found or held, only as good as the noise assumed; None where it stays open. values: the
-    parameters' values there. others: the best of each other kind and input, best first. tried: how many. failed: those
+    best: the experiment. aim: the parameter whose interval it narrows, the widest that any narrows. by_determinant: the
+    experiment that raises the determinant most (D-optimal). now: the criteria of the information without either.
+    half_widths_now: of the 95 % intervals by parameter, in its unit, as the verdicts have them, else to first order;
+    half_widths: the same, made narrower as the information predicts, only as good as the noise assumed; None where it stays
+    open. values: the parameters' values there. others: the best of each other kind and input, best first. tried: how many. failed: those
     that cannot be simulated, with the reason. text: the advice in words. misfit: whether the model leaves more than a known noise:
     the half-widths then hold only if nothing else is missing, and no interval of 95 % is predicted.
     """
 
     best: RankedDesign
+    aim: str
     by_determinant: RankedDesign
     now: OptimalityCriteria
     half_widths_now: FrozenMap[float | None]
@@ -276,7 +287,8 @@ class Recommendation:
             "from": first.before,
             "to": first.after,
             **self._line(self.best),
-            "criterion": "E-optimal: the largest smallest eigenvalue of the information in scaled coordinates",
+            "aim": self.aim,
+            "criterion": "the widest interval, beside its parameter's scale, is made the narrowest",
             "predicted_half_width": dict(self.half_widths),
             "predicted_ci95": intervals,
             "half_width_now": dict(self.half_widths_now),
@@ -294,6 +306,7 @@ class Recommendation:
             "moves": [m.to_dict() for m in r.design.moves],
             "record": list(r.record),
             "new_signals": list(r.new),
+            "half_width": r.half_width,
             "smallest_eigenvalue": {"now": self.now.smallest_eigenvalue, "then": r.criteria.smallest_eigenvalue},
             "directions_seen": {"now": self.now.directions, "then": r.criteria.directions},
             "determinant_gain": gain if r.criteria.directions == self.now.directions else None,
@@ -306,20 +319,26 @@ def recommend(
     units: Mapping[str, str],
     *,
     thresholds: Mapping[str, float],
+    told: Mapping[str, float] = MappingProxyType({}),
     misfit: bool = False,
-) -> Recommendation | None:
-    """Return the best of the experiments that could be made; None where there is no input to move, or none can be run.
+) -> Recommendation | str:
+    """Return the best of the experiments that a person could make, or in a sentence why none is advised; "" where nothing is left to know.
 
-    Tried are, for every input, steps at three levels, a ramp and a multisine; and the best steps followed by a step of
-    every other input; each with the signals recorded so far, and with one more. whole: all candidates free, at the
-    values of the optimum. inputs: the model's. units: of the parameters. thresholds: the rise of the cost at the ends of
-    a parameter's interval, which widens the predicted intervals too. misfit: whether the model leaves more than a known noise.
+    Tried are, for every input that can be set, steps at three levels, a ramp and a multisine; and the best steps followed by a
+    step of every other such input; each with the signals recorded so far, and with one more. whole: all candidates free, at
+    the values of the optimum. inputs: the model's. units: of the parameters. thresholds: the rise of the cost at the ends of
+    a parameter's interval. told: half-widths of the intervals by parameter, where the verdicts have some. misfit: whether the
+    model leaves more than a known noise.
     """
     recordings = in_time(whole.problem.fitted_experiments)
     if not recordings:
-        return None
+        return "No experiment is advised: nothing was recorded in time."
+    if not any(i.settable for i in inputs.values()):
+        none = f"none of {listed(tuple(inputs))} can be set by a person" if inputs else "the model has no input"
+        return f"No experiment is advised: {none}."
     template = max(recordings, key=lambda e: float(np.ptp(e.time)))
-    values, of_inputs = {n: i.value for n, i in inputs.items()}, {n: i.unit for n, i in inputs.items()}
+    values = {n: i.value for n, i in inputs.items() if i.settable}
+    of_inputs = {n: i.unit for n, i in inputs.items()}
     tried = _Ranking(whole, template)
     singles = list(single_input_designs(recordings, values, of_inputs, template))
     ranked = list(tried.ranked(singles))
@@ -329,24 +348,116 @@ def recommend(
             steps.setdefault(r.design.inputs[0], r.design)
     ranked += tried.ranked(two_step_designs([*steps.values()][:BEGUN_WITH], singles, template))
     if not ranked:
-        return None
-    base = whole.information.matrix
-    best = max(ranked, key=lambda r: (*_order(r), -len(r.new), -len(r.design.moves)))
+        return f"No experiment is advised: none of those tried can be simulated ({tried.failed[0]})."
+    count = len({r.design for r in ranked})
+    widths = _Widths.of(whole, thresholds, told)
+    found = widths.aim(ranked)
+    if found is None:
+        return widths.why_none(count)
+    aim, ranked = found
+    best = ranked[0]
     by_determinant = max(
         ranked, key=lambda r: (r.criteria.directions, r.criteria.log_determinant, -len(r.design.moves))
     )
-    usual = float(np.median(list(thresholds.values()))) if thresholds else TWO_SIDED
-    per_std = whole.slope[: len(whole.names)] * np.sqrt([2.0 * thresholds.get(n, usual) for n in whole.names])
-    now, then = (half_widths(m, per_std, whole.names, whole.error) for m in (base, base + best.gain))
-    at = FrozenMap({n: whole.value(n) for n in whole.names})
-    text = _text(best, by_determinant, now, then, {**units, **of_inputs}, len(ranked), misfit=misfit)
+    at, then = FrozenMap({n: whole.value(n) for n in whole.names}), widths.with_gain(best.gain)
+    text = _text(best, aim, by_determinant, widths, then, {**units, **of_inputs}, misfit=misfit)
     if whole.deterministic:
         text += " The misfit stands for the noise in these intervals."
     others = tuple(_others(ranked, best))
-    count = len({r.design for r in ranked})
     return Recommendation(
-        best, by_determinant, tried.now, now, then, at, others, count, tuple(tried.failed), text, misfit
+        best, aim, by_determinant, tried.now, widths.now, then, at, others, count, tuple(tried.failed), text, misfit
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Widths:
+    """Half-widths of the intervals as they are, and as information that is added would make them.
+
+    now: by parameter, in its unit, None where it is open. linear: the same to first order. scale: what a width is compared with,
+    by parameter. uncertain: share of a width that its own 95 % uncertainty is. per_std: as of `half_widths`.
+    """
+
+    whole: LocalAnalysis
+    per_std: Array
+    now: FrozenMap[float | None]
+    linear: FrozenMap[float | None]
+    scale: Mapping[str, float]
+    uncertain: float
+
+    @classmethod
+    def of(cls, whole: LocalAnalysis, thresholds: Mapping[str, float], told: Mapping[str, float]) -> _Widths:
+        """Return the widths at a point. thresholds, told: as of `recommend`."""
+        names = whole.names
+        usual = float(np.median(list(thresholds.values()))) if thresholds else TWO_SIDED
+        slope = whole.slope[: len(names)]
+        per_std = slope * np.sqrt([2.0 * thresholds.get(n, usual) for n in names])
+        linear = half_widths(whole.information.matrix, per_std, names, whole.error)
+        now = FrozenMap({n: told.get(n, half) if half is not None else None for n, half in linear.items()})
+        # A standard deviation from so many independent samples is itself known to 1/sqrt(2 samples).
+        samples = max(sum(whole.uncertainty.effective.values()) - len(whole.problem.names), 1.0)
+        uncertain = math.sqrt(2.0 * TWO_SIDED) / math.sqrt(2.0 * samples)
+        return cls(whole, per_std, now, linear, dict(zip(names, slope.tolist(), strict=True)), uncertain)
+
+    def with_gain(self, gain: Array) -> FrozenMap[float | None]:
+        """Return the widths with information added, (p, p) in scaled coordinates: those of now, narrower by what it is to first order."""
+        matrix = self.whole.information.matrix + gain
+        linear = half_widths(matrix, self.per_std, self.whole.names, self.whole.error)
+
+        def narrowed(name: str) -> float | None:
+            then, was, now = linear[name], self.linear[name], self.now[name]
+            return then if then is None or was is None or now is None else now * then / was if was else now
+
+        return FrozenMap({n: narrowed(n) for n in self.whole.names})
+
+    @cached_property
+    def again(self) -> FrozenMap[float]:
+        """The least width by parameter that any of the experiments would give if it were made once more."""
+        each = [self.with_gain(gain) for gain in self.whole.information.by_experiment.values()]
+        halves = {n: [half for w in each if (half := w[n]) is not None] for n in self.now}
+        return FrozenMap({n: min(found, default=math.inf) for n, found in halves.items()})
+
+    def narrows(self, name: str, then: float | None) -> bool:
+        """Return whether a width is less than what repetition gives, by more than it is uncertain; any width is less than none."""
+        return then is not None and (self.now[name] is None or then < (1.0 - self.uncertain) * self.again[name])
+
+    def aim(self, ranked: Sequence[RankedDesign]) -> tuple[str, list[RankedDesign]] | None:
+        """Return the widest of the open intervals that a design narrows, and the designs, the best for it first; None where none does."""
+        after = [self.with_gain(r.gain) for r in ranked]
+        for name in self.open:
+            found = [replace(r, half_width=w[name]) for r, w in zip(ranked, after, strict=True)]
+            found.sort(key=lambda r: r.order)
+            if self.narrows(name, found[0].half_width):
+                return name, found
+        return None
+
+    @property
+    def open(self) -> list[str]:
+        """The parameters whose interval is wider than a change that is told, the widest first beside its scale."""
+
+        def wide(name: str) -> bool:
+            half, value = self.now[name], self.whole.value(name)
+            return half is None or not narrow(value, (value - half, value + half))
+
+        def width(name: str) -> float:
+            half = self.now[name]
+            return math.inf if half is None else half / self.scale[name]
+
+        return sorted(filter(wide, self.now), key=width, reverse=True)
+
+    def why_none(self, count: int) -> str:
+        """Return why none of so many experiments is advised, in a sentence; "" where no interval is open."""
+        if not self.open:
+            return ""
+        if self.uncertain >= 1.0:
+            return (
+                "No experiment is advised: what the model leaves is no noise, and a width that rests on it is too uncertain to "
+                "promise a narrower one. Diagnose first."
+            )
+        return (
+            f"No experiment is advised: of {count} tried (steps, ramps, multisines and pairs of steps) none narrows the interval of "
+            f"{listed(self.open)} further than the same recordings made once more, by more than the {percentage(self.uncertain)} by "
+            "which a width is uncertain."
+        )
 
 
 class _Ranking:
@@ -377,7 +488,7 @@ class _Ranking:
                 more = optimality(self.base + gain, self.whole.error)
                 if (more.directions, more.smallest_eigenvalue) > (
                     first.directions,
-                    first.smallest_eigenvalue * GAIN,
+                    first.smallest_eigenvalue * EFFORT,
                 ):
                     yield RankedDesign(design, (*self.recorded, signal), (signal,), more, gain)
 
@@ -411,19 +522,19 @@ class _Ranking:
 
 
 def _others(ranked: Sequence[RankedDesign], best: RankedDesign) -> Iterator[RankedDesign]:
-    """Yield the best of each other kind and set of inputs, best first; pairs only where the second step adds something."""
+    """Yield the best of each other kind and set of inputs, in their order; pairs only where the second step adds something."""
     shown = {(best.design.kind, frozenset(best.design.inputs))}
     alone: dict[tuple[tuple[Move, ...], tuple[str, ...]], RankedDesign] = {
         (r.design.moves, r.record): r for r in ranked if len(r.design.moves) == 1
     }
-    for r in sorted(ranked, key=_order, reverse=True):
+    for r in ranked:
         key = r.design.kind, frozenset(r.design.inputs)
         single = alone.get((r.design.moves[:1], r.record))
         if key in shown or (
             len(r.design.moves) > 1
             and single is not None
             and r.criteria.directions <= single.criteria.directions
-            and r.criteria.log_determinant <= single.criteria.log_determinant + math.log(GAIN)
+            and r.criteria.log_determinant <= single.criteria.log_determinant + math.log(EFFORT)
         ):
             continue
         shown.add(key)
@@ -443,39 +554,37 @@ def _order(r: RankedDesign) -> tuple[int, float, float]:
 
 def _text(
     best: RankedDesign,
+    aim: str,
     by_determinant: RankedDesign,
-    now: Mapping[str, float | None],
+    widths: _Widths,
     then: Mapping[str, float | None],
     units: Mapping[str, str],
-    tried: int,
     *,
     misfit: bool,
 ) -> str:
-    """Return the advice, what it would give for the parameters that gain most, and what stays open all the same."""
+    """Return the advice, what it would give for the parameter it is for and those that gain most, and what stays as it is."""
+    now = widths.now
 
-    def ratio(name: str) -> float:  # of the interval's width then to now; 0 where it was open
+    def share(name: str) -> float:  # of the interval's width then to now; 0 where it was open
         before, after = now[name], then[name]
-        return 1.0 if after is None else 0.0 if before is None else after / before if before else 1.0
+        return 0.0 if before is None or after is None or not before else after / before
 
     def instruction(r: RankedDesign) -> str:
         record = f"{listed(r.new)} besides the signals so far" if r.new else "the same signals"
         return f"{r.design.text(units)}, recording {record}"
 
     def gain(name: str) -> str:
-        before = "none" if now[name] is None else f"±{now[name]:.3g}"
+        before, after = ("none" if half is None else f"±{figures(half, 3)}" for half in (now[name], then[name]))
         would = "be known to" if misfit else "get a 95 % confidence interval of"
-        return f"{name} would {would} ±{then[name]:.3g} {units.get(name, '')}".rstrip() + f" (now {before})"
+        return f"{name} would {would} {after} {units.get(name, '')}".rstrip() + f" (now {before})"
 
-    gains = sorted((n for n in then if ratio(n) < WORTH), key=ratio)
-    if not gains:
-        return (
-            f"None of the {tried} experiments tried (steps, ramps, multisines and pairs of steps) would narrow an interval "
-            f"by a tenth; the most would come from: {instruction(best)}."
-        )
+    others = sorted((n for n in then if n != aim and widths.narrows(n, then[n])), key=share)
     condition = "if nothing else is missing, " if misfit else ""
-    text = f"{instruction(best)}: {condition}{', '.join(map(gain, gains[:NAMED]))}."
+    text = f"{instruction(best)}: {condition}{', '.join(map(gain, [aim, *others][:NAMED]))}."
     if best.new:
         text += f" That takes the noise of {listed(best.new)} to be like that of the signals recorded."
+    if wider := widths.open[: widths.open.index(aim)]:
+        text += f" The wider interval of {listed(wider)} is narrowed by none of the experiments tried."
     still_open = [n for n, half in then.items() if half is None]
     if still_open:
         text += f" {listed(still_open)} would stay open: only together with others, or not at all, do they show."

@@ -56,7 +56,8 @@ class IdentifiabilityReport(Shown):
     combinations: what is seen of those that cannot be told apart. collinear: subsets with their index, worst first within
     each size. shares: of each parameter's information, by experiment.
     pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
-    search met. sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
+    search met. recommended: what to measure next; not_recommended: why nothing is.
+    sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
     the model has no equations here.
     """
 
@@ -71,6 +72,7 @@ class IdentifiabilityReport(Shown):
     heterogeneity: FrozenMap[Heterogeneity] = field(default_factory=FrozenMap)
     misspecification: Misspecification = field(default_factory=lambda: Misspecification(False, ()))
     recommended: Recommendation | None = None
+    not_recommended: str = ""
     thresholds: FrozenMap[float] = field(default_factory=FrozenMap)
     pilot: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -121,6 +123,7 @@ class IdentifiabilityReport(Shown):
             },
             "experiments": {e: {"information": dict(t)} for e, t in self.shares.items()},
             "recommended_experiment": self.recommended.to_dict() if self.recommended else None,
+            "not_recommended": self.not_recommended,
             "profiles": {n: _profile(v.profile) for n, v in self.parameters.items() if v.profile is not None},
             "pair": self.pair,
             "sensitivities": self.sensitivities.to_dict() if self.sensitivities else None,
@@ -162,6 +165,8 @@ class IdentifiabilityReport(Shown):
             yield f"The model does not explain these data: {'; '.join(signs.signs)}."
         if self.recommended is not None:
             yield f"Measure next: {self.recommended.text}"
+        elif self.not_recommended:
+            yield self.not_recommended
         yield "\n".join([*self.notes, CONDITIONS])
 
     def __str__(self) -> str:

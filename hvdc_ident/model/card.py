@@ -171,6 +171,8 @@ def _is_given(field: Field[Any], value: Any) -> bool:
 def _value(value: Any, place: str) -> str:
     if isinstance(value, str):
         return toml_string(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
     if isinstance(value, float):
         return _float(value)
     if isinstance(value, sp.Expr):

@@ -65,6 +65,10 @@ class InputEntry(TomlTable):
         default=0.0)
     unit: str = optional("Unit, as text.", 'v = {value = 0.0, unit = "V"}', default="")
     description: str = optional("What the input is.", 'v = {value = 0.0, description = "armature voltage"}', default="")
+    settable: bool = optional(
+        "False for an input that no person can move for an experiment, such as the voltage of a grid: no recording that moves it is "
+        "advised.",
+        'E = {value = 1.0, unit = "pu", settable = false}', default=True)
 
 
 class StateEntry(TomlTable):

@@ -125,6 +125,10 @@ def _field(kind: type[Any], key: str, value: object, place: str) -> Any:
         if not isinstance(value, str):
             raise ModelError(f"its {key} is no text", where=place, expected="a text", got=_shown(value))
         return value
+    if key == "settable":
+        if not isinstance(value, bool):
+            raise ModelError(f"its {key} is neither true nor false", where=place, expected="true or false", got=_shown(value))
+        return value
     if key in EXPRESSIONS or (key == "value" and kind not in (Parameter, Input)):
         return expression(value, place if key in ("value", "derivative", "equation", "of") else f"{place}, {key}")
     if kind is State and key in ("guess", "rest", "vanishes") and value is None:

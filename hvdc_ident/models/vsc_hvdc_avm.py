@@ -60,9 +60,9 @@ def inputs(rated: Rating) -> dict[str, Input]:
         "Qref1": Input(0.0, "pu", "reactive power set-point of station 1"),
         "Pref2": Input(rated.power, "pu", "active power set-point of station 2"),
         "Qref2": Input(0.0, "pu", "reactive power set-point of station 2"),
-        "E1": Input(1.0, "pu", "grid voltage of station 1"),
-        "E2": Input(1.0, "pu", "grid voltage of station 2"),
-        "Iload1": Input(0.0, "pu", "dc current drawn from the capacitor of station 1"),
+        "E1": Input(1.0, "pu", "grid voltage of station 1", settable=False),
+        "E2": Input(1.0, "pu", "grid voltage of station 2", settable=False),
+        "Iload1": Input(0.0, "pu", "dc current drawn from the capacitor of station 1", settable=False),
     }
 
 

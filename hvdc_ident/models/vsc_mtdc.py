@@ -99,8 +99,8 @@ def _inputs(stations: list[str]) -> dict[str, Input]:
         found[f"Pref{i}"] = Input(0.4 * sign, "pu", f"active power set-point of station {i}")
     for i in stations:
         found[f"Qref{i}"] = Input(0.0, "pu", f"reactive power set-point of station {i}")
-        found[f"E{i}"] = Input(1.0, "pu", f"grid voltage of station {i}")
-        found[f"Iload{i}"] = Input(0.0, "pu", f"dc current drawn at node {i}")
+        found[f"E{i}"] = Input(1.0, "pu", f"grid voltage of station {i}", settable=False)
+        found[f"Iload{i}"] = Input(0.0, "pu", f"dc current drawn at node {i}", settable=False)
     return found
 
 

@@ -37,7 +37,7 @@ LEVELS = FrozenMap({level: output for level, output, _, _ in REFERENCES})
 """By input with a level the output that has it."""
 LOADED = 0.8
 """Share of its base that a unit delivers where its level is not known."""
-VOLTAGE = Input(1.0, "pu", "voltage of the infinite bus")
+VOLTAGE = Input(1.0, "pu", "voltage of the infinite bus", settable=False)
 SHOWN = FrozenMap({"P": "MW", "Q": "Mvar", "Vt": "pu", "dw": "pu", "Efd": "pu", "Pm": "pu", "wt": "pu", "wg": "pu"})
 """Outputs of a unit, where one of its components has them, with their units."""
 
@@ -210,7 +210,8 @@ def _references(inputs: dict[str, Input], machine: UnitPart, unit: Model) -> dic
         if reference is not None:
             found[reference] = (level, output, inputs.pop(reference))
             base = machine.values.get("Sn", shelf_model(machine.source).values.get("Sn", 100.0))
-            inputs[level] = Input(LOADED * base if output == "P" else 0.0, unit_of_level, f"{output} before the event")
+            value = LOADED * base if output == "P" else 0.0
+            inputs[level] = Input(value, unit_of_level, f"{output} before the event", settable=False)
     return found
 
 
@@ -273,7 +274,8 @@ def _one_that_gives(models: Mapping[str, Model], output: str) -> str:
 
 
 def _input_line(name: str, quantity: Input) -> str:
+    settable = "" if quantity.settable else ", settable = false"
     return (
         f"{toml_key(name)} = {{value = {quantity.value!r}, unit = {toml_string(quantity.unit)}, "
-        f"description = {toml_string(quantity.description)}}}"
+        f"description = {toml_string(quantity.description)}{settable}}}"
     )

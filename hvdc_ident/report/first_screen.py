@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hvdc_ident.fit.uncertainty import MOVED
 from hvdc_ident.report.html import badge, estimate, number, prose, table, table_of, text, typeset
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
@@ -20,7 +21,7 @@ from hvdc_ident.summary.phrases import (
     verdict_sentence,
     which_values,
 )
-from hvdc_ident.summary.run_summary import MOVED, ParameterSummary, Quantity
+from hvdc_ident.summary.run_summary import ParameterSummary, Quantity
 from hvdc_ident.summary.tables import PLACES, sets_table
 from hvdc_ident.text import change_text, percentage, probability_text
 
@@ -213,5 +214,5 @@ def _next(s: RunSummary) -> str:
     elif s.counting.name == "effect":
         why = "No recording is advised."
     else:
-        why = "" if s.next else "No advice yet: `hvdc-ident identify STUDY` says which recording would tell more."
+        why = s.unadvised or ("" if s.next else "No advice yet: `hvdc-ident identify STUDY` says which recording would tell more.")
     return f"<p class='answer'>{prose(' '.join([why, *map(next_sentence, s.next)]).strip())}</p>"

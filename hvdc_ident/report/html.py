@@ -52,16 +52,12 @@ def captioned(drawing: str, caption: str, attributes: str = "") -> str:
     return f"<figure{attributes}>{drawing}<figcaption>{caption}</figcaption></figure>"
 
 
-def folded(summary: str, body: str, about: str = "", *, printed: bool = False) -> str:
-    """Return a part that opens on demand, "" without a body. summary, about: its line and one sentence on it, as HTML.
-
-    printed: whether it is printed open even where the reader left it closed; others are printed as their line.
-    """
+def folded(summary: str, body: str, about: str = "") -> str:
+    """Return a part that opens on demand, "" without a body. summary, about: its line and one sentence on it, as HTML."""
     if not body:
         return ""
     more = f"<span class='about'>{about}</span>" if about else ""
-    kind = " class='printed'" if printed else ""
-    return f"<details{kind}><summary>{summary}{more}</summary>{body}</details>"
+    return f"<details><summary>{summary}{more}</summary>{body}</details>"
 
 
 def badge(passed: bool | None) -> str:
@@ -107,11 +103,10 @@ class Section:
     """A part of the page that opens on demand.
 
     order: its place. title: its heading. about: one sentence on what it shows, which stands beside the heading. render: its
-    HTML from the results (empty: the part is left out). printed: whether a print shows it; of the others it has the heading.
+    HTML from the results (empty: the part is left out). A print shows it open.
     """
 
     order: int
     title: str
     about: str
     render: Callable[[Results], str]
-    printed: bool = False

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
+from hvdc_ident.fit.uncertainty import MOVED
 from hvdc_ident.report.html import badge, table_of, text
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
@@ -30,7 +31,7 @@ from hvdc_ident.summary.phrases import (
     sizes_text,
     windows_name,
 )
-from hvdc_ident.summary.run_summary import MOVED, AddedEffect, FindingSummary, SetSummary
+from hvdc_ident.summary.run_summary import AddedEffect, FindingSummary, SetSummary
 from hvdc_ident.summary.tables import values_table
 from hvdc_ident.text import listed, quantity, span
 
@@ -222,7 +223,8 @@ def _request(s: RunSummary) -> str:
 def _asked_of(f: FindingSummary) -> str:
     """Return what an owner knows of an effect, where it may be, and its size where that does not depend on the place."""
     places = list(place_texts(f, listed))
-    where = " or ".join(places[:2]) + (f" or one of {len(places) - 2} more places" if len(places) > 2 else "")
+    shown = places[: RIVALS if len(places) <= RIVALS else 2]
+    where = " or ".join(shown) + (f" or one of {len(places) - 2} more places" if len(places) > len(shown) else "")
     what = f"{ASKED.get(f.effect, f'the {f.effect}')} at {where}"
     depends = any(p.values for p in f.places)
     return what if depends or not f.sizes else f"{what}, which the model leaves out (here {sizes_text(f.sizes)})"
@@ -345,8 +347,7 @@ def _next(s: RunSummary) -> str:
     advice = next((step.text for step in s.next if step.kind == "separate"), "")
     if not advice:
         return ""
-    advice = "r" + advice[1:] if advice.startswith("Record ") else advice
-    return f"{'To tell them apart' if s.rivals else 'What would show more'}: {advice}"
+    return f"{'To tell them apart' if s.rivals else 'What would show more'}: {advice[:1].lower()}{advice[1:]}"
 
 
 def _attached(results: Results) -> list[str]:

@@ -64,10 +64,9 @@ def _anchor(section: Section) -> str:
 
 def _folded(section: Section, body: str, *, opened: bool) -> str:
     """The section as a part that opens on demand; a link into it opens it too."""
-    kind = "section printed" if section.printed else "section"
     heading = f"<summary><h2>{text(section.title)}</h2><span class='about'>{text(section.about)}</span></summary>"
     state = " open" if opened else ""
-    return f"<details class='{kind}'{state}>{heading}\n<div id='{_anchor(section)}'>{body}</div></details>"
+    return f"<details class='section'{state}>{heading}\n<div id='{_anchor(section)}'>{body}</div></details>"
 
 
 def document(title: str, subtitle: str, body: str) -> str:

@@ -11,13 +11,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from hvdc_ident.data import FEWEST_QUIET, Array, Trajectory, before_event, conversion, noise_estimate
 from hvdc_ident.model import AnyModel
+from hvdc_ident.study.conversions import Evidence, suggest_conversion
 from hvdc_ident.text import quantity
 
 Kind = Literal["input", "output"]
@@ -125,7 +126,7 @@ def match_names(columns: Sequence[Column], targets: Sequence[Target]) -> dict[st
 def matching(columns: Sequence[Column], targets: Sequence[Target]) -> Matching:
     """Return the columns by signal. The targets' levels are those of the model at the inputs that names map."""
     named = match_names(columns, targets)
-    mapped = [m for m in named.values() if usable(m)]
+    mapped = [_questioned(m) for m in named.values() if usable(m)]
     proposed = [_with_base(m) for m in named.values() if not usable(m)]
     taken = {m.column.name for m in named.values()}
     free = [c for c in columns if c.name not in taken]
@@ -182,45 +183,52 @@ def _candidate(target: Target, column: Column) -> Match | None:
     return match if stated or _is_near(match) else None
 
 
-def _levels(match: Match) -> tuple[float, float, float] | None:
-    """Recorded level, model's level and the noise, in the model's unit; None where one is not known."""
+def _evidence(match: Match) -> Evidence | None:
+    """Return the recorded level against the model's, in the model's unit; None where one is not known."""
     by = match.column.converted(match.target.unit)
     if by is None or match.column.level is None or match.target.level is None:
         return None
-    return by[0] * match.column.level + by[1], match.target.level, abs(by[0]) * match.column.noise
+    return Evidence(by[0] * match.column.level + by[1], (match.target.level,), abs(by[0]) * match.column.noise)
 
 
 def _is_near(match: Match) -> bool:
     """Return whether both levels are known and those of one quantity: within the noise, or by less than a way of counting."""
-    known = _levels(match)
-    if known is None:
+    found = _evidence(match)
+    if found is None or found.recorded is None:
         return False
-    recorded, level, noise = known
-    same = abs(recorded - level) <= CERTAIN * noise or recorded == level
-    return same or (recorded * level > 0.0 and abs(math.log(recorded / level)) < math.log(NEAR))
+    same = abs(found.recorded - found.levels[0]) <= CERTAIN * found.error
+    return same or found.level_mismatch() < math.log(NEAR)
 
 
 def _far(match: Match) -> float:
-    """The difference of the levels over the larger one; infinite where one is not known."""
-    known = _levels(match)
-    if known is None:
+    """Return the difference of the levels over the larger one; infinite where one is not known."""
+    found = _evidence(match)
+    if found is None or found.recorded is None:
         return math.inf
-    size = max(abs(known[0]), abs(known[1]))
-    return abs(known[0] - known[1]) / size if size else 0.0
+    size = max(abs(found.recorded), abs(found.levels[0]))
+    return abs(found.recorded - found.levels[0]) / size if size else 0.0
+
+
+def _questioned(match: Match) -> Match:
+    """Return a match of names, with the conversion that its levels suggest where they are far apart."""
+    found = _evidence(match)
+    suggested = suggest_conversion([found], match.target.unit) if found is not None and not _is_near(match) else None
+    if found is None or suggested is None:
+        return match
+    reads = quantity(found.recorded or 0.0, match.target.unit)
+    level = quantity(found.levels[0], match.target.unit)
+    return replace(match, reason=f"{match.reason}; it reads {reads} {match.column.place}, the model is at {level}: {suggested.reason}")
 
 
 def _with_base(match: Match) -> Match:
     """Return a match of names that cannot be used, with the reason, and the base that its levels suggest."""
     column, target = match.column, match.target
     if column.converted(target.unit) is not None:
-        return Match(
-            target,
-            column,
-            f"{match.reason}, but not recorded in {column.gaps} row{'s' if column.gaps > 1 else ''}, and an input is needed all along",
-        )
+        rows = f"{column.gaps} row{'s' if column.gaps > 1 else ''}"
+        return replace(match, reason=f"{match.reason}, but not recorded in {rows}, and an input is needed all along")
     reason = f"{match.reason}, but in {column.unit}, which converts to {target.unit} only with a rated base"
     if column.level is None or not target.level or column.level * target.level <= 0.0:
-        return Match(target, column, reason)
+        return replace(match, reason=reason)
     base = float(f"{column.level / target.level:.3g}")
     levels = f"{quantity(column.level, column.unit)} {column.place}, {quantity(target.level, target.unit)} in the model"
-    return Match(target, column, f"{reason}: {levels}", base)
+    return replace(match, reason=f"{reason}: {levels}", base=base)

@@ -260,10 +260,12 @@ def _linear(source: Study | Model | LinearModel, selected: ValueSet | None) -> L
 
 
 def letter(study: Study, folder: Path, options: StageOptions) -> tuple[Path, Done]:
-    """The path of the letter in the folder, and the diagnosis it tells of, which is run where the folder has none.
+    """The path of the letter in the folder, and the diagnosis it is about, which is run where the folder has none, and so is the
+    comparison at the given values: the letter draws the model before and after.
 
     Raises ComputationError with the reason where the diagnosis fails.
     """
+    have_stage(study, "simulate", folder, options)
     done = have_stage(study, "diagnose", folder, options)
     if done.failed:
         raise ComputationError("there is no diagnosis to write a letter about", where="letter", got=done.failed)

@@ -7,23 +7,22 @@ from typing import TYPE_CHECKING
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.checks import need_start
-from hvdc_ident.study.level_comparison import outputs_of
+from hvdc_ident.study.initial_values import InitialValues, outputs_of
 from hvdc_ident.study.linear_analysis import operating_point
-from hvdc_ident.study.quiescent_levels import QuiescentLevels
 from hvdc_ident.study.stages import stages
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
 
-def hindrances(study: Study, levels: QuiescentLevels) -> list[str]:
+def hindrances(study: Study, values: InitialValues) -> list[str]:
     """Return what hinders a run, in sentences; empty where nothing was found.
 
-    levels: of this study; they come from a run of every recorded experiment at the given values, whose failures they hold, with
+    values: of this study; they come from a run of every recorded experiment at the given values, whose failures they hold, with
     the recordings that seem to have another sign or unit. Besides these, experiments without a recording are run at the given
     values, and all at the start values where these differ and a search begins there.
     """
-    found = [*levels.failures, *levels.mistakes, *_bounds(study)]
+    found = [*values.failures, *values.mistakes, *_bounds(study)]
     found += _runs(study, at_start=False)
     searches = any(s.searches and s.wanted(study) for s in stages())
     if searches and study.start != study.given:

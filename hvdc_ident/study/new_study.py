@@ -316,6 +316,9 @@ def _study_text(
         yield f"# {toml_key(name)} = {{start = {p.value!r}}}" + (f"   # {_comment(about)}" if about else "")
     more = len(model.parameters) - len(asked) - MOST_LISTED
     yield from [f"# and {more} more parameters of the model"] if more > 0 else []
+    if settable := [n for n, i in model.inputs.items() if i.settable]:
+        names = ", ".join(map(toml_string, settable))
+        yield from ("", "# [inputs]", f"# settable = [{names}]   # those that a person can move for a recording")
     for r in recordings:
         yield from ("", *_experiment_text(r, played=dyr is not None))
     yield ""

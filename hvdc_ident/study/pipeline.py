@@ -17,7 +17,7 @@ from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
 from hvdc_ident.model import Model
 from hvdc_ident.study.checks import steady_notes, violations
 from hvdc_ident.study.executors import open_executor
-from hvdc_ident.study.quiescent_levels import quiescent_levels
+from hvdc_ident.study.initial_values import initial_values
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult, stage, stages
 from hvdc_ident.study.store import CachingExecutor, Store, exclusive, source_hash
 from hvdc_ident.study.study import Study
@@ -145,7 +145,7 @@ def _rest_of(study: Study, options: StageOptions) -> Rest:
 
     @cache
     def rest() -> list[dict[str, Any]]:
-        found = quiescent_levels(study)
+        found = initial_values(study)
         options.announce(found.lines)
         return found.to_list()
 

@@ -102,6 +102,7 @@ Unit = Annotated[str, StringConstraints(max_length=50)]
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 Names = Annotated[list[Name], Field(min_length=1)]
 NameOrNames = Annotated[Names, BeforeValidator(_as_list, json_schema_input_type=Name | Names)]
+NamesOrNone = Annotated[list[Name], BeforeValidator(_as_list, json_schema_input_type=Name | list[Name])]
 OneOrThree = Annotated[list[Name], BeforeValidator(_one_or_three, json_schema_input_type=Name | Names)]
 Axes = Annotated[list[Name], Field(min_length=1, max_length=2), BeforeValidator(_as_list, json_schema_input_type=Name | Names)]
 Two = Annotated[list[Name], Field(min_length=2, max_length=2)]
@@ -115,6 +116,15 @@ Sizes = Annotated[dict[Name, Positive], ByName()]
 Interpolation = Literal["hold", "linear"]
 Role = Literal["fit", "holdout"]
 Spacing = Literal["linear", "log"]
+
+
+class InputsTable(TomlTable):
+    """[inputs]: what a person can do with the model's inputs."""
+
+    settable: NamesOrNone | None = optional(
+        "The inputs that a person can move for an experiment; what to record next moves no other. [] for none. If left out, those that "
+        "the model does not declare otherwise: of shipped models all but grid voltages, grid frequencies and measured signals.",
+        'settable = ["Vdcref1", "Pref2"]', of="input")
 
 
 class EffectTable(TomlTable):
@@ -198,6 +208,16 @@ class ParameterTable(TomlTable):
         "expr": "tie = ..., an expression of other parameters that this one follows",
         "bounds": "min = ... and max = ...", "lower": "min = ...", "upper": "max = ...", "lb": "min = ...", "ub": "max = ...",
     }
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_table(cls, value: Any) -> Any:
+        numbers = value if isinstance(value, list) else [value]
+        if len(numbers) in (1, 2) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in numbers):
+            keys = ("min", "max") if len(numbers) == 2 else ("start",)
+            line = ", ".join(f"{k} = {v}" for k, v in zip(keys, numbers, strict=True))
+            raise wrong("a table: {start = ..., min = ..., max = ...}", hint=f"{{{line}}}")
+        return value
 
     @model_validator(mode="after")
     def _consistent(self) -> ParameterTable:
@@ -646,6 +666,7 @@ class StudyFile(TomlTable):
     model: ModelTable = key("The model and what differs from it.", 'model = {source = "vsc-hvdc-link"}')
     parameters: Annotated[dict[Name, ParameterTable], ByName(own=("prior",), tables=True)] = optional(
         "The parameters that may be estimated, by name. All others keep the model's values.", "[parameters]", default={})
+    inputs: InputsTable | None = optional("What a person can do with the model's inputs.", "[inputs]")
     experiment: list[ExperimentTable] = optional("The recordings: one table for each.", "[[experiment]]", default=[])
     response: list[ResponseTable] = optional("Measured frequency responses: one table for each.", "[[response]]", default=[])
     linearize: LinearizeTable | None = optional("The linear model at an operating point.", "[linearize]")

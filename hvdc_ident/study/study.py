@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -289,10 +289,15 @@ def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> Fr
 
 
 def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> AnyModel:
-    """Return the model with its ties and its given values.
+    """Return the model with its ties, its given values, and what is said of its inputs.
 
-    Raises StudyError or UnknownNameError for a tie, or a parameter of each experiment, that does not fit the model.
+    Raises StudyError or UnknownNameError for a tie, an input, or a parameter of each experiment, that does not fit the model.
     """
+    settable = settings.inputs.settable if settings.inputs else None
+    if settable is not None:
+        require_known("input", settable, model.inputs, f"{where}, inputs.settable")
+        inputs = {n: replace(i, settable=n in settable) for n, i in model.inputs.items()}
+        model = replace(model, inputs=FrozenMap(inputs))  # type: ignore[type-var]
     for name, line in settings.parameters.items():
         if line.given is not None and name in model.parameters:
             with located(f"{where}, parameters.{name}.given"):

@@ -11,9 +11,9 @@ from typing import Any
 from hvdc_ident.data import Experiment, recording_lines
 from hvdc_ident.study.checks import steady_notes
 from hvdc_ident.study.hindrances import hindrances
+from hvdc_ident.study.initial_values import initial_values
 from hvdc_ident.study.measured_responses import described
 from hvdc_ident.study.pipeline import heading_of
-from hvdc_ident.study.quiescent_levels import quiescent_levels
 from hvdc_ident.study.stages import stages
 from hvdc_ident.study.study import Study, candidate_lines
 from hvdc_ident.text import one_of, quantity
@@ -29,7 +29,7 @@ class Summary:
     @classmethod
     def of(cls, study: Study, seed: int = 0, *, in_python: bool = False) -> Summary:
         """Return the summary of a study. The model is run once an experiment, and once more where the start values differ."""
-        model, levels = study.model, quiescent_levels(study)
+        model, initial = study.model, initial_values(study)
         sizes = {n: len(getattr(model, n)) for n in ("states", "parameters", "inputs", "outputs")}
         return cls(
             {
@@ -40,9 +40,9 @@ class Summary:
                 "steady_state": steady_notes(study, searches=any(s.searches and s.wanted(study) for s in stages())),
                 "responses": {r.name: described(r) for r in study.responses},
                 "stages": [s.name for s in stages() if s.wanted(study)],
-                "rest_levels": levels.to_list(),
-                "rest_lines": [*levels.lines, *levels.remarks],
-                "hindrances": hindrances(study, levels),
+                "rest_levels": initial.to_list(),
+                "rest_lines": [*initial.lines, *initial.remarks],
+                "hindrances": hindrances(study, initial),
             },
             in_python,
         )

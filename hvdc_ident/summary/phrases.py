@@ -277,7 +277,8 @@ def gained_sentence(s: RunSummary) -> str:
     r = s.remainder
     if r.shrink is None:
         return ""
-    rest = f"; what is left there is {times_text(r.times)} the noise" if r.times is not None else ""
+    times = None if r.times is None else times_text(r.times)
+    rest = "" if times is None else f"; what is left there is {'' if times == '1 times' else f'{times} '}the noise"
     where = "experiments that no fit has seen" if r.against == "experiments" else r.against
     return (
         f"Adding it shrinks the error on {where} by {percentage(r.shrink)}, measured against the same model with its "

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.files import plain, read_plain
 from hvdc_ident.fit.judgement import Count, Yardstick
+from hvdc_ident.fit.uncertainty import narrow
 
 Outcome = Literal["pass", "fail", "not judged"]
 SETS = ("given", "fitted", "effect")
@@ -17,8 +18,6 @@ SETS = ("given", "fitted", "effect")
 Interval = tuple[float | None, float | None]
 Signal = tuple[str, str]
 """An output and an experiment."""
-MOVED = 0.02
-"""Share of the given value from which on a fitted value is said to differ from it."""
 NextKind = Literal["diagnose", "separate", "letter", "narrow", "export"]
 
 
@@ -162,12 +161,6 @@ class ParameterSummary:
         return self.value is not None and self.interval is not None and narrow(self.value, self.interval)
 
 
-def narrow(value: float, interval: Interval) -> bool:
-    """Return whether an interval is narrower, either way, than a change that is told (`MOVED`)."""
-    low, high = interval
-    return low is not None and high is not None and max(high - value, value - low) <= MOVED * abs(value)
-
-
 @dataclass(frozen=True)
 class PlaceSummary:
     """A likely place of an effect. source: the signal brought in there. values: the sizes of the effect there, and the values of
@@ -262,7 +255,8 @@ class RunSummary(Shown):
     recordings cannot tell from them; late: the delays of a slow signal, s, between which all of these lie, where each has one.
     stand_ins: where values that are off explain the gap, what explains it as well with these values as given.
     conditional: by set of values, whether they hold only if nothing else is missing. fit: the status of the fit.
-    next: what to do, the first thing first. failures: by stage.
+    next: what to do, the first thing first. unadvised: why no recording that narrows an interval is advised, where that was asked.
+    failures: by stage.
     """
 
     study: str
@@ -291,6 +285,7 @@ class RunSummary(Shown):
     fit: str
     search_doubt: str
     next: tuple[NextStep, ...]
+    unadvised: str
     failures: Mapping[str, str]
     schema: int = 1
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from hvdc_ident.fit.judgement import Count, Yardstick
+from hvdc_ident.fit.uncertainty import narrow
 from hvdc_ident.summary.run_summary import (
     SETS,
     AddedEffect,
@@ -26,7 +27,6 @@ from hvdc_ident.summary.run_summary import (
     Signal,
     SignalError,
     SignalSummary,
-    narrow,
 )
 from hvdc_ident.text import form_of, listed, quantity
 
@@ -103,6 +103,7 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
         fit=str(fit.get("status") or ""),
         search_doubt=str(fit.get("search_doubt") or ""),
         next=_next(fit, diagnosis, identified, parameters),
+        unadvised=str(identified.get("not_recommended") or "") if not added_to(diagnosis) else "",
         failures=_failures(stages),
     )
 

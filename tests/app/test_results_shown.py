@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,10 @@ from hvdc_ident.app.result_tables import (
 )
 from hvdc_ident.app.runs import StudyRun
 from hvdc_ident.app.supposed import planned_experiments, refitted, suppositions
+from hvdc_ident.data import trajectory
+from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.experiment_design import Move
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.report.overlay import Overlay, overlay_of
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.phrases import next_sentence
@@ -74,7 +78,15 @@ def test_a_move_is_read_as_it_was_told(move: Move) -> None:
 
 
 def test_the_first_experiment_is_the_one_that_is_recommended(study: hi.Study) -> None:
-    identified = told(study, "identifiability")
+    """Of a wide interval of k, which a record of more noise leaves; the model of the plant, so that there is no misfit."""
+    best = suppositions(study, told(study, "discrepancy"), study.folder)[0].model
+    random = np.random.default_rng(7)
+    noisy = [
+        e.with_(measured=trajectory(e.time, {"y": e.measured["y"] + 0.2 * random.standard_normal(e.time.size)}), noise={"y": 0.2})
+        for e in study.experiments
+        if e.measured is not None
+    ]
+    identified = identifiability(best, noisy, study.candidates.values(), starts=1).to_dict()
     advice = identified["recommended_experiment"]
     first, *others = planned_experiments(study, identified)
     assert advice["text"].startswith(first.words) and others
@@ -83,6 +95,15 @@ def test_the_first_experiment_is_the_one_that_is_recommended(study: hi.Study) ->
     signal = planned.inputs[move["input"]]
     assert (float(signal(0.0)), planned.event) == (move["from"], move["at"])
     assert planned.time[-1] == max(e.time[-1] for e in study.experiments)
+
+
+def test_where_none_is_recommended_every_move_of_a_settable_input_can_be_looked_at(study: hi.Study) -> None:
+    identified = told(study, "identifiability")
+    assert identified["recommended_experiment"] is None and "by which a width is uncertain" in identified["not_recommended"]
+    found = planned_experiments(study, identified)
+    assert {p.design.inputs for p in found} == {("u",)} and {p.design.kind for p in found} == {"step", "ramp", "multisine"}
+    grid = {n: replace(i, settable=False) for n, i in study.model.inputs.items()}
+    assert planned_experiments(replace(study, model=replace(study.model, inputs=FrozenMap(grid))), identified) == ()
 
 
 def test_a_profile_passes_its_level_at_the_ends_of_the_interval(study: hi.Study) -> None:

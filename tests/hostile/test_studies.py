@@ -136,6 +136,17 @@ CASES = {
         _replace('"d.csv"', r'"C:\temp\new.csv"'),
     ),
     "text without quotes": Case(('got role = fit. Try: text in quotes: "fit"',), _append("role = fit\n")),
+    "a decimal comma": Case(
+        ("got noise = {Irorder2 = 0,001}", "Try: a decimal point: 0.001"), _append("noise = {Irorder2 = 0,001}\n")
+    ),
+    "bounds in place of a table": Case(
+        ("parameters.KPQ", "expected a table: {start = ..., min = ..., max = ...}", "Try: {min = 0.5, max = 5}"),
+        _replace("[[exp", "KPQ = [0.5, 5]\n[[exp"),
+    ),
+    "a number in place of a table": Case(("parameters.KPQ", "got 2.0. Try: {start = 2.0}"), _replace("[[exp", "KPQ = 2.0\n[[exp")),
+    "an input that nobody knows": Case(
+        ("inputs.settable", "no input 'Pref9'", "'Pref2'"), _replace("[parameters]", '[inputs]\nsettable = "Pref9"\n[parameters]')
+    ),
     "a date without quotes": Case(('Try: text in quotes: "25.11.2026"',), _append("[letter]\ndate = 25.11.2026\n")),
     "a time of day for a number": Case(
         ("experiment 'd'.event", "expected a number, got 10:00:01", "s, as the time in the data"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -10,10 +11,11 @@ import pytest
 from hvdc_ident.data import InputSignal, trajectory
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.simulator import inputs_of
-from hvdc_ident.identifiability import identifiability
+from hvdc_ident.identifiability import IdentifiabilityReport, identifiability
 from hvdc_ident.identifiability.experiment_design import (
     ExperimentDesign,
     Move,
+    Recommendation,
     half_widths,
     optimality,
     recommend,
@@ -21,7 +23,9 @@ from hvdc_ident.identifiability.experiment_design import (
     two_step_designs,
 )
 from hvdc_ident.identifiability.pilot_fit import pilot_fit
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
+from hvdc_ident.parameters import Input
 from hvdc_ident.simulate import ModelSimulator
 from tests.fit.simulators import line
 from tests.identifiability.cases import closed, measured, on_model, pi_loop
@@ -89,32 +93,69 @@ def test_a_signal_is_recommended_where_only_it_tells_a_combination_apart() -> No
     assert all(found.half_widths[n] is not None for n in model.values)
 
 
-def test_the_best_are_best_of_all_that_were_tried() -> None:
-    """Against every design weighed anew by its eigenvalues, with sensitivities from the engine."""
-    model = two_inputs()
-    signals = {"u": InputSignal.step(1.0, 0.0, 1.0), "w": InputSignal.step(2.0, 0.0, 0.1)}
-    data = on_model(model, "e", signals, ["y"], 1e-3)
+def test_the_best_narrows_the_widest_interval_most_of_all_that_were_tried() -> None:
+    """Against every design weighed anew by the inverse of its information, with sensitivities from the engine."""
+    model, noise = two_inputs(), 0.05
+    signals = {"u": InputSignal.step(1.0, 0.0, 0.5), "w": InputSignal.step(2.0, 0.0, 0.1)}
+    data = on_model(model, "e", signals, ["y"], noise)
     problem = Problem(ModelSimulator(model), (data,), tuple(FREE))
     optimum, _ = pilot_fit(problem, starts=1)
-    found = recommend(optimum, model.inputs, {}, thresholds={"a": 1.92, "k": 1.92})
+    found = recommend(optimum, inputs_of(problem.simulator, [data]), {}, thresholds={"a": 1.92, "k": 1.92})
+    assert isinstance(found, Recommendation)
     base = optimum.information.matrix
+    widest = int(np.argmax(np.diag(np.linalg.inv(base))))
+    assert found.aim == optimum.names[widest] == "k"
     units = dict.fromkeys(model.inputs, "")
     singles = list(single_input_designs([data], {"u": 0.0, "w": 0.0}, units, data))
     assert {t.kind for t in singles} == {"step", "ramp", "multisine"} and len(singles) == 10
     steps = [t for t in singles if t.kind == "step"]
     designs = [*singles, *two_step_designs(steps, singles, data)]
-    smallest, determinants = [], []
+    variances, determinants = [], []
     for design in designs:
         run = ModelSimulator(model).simulate(design.experiment(data), problem.values(optimum.theta), optimum.names)
-        j = run.gradient("y") * optimum.slope / 1e-3
-        values = np.linalg.eigvalsh(base + j.T @ j)
-        smallest.append(values[0])
-        determinants.append(float(np.log(values).sum()))
-    assert found.best.criteria.smallest_eigenvalue >= 0.99 * max(smallest)
+        columns = {o: run.gradient(o) * optimum.slope / noise for o in ("y", "only")}
+        same = base + columns["y"].T @ columns["y"]
+        for after in (same, same + columns["only"].T @ columns["only"]):
+            variances.append(np.linalg.inv(after)[widest, widest])
+            determinants.append(float(np.linalg.slogdet(after)[1]))
+    half = np.sqrt(2.0 * 1.92 * min(variances)) * optimum.slope[widest]
+    assert found.half_widths["k"] == pytest.approx(half, rel=0.05)  # it is the least to two digits
     assert found.by_determinant.criteria.log_determinant >= max(determinants) - 1e-6
-    orders = [r.criteria.smallest_eigenvalue for r in found.others]
-    assert all(a >= 0.98 * b for a, b in pairwise(orders))
+    widths = [r.half_width for r in (found.best, *found.others)]
+    assert all(a <= 1.05 * b for a, b in pairwise(widths))
     assert len({(r.design.kind, frozenset(r.design.inputs)) for r in found.others}) == len(found.others)
+
+
+def test_only_what_a_person_can_set_is_moved() -> None:
+    model = two_inputs()
+    record = on_model(model, "e", {"u": InputSignal.step(1.0, 0.0, 1.0)}, ["y"], 1e-3)
+
+    def advised(**settable: bool) -> IdentifiabilityReport:
+        inputs = {n: Input(settable=settable[n]) for n in model.inputs}
+        return identifiability(replace(model, inputs=FrozenMap(inputs)), [record], FREE, starts=2)
+
+    only_w = advised(u=False, w=True).recommended
+    assert {i for r in (only_w.best, only_w.by_determinant, *only_w.others) for i in r.design.inputs} == {"w"}
+    nothing = advised(u=False, w=False)
+    assert nothing.recommended is None
+    assert nothing.not_recommended == "No experiment is advised: none of u and w can be set by a person."
+    only_u = advised(u=True, w=False)  # k shows through w alone
+    assert only_u.recommended is None or only_u.recommended.best.new
+
+
+def test_an_experiment_that_tells_no_more_than_a_repetition_is_not_advised() -> None:
+    """One input, which was moved as far as any design moves it but by half: made once more, the record tells as much."""
+    model = Model(name="one", parameters={"a": 0.8}, inputs={"u": 0.0}, states={"x": "-a*x + u"}, outputs={"y": "x"})
+    free, noise = [FREE[0]], 0.2
+    signals = {"u": InputSignal.step(1.0, 0.0, 1.0)}
+    once = on_model(model, "e", signals, ["y"], noise)
+    report = identifiability(model, [once], free, starts=2)
+    found = report.recommended
+    assert found is not None and abs(found.best.design.moves[0].after) == 2.0  # twice the step tells four times as much
+    half = report.parameters["a"].ci95
+    assert found.half_widths_now["a"] == pytest.approx(0.5 * (half[1] - half[0]))  # the width that the verdict shows
+    narrow = identifiability(model, [on_model(model, "e", signals, ["y"], 1e-4)], free, starts=2)
+    assert narrow.recommended is None and narrow.not_recommended == ""  # known to 0.01 %: nothing is left to know
 
 
 def test_designs_are_the_signals_they_say() -> None:

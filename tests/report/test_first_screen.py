@@ -92,6 +92,18 @@ def test_the_demo_is_printed_on_eight_pages_at_most_with_nothing_cut_off(browser
     assert (like_the_demo / "report.html").stat().st_size < 3_000_000
 
 
+CUT = """() => [...document.querySelectorAll(".tile .wide, .letter .wide")].filter((e) => e.scrollWidth > e.clientWidth)
+  .map((e) => e.textContent.slice(0, 60))"""
+
+
+def test_on_a_phone_no_column_of_the_first_screen_and_the_letter_is_cut(browser: Any, like_the_demo: Path) -> None:
+    tab = browser.new_page(viewport={"width": 390, "height": 800})
+    for shown in (like_the_demo / "report.html", write_letter(like_the_demo, Letterhead())):
+        tab.goto(shown.as_uri())
+        assert tab.locator(".tile .wide, .letter .wide").count() and tab.evaluate(CUT) == []
+    tab.close()
+
+
 def test_the_letter_is_one_printed_page(browser: Any, like_the_demo: Path) -> None:
     head = Letterhead(
         "A. Engineer, System Studies, TSO", "Converter Works, Modelling", "Link North", "3.2", "2026-11-25"

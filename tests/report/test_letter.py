@@ -9,11 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from hvdc_ident.cli import app
 from hvdc_ident.errors import InputError
-from hvdc_ident.report.letter import Letterhead, letter_of, write_letter
+from hvdc_ident.report.letter import Letterhead, _asked_of, letter_of, write_letter
 from hvdc_ident.study.study import without_letter
 from hvdc_ident.summary import Results
+from hvdc_ident.summary.run_summary import FindingSummary, PlaceSummary
+from tests.app.small_study import write_small_study
 from tests.report.judgements import judgement
 
 HEADING = {"schema": 1, "study": "s", "model": "m", "software": "hvdc_ident 0", "seed": 0, "sources": {}}
@@ -273,3 +277,22 @@ def test_where_an_effect_does_what_a_value_does_the_value_is_not_blamed(tmp_path
         in told
     )
     assert letter.request.endswith("KIP = 31.5 or that P2 is 1.05 times what the model has.")
+
+
+def test_after_a_diagnosis_alone_the_letter_shows_before_and_after(tmp_path: Path) -> None:
+    """Of a plant whose k lies beyond the bound of the study, and which is late by a lag that three places explain."""
+    study = write_small_study(tmp_path)
+    study.write_text(study.read_text().replace("k = {min = 0.5, max = 20}", "k = {min = 0.5, max = 4.2}"))
+    for command in ("diagnose", "letter"):
+        result = CliRunner().invoke(app, [command, str(study)])
+        assert result.exit_code == 0, result.output
+    page = (tmp_path / "study-results" / "letter.html").read_text("utf-8")
+    assert "recorded and simulated (given values and with the effect)" in page
+    assert "at its bound" in page and "What would show more: lag: a step" in page
+
+
+@pytest.mark.parametrize(("count", "said"), [(1, "x0"), (3, "x0 or x1 or x2"), (5, "x0 or x1 or one of 3 more places")])
+def test_no_place_is_counted_that_could_be_named(count: int, said: str) -> None:
+    places = tuple(PlaceSummary((f"x{k}",), 1.0 / count) for k in range(count))
+    finding = FindingSummary("lag", (), "", 1.0, {}, places)
+    assert _asked_of(finding) == f"the time constant of the filter or transducer at {said}"

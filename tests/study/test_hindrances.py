@@ -73,13 +73,15 @@ def test_a_study_without_a_hindrance_is_good_and_next_is_a_run(tmp_path: Path) -
     ("changes", "said"),
     [
         ({"sign": -1.0}, "sign?"),
+        ({"sign": 100.0}, "in per cent?"),  # within k's bounds the level of other units can be reached too
+        ({"equation": "u + h**2 + k"}, "no steady state was found"),
         # Above k = 2.2 the root has no value.
         ({"equation": "sqrt(2.2 - k) + u - k*h", "line": "{start = 4, min = 0.5, max = 5}"}, "at the start values"),
         ({"equation": "u - k*h + 40*(h - 0.71)**3 + 9*h**2*(u - 1)"}, "stopped"),
         ({"equation": "u - k*h + 20*(h - 1/1.4)"}, "runs away"),
         ({"line": "{start = 2.0, min = 1.5, max = 5}"}, "the given value 1.4 lies outside the bounds of the search, 1.5 to 5"),
     ],
-    ids=["sign", "start", "stop", "away", "given"],
+    ids=["sign", "unit", "rest", "start", "stop", "away", "given"],
 )  # fmt: skip
 def test_what_a_run_would_stumble_over_is_the_end_of_the_check(
     tmp_path: Path, changes: dict[str, object], said: str
@@ -103,8 +105,9 @@ def test_what_a_run_would_stumble_over_is_the_end_of_the_check(
     [
         {"equation": "sqrt(2.2 - k) + u - k*h", "line": "{start = 4, min = 0.5, max = 5}"},
         {"equation": "u - k*h + 40*(h - 0.71)**3 + 9*h**2*(u - 1)"},
+        {"equation": "u + h**2 + k"},
     ],
-    ids=["start", "stop"],
+    ids=["start", "stop", "rest"],
 )
 def test_a_run_does_stumble_there(tmp_path: Path, changes: dict[str, str]) -> None:
     assert call("run", write(tmp_path, **changes), "--quiet").exit_code != 0

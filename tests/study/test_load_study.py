@@ -57,6 +57,16 @@ def test_values_effects_and_parameterisation_reach_the_model(tmp_path: Path) -> 
     assert 0.002 in study.model.values.values()
 
 
+def test_the_study_says_which_inputs_a_person_can_set(tmp_path: Path) -> None:
+    own = {n for n, i in loaded(tmp_path).model.inputs.items() if i.settable}
+    assert own == {"Vdcref1", "Qref1", "Pref2", "Qref2"}  # the card: neither grid voltages nor a dc load
+    stated = loaded(tmp_path, head='[inputs]\nsettable = ["Pref2", "E1"]\n').model.inputs
+    assert {n for n, i in stated.items() if i.settable} == {"Pref2", "E1"}
+    assert not any(i.settable for i in loaded(tmp_path, head="[inputs]\nsettable = []\n").model.inputs.values())
+    with pytest.raises(InputError, match=r"no input 'Pref'.*Pref2"):
+        loaded(tmp_path, head='[inputs]\nsettable = ["Pref"]\n')
+
+
 def test_a_simulation_has_the_given_values_and_a_fit_begins_at_the_starts(tmp_path: Path) -> None:
     head = "[model.values]\nKIP = 31\n[parameters]\nKIP = {start = 25, min = 5, max = 50}\n"
     head += "KPVDC = {start = 20, max = 40}\n"

@@ -235,5 +235,4 @@ SECTION = Section(
     title="What the model lacks",
     about="The diagnosis: what is missing, how likely, where, and how much of the gap it closes.",
     render=_render,
-    printed=True,
 )

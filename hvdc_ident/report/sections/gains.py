@@ -170,5 +170,4 @@ SECTION = Section(
     title="Parameters",
     about="Every value by its name: given, fitted, and with what the model lacks; intervals, and why some are held.",
     render=_render,
-    printed=True,
 )

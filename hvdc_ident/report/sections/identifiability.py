@@ -141,26 +141,23 @@ def _next(found: dict[str, Any]) -> str:
         (
             "; then ".join(_move(m) for m in line["moves"]),
             ", ".join(line["new_signals"]) or "–",
-            _times(line["smallest_eigenvalue"]),
+            line.get("half_width"),
             line["determinant_gain"],
         )
         for line in lines
     ]
-    header = ["experiment", "also record", "smallest eigenvalue, times", "gain of ln determinant"]
+    aim = str(advice.get("aim", ""))
+    header = ["experiment", "also record", f"{aim} then known to ±", "gain of ln determinant"]
     note = (
         "<p class='small'>Best first, the best of each kind and input. To first order, with noise as in the recordings; of a "
         "signal not recorded so far, as on others of its unit.</p>"
     )
-    about = "How much each experiment adds: eigenvalues of the information are the squared precision along its weakest direction."
+    about = f"How far each experiment narrows the interval of {text(aim)}, and how much it tells of all parameters together."
     return lead + folded("Experiments compared", rows_of(header, rows) + note, about)
 
 
 def _move(m: dict[str, Any]) -> str:
     return f"{m['shape']} of {m['input']}, {m['from']:g} to {m['to']:g}"
-
-
-def _times(eigenvalue: dict[str, Any]) -> float | None:
-    return eigenvalue["then"] / eigenvalue["now"] if eigenvalue.get("now") and eigenvalue.get("then") else None
 
 
 def profiles(found: Mapping[str, Mapping[str, Any]], parameters: Mapping[str, Mapping[str, Any]]) -> Figure:

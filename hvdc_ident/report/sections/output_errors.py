@@ -105,5 +105,4 @@ SECTION = Section(
     title="Errors",
     about="The error of every signal at the given values and fitted, and within the windows of the tolerance profile.",
     render=_render,
-    printed=True,
 )

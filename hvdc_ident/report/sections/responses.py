@@ -86,5 +86,4 @@ SECTION = Section(
     title="Measured frequency responses",
     about="Measured impedances and transfer functions beside the model's.",
     render=_render,
-    printed=True,
 )

@@ -29,5 +29,4 @@ SECTION = Section(
     title="The truth",
     about="The values and delays that the recordings were made with, beside those found.",
     render=_render,
-    printed=True,
 )

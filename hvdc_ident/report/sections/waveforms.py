@@ -94,5 +94,4 @@ SECTION = Section(
     title="Waveforms",
     about="Every recorded signal with the model's runs laid over it.",
     render=_render,
-    printed=True,
 )

@@ -111,6 +111,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     for name, v in data["parameters"].items():
         lines.append(f"{name:{width}}  {v['verdict']}: {v['reason']}{beside if v['ci95'] else ''}")
     lines += data["notes"]
+    lines += [data["not_recommended"]] if data.get("not_recommended") else []
     lines += map(next_sentence, summarise({"identifiability": data}).next)
     names = listed(data.get("identifiable") or ())
     return [*lines, f"Next: `hvdc-ident fit STUDY` estimates {names}."] if names else lines

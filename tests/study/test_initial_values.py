@@ -14,8 +14,8 @@ from hvdc_ident.cli import app
 from hvdc_ident.data import Array, Experiment, InputSignal, experiment, trajectory
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.study.level_comparison import conversions
-from hvdc_ident.study.quiescent_levels import QuiescentLevels, compare_levels
+from hvdc_ident.study.conversions import Evidence, conversions, suggest_conversion
+from hvdc_ident.study.initial_values import InitialValues, compare_initial_values
 
 CARD = """schema = 1
 name = "lag"
@@ -67,16 +67,16 @@ def record(
     )
 
 
-def only(found: QuiescentLevels) -> str:
+def only(found: InitialValues) -> str:
     (line,) = found.lines
     return line
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_nothing_is_said_where_nothing_is_wrong(tmp_path: Path, seed: int) -> None:
-    found = compare_levels(card(tmp_path), [record(seed=seed), record(seed=seed + 100, name="b")], CANDIDATES)
+    found = compare_initial_values(card(tmp_path), [record(seed=seed), record(seed=seed + 100, name="b")], CANDIDATES)
     assert found.lines == [] and found.remarks == ()
-    level = found.levels[0]
+    level = found.values[0]
     assert level.recorded == pytest.approx(1.02, abs=5e-4) and level.model == pytest.approx(1.02, abs=1e-9)
     assert level.suggestion is None and level.factor is None
 
@@ -99,65 +99,65 @@ def test_nothing_is_said_where_nothing_is_wrong(tmp_path: Path, seed: int) -> No
     ],
 )
 def test_a_factor_is_named_by_what_it_is(tmp_path: Path, unit: str, factor: float, words: str) -> None:
-    found = compare_levels(
+    found = compare_initial_values(
         card(tmp_path, unit), [record(factor), record(factor, levels=(0.9, 0.7), name="b")], CANDIDATES
     )
     assert words in only(found)
-    assert [level.factor for level in found.levels] == pytest.approx([factor, factor])
-    assert found.levels[0].recorded == pytest.approx(factor * 1.02, rel=1e-3)
+    assert [level.factor for level in found.values] == pytest.approx([factor, factor])
+    assert found.values[0].recorded == pytest.approx(factor * 1.02, rel=1e-3)
     assert only(found).count("step") + only(found).count(" b") >= 2  # told once, of both
 
 
 def test_a_base_of_no_known_factor_scales_level_and_movement(tmp_path: Path) -> None:
-    found = compare_levels(card(tmp_path), [record(5.54)], CANDIDATES)
+    found = compare_initial_values(card(tmp_path), [record(5.54)], CANDIDATES)
     assert "a factor of 5.5" in only(found) and "level and movement" in only(found)
-    assert found.levels[0].factor == pytest.approx(5.54, rel=2e-3)
+    assert found.values[0].factor == pytest.approx(5.54, rel=2e-3)
 
 
 def test_an_offset_moves_the_level_and_not_the_movement(tmp_path: Path) -> None:
-    found = compare_levels(card(tmp_path), [record(shift=0.05)], CANDIDATES)
-    assert "offset" in only(found) and found.levels[0].suggestion == "offset"
-    assert found.levels[0].difference == pytest.approx(0.05, abs=5e-4)
-    assert found.levels[0].noise_units == pytest.approx(50.0, rel=0.02)
-    assert found.levels[0].factor is None
+    found = compare_initial_values(card(tmp_path), [record(shift=0.05)], CANDIDATES)
+    assert "offset" in only(found) and found.values[0].suggestion == "offset"
+    assert found.values[0].difference == pytest.approx(0.05, abs=5e-4)
+    assert found.values[0].noise_units == pytest.approx(50.0, rel=0.02)
+    assert found.values[0].factor is None
 
 
 def test_degrees_celsius_are_an_offset_with_a_name(tmp_path: Path) -> None:
-    found = compare_levels(card(tmp_path, "K"), [record(1.0, -273.15, levels=(300.0, 310.0))], CANDIDATES)
+    found = compare_initial_values(card(tmp_path, "K"), [record(1.0, -273.15, levels=(300.0, 310.0))], CANDIDATES)
     assert "in degC?" in only(found)
 
 
 def test_where_the_level_is_0_the_movement_tells(tmp_path: Path) -> None:
-    found = compare_levels(card(tmp_path, zero=1.02), [record(-1.0, zero=1.02)], CANDIDATES)
+    found = compare_initial_values(card(tmp_path, zero=1.02), [record(-1.0, zero=1.02)], CANDIDATES)
     assert "y moves -" in only(found) and only(found).endswith("sign?")
-    assert found.levels[0].model == pytest.approx(0.0, abs=1e-9)
+    assert found.values[0].model == pytest.approx(0.0, abs=1e-9)
 
 
 def test_what_a_candidate_can_make_good_is_no_evidence(tmp_path: Path) -> None:
     gain = (*CANDIDATES, FitParameter("k", 1.0, 0.5, 3000.0))
     model = card(tmp_path, "MW")
-    assert compare_levels(model, [record(1e3)], gain).lines == []
-    assert compare_levels(model, [record(1.4)], gain).lines == []
-    assert "sign?" in only(compare_levels(model, [record(-1.0)], gain))  # no bound of k reaches that
-    level = compare_levels(model, [record(1e3)], gain).levels[0]
+    assert compare_initial_values(model, [record(1e3)], gain).lines == []
+    assert compare_initial_values(model, [record(1.4)], gain).lines == []
+    assert "sign?" in only(compare_initial_values(model, [record(-1.0)], gain))  # no bound of k reaches that
+    level = compare_initial_values(model, [record(1e3)], gain).values[0]
     assert level.low == pytest.approx(0.5 * 1.02) and level.high == pytest.approx(3000 * 1.02)
 
 
 def test_an_input_in_per_cent_is_told_of_the_input(tmp_path: Path) -> None:
-    found = compare_levels(card(tmp_path), [record(units=100.0)], CANDIDATES)
+    found = compare_initial_values(card(tmp_path), [record(units=100.0)], CANDIDATES)
     assert "input u reads 102 before the event, the model's value is 1.02: in per cent?" in only(found)
-    assert found.levels[0].channel == "input u"
+    assert found.values[0].channel == "input u"
 
 
 def test_another_operating_point_is_no_mistake(tmp_path: Path) -> None:
     model = card(tmp_path)
     for levels in ((0.0102, 0.02), (102.0, 110.0), (-1.02, -1.1)):  # the record follows the input as it stands
-        assert compare_levels(model, [record(levels=levels)], CANDIDATES).lines == []
+        assert compare_initial_values(model, [record(levels=levels)], CANDIDATES).lines == []
 
 
 def test_a_time_in_ms_is_told(tmp_path: Path) -> None:
-    found = compare_levels(card(tmp_path), [record(seconds=1e3)], CANDIDATES)
-    assert "is the time in ms?" in only(found) and found.levels[0].channel == "time"
+    found = compare_initial_values(card(tmp_path), [record(seconds=1e3)], CANDIDATES)
+    assert "is the time in ms?" in only(found) and found.values[0].channel == "time"
 
 
 def test_a_slow_record_of_a_fast_model_is_no_mistake(tmp_path: Path) -> None:
@@ -165,15 +165,15 @@ def test_a_slow_record_of_a_fast_model_is_no_mistake(tmp_path: Path) -> None:
     u = InputSignal.step(3000.0, 1.02, 1.1)
     y = response(1.02, 1.1, time, event=3000.0) + 1e-3 * np.random.default_rng(0).standard_normal(time.size)
     e = experiment("slow", time, {"u": u}, measured=trajectory(time, {"y": y}), noise={"y": 1e-3}, event=3000.0)
-    assert compare_levels(card(tmp_path), [e], CANDIDATES).lines == []
+    assert compare_initial_values(card(tmp_path), [e], CANDIDATES).lines == []
 
 
 def test_a_record_without_rows_before_its_event_says_so(tmp_path: Path) -> None:
     e = record().with_(event=0.0)
-    found = compare_levels(card(tmp_path), [e], CANDIDATES)
+    found = compare_initial_values(card(tmp_path), [e], CANDIDATES)
     assert found.lines == [] and "no row stands before its event" in found.remarks[0]
-    assert found.levels[0].recorded is None
-    free = compare_levels(card(tmp_path), [e.with_(event=None)], CANDIDATES)
+    assert found.values[0].recorded is None
+    free = compare_initial_values(card(tmp_path), [e.with_(event=None)], CANDIDATES)
     assert "its event is not known" in free.remarks[0]
 
 
@@ -181,9 +181,9 @@ def test_rows_that_are_not_recorded_are_left_out(tmp_path: Path) -> None:
     e = record(-1.0)
     assert e.measured is not None
     y = np.where(np.arange(TIME.size) % 3 == 0, np.nan, e.measured["y"])
-    assert "sign?" in only(compare_levels(card(tmp_path), [e.with_(measured=trajectory(TIME, {"y": y}))], CANDIDATES))
+    assert "sign?" in only(compare_initial_values(card(tmp_path), [e.with_(measured=trajectory(TIME, {"y": y}))], CANDIDATES))
     nothing = e.with_(measured=trajectory(TIME, {"y": np.full(TIME.size, np.nan)}))
-    assert compare_levels(card(tmp_path), [nothing], CANDIDATES).lines == []
+    assert compare_initial_values(card(tmp_path), [nothing], CANDIDATES).lines == []
 
 
 def test_a_model_without_a_rest_is_reported_with_its_reason(tmp_path: Path) -> None:
@@ -191,9 +191,9 @@ def test_a_model_without_a_rest_is_reported_with_its_reason(tmp_path: Path) -> N
         'schema = 1\nname = "m"\n[inputs]\nu = {value = 1.0}\n'
         '[states]\nx = {derivative = "u + x**2 + 1"}\n[outputs]\ny = "x"\n'
     )
-    found = compare_levels(load_model(tmp_path / "m.toml"), [record()], ())
+    found = compare_initial_values(load_model(tmp_path / "m.toml"), [record()], ())
     assert "not compared with the model's rest" in only(found) and "no steady state was found" in only(found)
-    assert found.levels[0].model is None and found.levels[0].recorded == pytest.approx(1.02, abs=5e-4)
+    assert found.values[0].model is None and found.values[0].recorded == pytest.approx(1.02, abs=5e-4)
 
 
 def test_coloured_noise_alone_is_no_difference(tmp_path: Path) -> None:
@@ -207,23 +207,100 @@ def test_coloured_noise_alone_is_no_difference(tmp_path: Path) -> None:
         e = record(noise=0.0)
         y = response(1.02, 1.1) + noise
         told += len(
-            compare_levels(model, [e.with_(measured=trajectory(TIME, {"y": y}), noise=FrozenMap({"y": 1e-3}))]).lines
+            compare_initial_values(model, [e.with_(measured=trajectory(TIME, {"y": y}), noise=FrozenMap({"y": 1e-3}))]).lines
         )
     assert told == 0
 
 
 def test_a_record_without_noise_is_judged_by_the_misfit(tmp_path: Path) -> None:
     model = card(tmp_path)
-    assert compare_levels(model, [record(noise=0.0)], CANDIDATES).lines == []
-    assert "sign?" in only(compare_levels(model, [record(-1.0, noise=0.0)], CANDIDATES))
+    assert compare_initial_values(model, [record(noise=0.0)], CANDIDATES).lines == []
+    assert "sign?" in only(compare_initial_values(model, [record(-1.0, noise=0.0)], CANDIDATES))
 
 
-def test_priors_of_the_conversions_add_up() -> None:
+def test_conversions_undo_what_they_do() -> None:
     for unit in ("pu", "MW", "kV", "rad", "K", "Hz", "kg", ""):
-        found = conversions(unit, {})
-        assert sum(c.prior for c in found) <= 1.0 + 1e-12
+        found = conversions(unit)
         assert len({(f"{c.factor:.6g}", c.shift) for c in found}) == len(found)
         assert all(c.undone(c.factor * 0.7 + c.shift) == pytest.approx(0.7) for c in found)
+
+
+@pytest.mark.parametrize(
+    ("unit", "factor", "shift", "words"),
+    [
+        ("kV", (2.0 / 3.0) ** 0.5, 0.0, "sqrt(2/3): peak of phase for rms of line to line?"),
+        ("pu", 2.0 * np.pi * 50.0, 0.0, "in rad/s of 50 Hz?"),
+        ("MW", 1.0 / 250.0, 0.0, "per unit of Sn = 250 MVA?"),
+        ("Hz", 1.0, 50.0, "the frequency and not its deviation from 50?"),
+        ("pu", 1.0, 1.0, "the quantity itself and not its deviation from 1?"),
+    ],
+)
+def test_ratios_of_the_table(tmp_path: Path, unit: str, factor: float, shift: float, words: str) -> None:
+    zero = 1.0 if shift else 0.0  # a deviation is near 0
+    found = compare_initial_values(card(tmp_path, unit, zero), [record(factor, shift, zero=zero)], CANDIDATES)
+    assert words in only(found) and found.values[0].factor == pytest.approx(factor)
+
+
+@pytest.mark.parametrize("wrong", [1.35, 1.6, 7.0, 0.3])
+def test_a_level_that_is_off_by_itself_is_no_conversion(tmp_path: Path, wrong: float) -> None:
+    """A level and a movement that are each off by another factor are the model's fault, however near one is to a ratio."""
+    e = record()
+    assert e.measured is not None
+    y = wrong * 1.02 + 1.15 * (e.measured["y"] - 1.02)
+    (value,) = compare_initial_values(card(tmp_path), [e.with_(measured=trajectory(TIME, {"y": y}))], CANDIDATES).values
+    assert value.suggestion == "difference" and not value.is_mistake
+
+
+def test_evidence_of_one_level_alone_names_a_conversion_that_fits_exactly() -> None:
+    found = suggest_conversion([Evidence(40.0, (0.4,))], "pu")
+    assert found is not None and found.reason == "in per cent?" and found.conversion.undone(40.0) == pytest.approx(0.4)
+    assert suggest_conversion([Evidence(33.0, (0.4,))], "pu") is None
+    assert suggest_conversion([Evidence(0.4, (0.4,))], "pu") is None
+
+
+TURBINE = """schema = 1
+name = "turbine"
+[parameters]
+T = {value = 0.3, unit = "s", min = 0.05, max = 2}
+[inputs]
+u = {value = 1.0}
+yset = {value = 0.7, unit = "pu"}
+[states]
+x = {derivative = "(u*yset - x)/T"}
+[outputs]
+gate = {value = "x", unit = "pu"}
+P = {value = "120*(x**1.5 - 0.1)", unit = "MW"}
+"""
+
+
+@pytest.mark.parametrize(("yset", "offset"), [(0.8, 0.0), (0.7, 0.0), (0.7, 0.1)])
+def test_another_set_point_that_explains_both_outputs_is_offered(tmp_path: Path, yset: float, offset: float) -> None:
+    """An offset of one output is none: the other one contradicts it."""
+    (tmp_path / "turbine.toml").write_text(TURBINE)
+    random = np.random.default_rng(2)
+    x = yset * response(1.0, 1.02)
+    seen = {
+        "gate": x + offset + 2e-4 * random.standard_normal(TIME.size),
+        "P": 120.0 * (x**1.5 - 0.1) + 0.05 * random.standard_normal(TIME.size),
+    }
+    e = experiment(
+        "e", TIME, {"u": InputSignal.step(1.0, 1.0, 1.02)}, measured=trajectory(TIME, seen),
+        noise=FrozenMap({"gate": 2e-4, "P": 0.05}), event=1.0,
+    )  # fmt: skip
+    model = load_model(tmp_path / "turbine.toml")
+    found = compare_initial_values(model, [e], CANDIDATES)
+    if yset == 0.7:
+        assert [v.suggestion for v in found.values] == ["offset" if offset else None, None]
+        return
+    assert only(found).endswith("at yset = 0.8 pu and not 0.7 it rests there: values = {yset = 0.8}?")
+    assert found.mistakes == found.lines and {v.channel for v in found.values} == {"input yset"}
+    mended = compare_initial_values(model, [e.with_(values=FrozenMap({"yset": 0.8}))], CANDIDATES)
+    assert mended.lines == []
+
+
+def test_an_input_counted_in_another_way_is_found_by_its_level_and_the_outputs(tmp_path: Path) -> None:
+    (line,) = compare_initial_values(card(tmp_path), [record(units=(2.0 / 3.0) ** 0.5)], CANDIDATES).lines
+    assert "input u reads 0.8328 before the event, the model's value is 1.02: a factor of sqrt(2/3)" in line
 
 
 # --- the command line and the report ---
@@ -282,7 +359,7 @@ z = "5 - k*x"
 """
 
 
-def two(folder: Path, first: str, second: str, slope: float = 3.0) -> QuiescentLevels:
+def two(folder: Path, first: str, second: str, slope: float = 3.0) -> InitialValues:
     """The comparison for a plant of y = x, z = 5 - slope x, its columns recorded under the names `first` and `second`."""
     (folder / "two.toml").write_text(TWO)
     random = np.random.default_rng(5)
@@ -291,7 +368,7 @@ def two(folder: Path, first: str, second: str, slope: float = 3.0) -> QuiescentL
     u = {"u": InputSignal.step(1.0, 1.02, 1.1)}
     std = FrozenMap({"y": 1e-3, "z": 1e-3})
     seen = trajectory(TIME, {first: y, second: z})
-    return compare_levels(
+    return compare_initial_values(
         load_model(folder / "two.toml"), (experiment("step", TIME, u, measured=seen, noise=std, event=1.0),), CANDIDATES
     )
 
