@@ -26,8 +26,8 @@ from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.models import load_model
+from hvdc_ident.parallel import LocalPool
 from hvdc_ident.simulate import simulate
-from hvdc_ident.study.executors.local import LocalPool
 
 ROWS, END, EVENT, NOISE = 1000, 0.999, 0.1, 1e-3
 HIDDEN = EffectUse("lag", ("Vdc1_m",), FrozenMap({"T": 0.005}))

@@ -20,7 +20,7 @@ import numpy as np
 from diagnose import Watch
 
 from hvdc_ident.discrepancy import diagnose
-from hvdc_ident.study.executors.local import LocalPool
+from hvdc_ident.parallel import LocalPool
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "studies" / "hidden_effects"))
 

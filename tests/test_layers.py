@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
-errors lazy text toml_tables executor files processes immutable psse colours display data parameters axes expression shelf model
+errors lazy text toml_tables executor files parallel immutable psse colours display data parameters axes expression shelf model
 plants effects
 models formats simulate
 fmu linearize sensitivity fit identifiability discrepancy summary report study api app command run_commands cli

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
-import subprocess
-import sys
-import tempfile
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Literal
 
 import hvdc_ident as hi
 from hvdc_ident.app.study_folder import stamp
-from hvdc_ident.app.worker import EVERYTHING, GRACE
-from hvdc_ident.errors import InputError
+from hvdc_ident.errors import HvdcIdentError, InputError
 from hvdc_ident.executor import times_of
+from hvdc_ident.parallel import Child
 from hvdc_ident.study.pipeline import FIRST, standing
 from hvdc_ident.study.stages import Stage, stages
 from hvdc_ident.summary import Results
@@ -27,8 +23,12 @@ from hvdc_ident.summary import Results
 State = Literal["not run", "done", "stale", "failed", "interrupted"]
 Outcome = Literal["running", "done", "failed", "cancelled"]
 _STAGE = re.compile(r"^(?:\d+ of \d+, )?([a-z]+): ")
-LAST_WORDS = 2000
-"""Characters of what a process printed last that are told where it ended without a word of its own."""
+EVERYTHING, LETTER = "run", "letter"
+"""Names of work beside those of the stages: every stage that the study asks for, and the letter."""
+OFTEN = 0.1
+"""Seconds between two messages of progress: the eye reads no more."""
+
+Tell = Callable[[Mapping[str, Any]], None]
 
 
 @dataclass(frozen=True)
@@ -103,11 +103,62 @@ def signature(study: hi.Study, folder: Path) -> tuple[tuple[int, int, int] | Non
     return tuple(stamp(f) for f in files)
 
 
-class StudyRun:
-    """Work on a study in a process of its own, followed by a thread that reads what it tells.
+class ToldProgress:
+    """Progress that is told as it comes, but not more often than `OFTEN`."""
 
-    what: a stage, or all of them, or the letter. done, total, text: its progress. said: what to know, in lines. outcome,
-    message: how it ended, and why where it is not done.
+    def __init__(self, tell: Tell) -> None:
+        self._tell, self._last = tell, -OFTEN
+
+    def __call__(self, done: int, total: int, text: str) -> None:
+        """Tell that so much is done."""
+        now = time.monotonic()
+        if now - self._last >= OFTEN:
+            self._last = now
+            self._tell({"done": done, "total": total, "text": text})
+
+
+def work(
+    connection: Connection, _: memoryview[float], study_file: Path, folder: Path, what: str, trust: bool
+) -> None:
+    """Do the work in a process of its own and tell what happens, at the end why it did not come to its end, "" where it did.
+
+    what: a stage, `EVERYTHING` or `LETTER`.
+    """
+    try:
+        end = _done(connection.send, study_file, folder, what, trust)
+    except HvdcIdentError as error:
+        end = str(error)
+    except MemoryError:
+        end = "not enough memory for this study"
+    connection.send({"end": end})
+
+
+def _done(tell: Tell, study_file: Path, folder: Path, what: str, trust: bool) -> str:
+    from hvdc_ident.study.export import letter
+    from hvdc_ident.study.pipeline import run_stage, run_study
+    from hvdc_ident.study.stages import StageOptions
+    from hvdc_ident.study.study import load_study
+
+    def announce(lines: Sequence[str]) -> None:
+        tell({"say": list(lines)})
+
+    options = StageOptions(progress=ToldProgress(tell), announce=announce)
+    study = load_study(study_file, trust)
+    if what == EVERYTHING:
+        done = run_study(study, folder, options)
+    elif what == LETTER:
+        done = [letter(study, folder, options)[1]]
+    else:
+        done = [run_stage(study, what, folder, options)]
+    return "; ".join(f"{d.stage.name}: {d.failed}" for d in done if d.failed)
+
+
+class StudyRun:
+    """Work on a study in a process of its own, followed by a thread that takes in what it tells.
+
+    A process and not a thread: the page stays alive while it computes, and cancelling ends it at once. The store keeps what
+    was finished. what: a stage, or all of them, or the letter. done, total, text: its progress. said: what to know, in
+    lines. outcome, message: how it ended, and why where it is not done.
     """
 
     def __init__(self, study_file: Path, folder: Path, what: str, trust: bool) -> None:
@@ -117,17 +168,8 @@ class StudyRun:
         self.outcome: Outcome = "running"
         self.message = ""
         self._begun = self._stage_begun = time.monotonic()
-        self._cancelled = False
-        self._last_words = tempfile.TemporaryFile()  # noqa: SIM115 - closed when the process has ended
-        threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")  # as the command line does
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "hvdc_ident.app.worker", str(study_file), str(folder), what, str(int(trust))],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._last_words,
-            env={**threads, **os.environ},
-            start_new_session=True,  # Ctrl-C at the server's terminal ends the server, and so the work
-        )
+        self._cancelled = threading.Event()
+        self._child = Child(work, study_file, folder, what, trust)
         self._thread = threading.Thread(target=self._follow, daemon=True)
         self._thread.start()
 
@@ -151,9 +193,7 @@ class StudyRun:
 
     def cancel(self) -> None:
         """End the work; what was finished is kept."""
-        self._cancelled = True
-        if self._process.stdin is not None:
-            self._process.stdin.close()
+        self._cancelled.set()
 
     def wait(self, seconds: float | None = None) -> Outcome:
         """Return how the work ended, once it has; "running" where it has not within so many seconds."""
@@ -162,23 +202,24 @@ class StudyRun:
 
     def _follow(self) -> None:
         """Take in what the process tells until it ends."""
-        assert self._process.stdout is not None
         end: str | None = None
-        for line in self._process.stdout:
-            told = json.loads(line)
-            end = told.get("end", end)
-            self.said += told.get("say", ())
-            if "text" in told:
-                self._take(told)
-        code = self._ended()
-        self._last_words.seek(0)
-        words = self._last_words.read().decode("utf-8", "replace").strip()
-        self._last_words.close()
+        try:
+            while end is None and not self._cancelled.is_set():
+                if self._child.connection.poll(OFTEN):
+                    told = self._child.connection.recv()
+                    end = told.get("end")
+                    self.said += told.get("say", ())
+                    if "text" in told:
+                        self._take(told)
+        except (EOFError, OSError):
+            pass  # it has ended without saying so
+        words = self._child.printed
+        ending = self._child.end()
         if end is not None:
             self.message = end
-        elif not self._cancelled:
-            self.message = f"the process ended with code {code}: {words[-LAST_WORDS:] or 'without a word'}"
-        cancelled = self._cancelled and end is None
+        elif not self._cancelled.is_set():
+            self.message = f"the process {ending or 'is gone'}: {words or 'without a word'}"
+        cancelled = self._cancelled.is_set() and end is None
         self.outcome = "cancelled" if cancelled else "failed" if self.message else "done"
 
     def _take(self, told: Mapping[str, Any]) -> None:
@@ -186,18 +227,6 @@ class StudyRun:
         self.done, self.total, self.text = told["done"], told["total"], told["text"]
         if self.stage != before:
             self._stage_begun = time.monotonic()
-
-    def _ended(self) -> int:
-        """Return the process's exit code; it is killed where it has closed its mouth and stays, which costs no result."""
-        try:
-            return self._process.wait(2.0 * GRACE)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            return self._process.wait()
-        finally:
-            for pipe in (self._process.stdin, self._process.stdout):
-                if pipe is not None:
-                    pipe.close()
 
 
 class Runs:

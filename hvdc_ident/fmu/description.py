@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from hvdc_ident.data import Array
 from hvdc_ident.errors import ModelError
 from hvdc_ident.fmu.archive import DESCRIPTION, Folder, check_archive, check_identifier, first_bytes, machine_of
 from hvdc_ident.immutable import FrozenMap
@@ -125,13 +126,18 @@ class Header(NamedTuple):
         return int(self.attributes["fmiVersion"].partition(".")[0])
 
 
+Message = tuple[dict[str, Any], dict[str, Array]]
+"""A request to a worker, or its answer: a heading and arrays."""
+
+
 class Setup(NamedTuple):
-    """Setup of a worker: an FMU's description, the folder that it is unpacked into, whose lock is inherited, and the deadline
-    of one run, s."""
+    """Setup of a worker: an FMU's description, the folder that it is unpacked into, whose lock is inherited, the deadline of
+    one run, s, and the bytes of memory that the FMU may take; None: no limit."""
 
     description: Description
     folder: Folder
     deadline: float
+    memory: int | None
 
 
 def read_description(

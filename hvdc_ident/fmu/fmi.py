@@ -20,7 +20,7 @@ from fmpy.fmi1 import FMICallException
 
 from hvdc_ident.data import Array
 from hvdc_ident.fmu.description import REAL, Description, Variable
-from hvdc_ident.processes.messages import NOW, START, STOP, no_progress
+from hvdc_ident.parallel.progress import NOW, START, STOP, no_progress
 
 FmiError = FMICallException
 """Raised by a call that returned discard, error or fatal; `.function`, `.status`."""

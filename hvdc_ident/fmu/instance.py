@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
-from hvdc_ident.fmu.description import Description
+from hvdc_ident.fmu.description import Description, Message
 from hvdc_ident.fmu.fmi import DISCARD, ERROR, FATAL, FmiError, FmiLibrary, VariableGroup, quoted, refusal
-from hvdc_ident.processes import Watch
-from hvdc_ident.processes.messages import Message
-from hvdc_ident.processes.server import die_like, in_new_process
+from hvdc_ident.parallel import Watch
+from hvdc_ident.parallel.inside import die_like, in_new_process, resident, space
 
 Reuse = Literal["reset", "instance", "process"]
 """Way in which each run begins: with a reset of the instance, a new instance, or a new process."""
@@ -255,7 +254,9 @@ def isolated(
     work: called with the function that sends. Where it sends none, raises its failure as RunFailed, or ends this process
     as the new one ended. hangs: called with the messages so far, whether to end the new process.
     """
-    messages, end = in_new_process(work, lambda e: failure(e).heading(), hangs)
+    messages, end = in_new_process(
+        work, lambda e: {**failure(e).heading(), "resident": resident(), "space": space()}, hangs
+    )
     if not messages and isinstance(end, dict):
         raise RunFailed.from_heading(end)
     if not messages:

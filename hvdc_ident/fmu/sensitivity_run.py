@@ -22,6 +22,7 @@ from hvdc_ident.fmu.derivatives import (
     noise_of,
     rms,
 )
+from hvdc_ident.fmu.description import Message
 from hvdc_ident.fmu.fmi import FmiError, VariableGroup
 from hvdc_ident.fmu.instance import (
     NOISE_FACTOR,
@@ -34,7 +35,6 @@ from hvdc_ident.fmu.instance import (
     quoting,
 )
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
-from hvdc_ident.processes.messages import Message
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.worker import RequestHandler

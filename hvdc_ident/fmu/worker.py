@@ -1,13 +1,11 @@
-"""The process with an FMU's machine code in it: it answers the pool's requests. See `hvdc_ident.processes`.
+"""The process with an FMU's machine code in it: it answers the pool's requests. See `hvdc_ident.parallel`.
 
 Whatever the FMU prints goes to a file, whose last line the pool quotes where the process ends.
 """
 
 from __future__ import annotations
 
-import math
 import os
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, field
 from functools import partial
@@ -19,13 +17,13 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.fmu.derivatives import DifferenceStep, PointEvaluation
-from hvdc_ident.fmu.description import Description, Setup
+from hvdc_ident.fmu.description import Description, Message, Setup
 from hvdc_ident.fmu.fmi import VariableGroup, why_not_loaded
 from hvdc_ident.fmu.instance import Instance, LoadFmu, NewWatch, Reuse, RunFailed, failure, find_reuse, isolated
 from hvdc_ident.fmu.sensitivity_run import SensitivityRun
-from hvdc_ident.processes import Watch
-from hvdc_ident.processes.messages import BEGAN, NOW, PROCESS, START, STOP, Message, packed, unpacked
-from hvdc_ident.processes.server import resident, space
+from hvdc_ident.parallel import Watch
+from hvdc_ident.parallel.inside import limit_memory, resident, space
+from hvdc_ident.parallel.progress import PROCESS, begin
 
 
 @dataclass
@@ -168,20 +166,12 @@ class RequestHandler:
         return {}, {"parameters": VariableGroup(self.instance.library, tuple(d.parameters.values())).get().copy()}
 
 
-def prepare(setup: Setup) -> None:
-    """Load what workers need beside this module: what one of them loads later would count as the FMU's memory."""
-    if setup.description.interface == "model-exchange":
-        import scipy.integrate  # noqa: F401
-
-
-def finish(setup: Setup) -> None:
-    """Remove the unpacked FMU where nobody else uses it."""
-    setup.folder.release()
-
-
 def serve(connection: Connection, progress: memoryview[float], setup: Setup, learned: Mapping[str, Any]) -> None:
     """Answer requests until the connection closes or the FMU ends the process. learned: by earlier workers."""
     folder = str(setup.folder.binaries)
+    if setup.description.interface == "model-exchange":
+        import scipy.integrate  # noqa: F401 - loaded later it would count as the FMU's memory
+    limit_memory(progress, setup.memory)
 
     def load(learned: dict[str, Any]) -> Instance:
         try:
@@ -196,8 +186,7 @@ def serve(connection: Connection, progress: memoryview[float], setup: Setup, lea
         return instance
 
     def restart_deadline() -> None:
-        progress[BEGAN] = time.monotonic()  # the deadline is that of one run
-        progress[START] = progress[STOP] = progress[NOW] = math.nan
+        begin(progress)  # the deadline is that of one run
 
     def answer(work: Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]]) -> bool:
         """Send the work's result or its failure; return whether it succeeded.
@@ -213,7 +202,7 @@ def serve(connection: Connection, progress: memoryview[float], setup: Setup, lea
             heading, arrays, fatal = failed.heading(), {}, failed.fatal
         progress[PROCESS] = os.getpid()  # the work may have used others
         memory = {"memory": max(resident(), heading.get("resident", 0)), "space": max(space(), heading.get("space", 0))}
-        connection.send_bytes(packed({**heading, **memory}, arrays))
+        connection.send(({**heading, **memory}, arrays))
         if fatal:
             os._exit(0)
         return "done" in heading
@@ -225,6 +214,6 @@ def serve(connection: Connection, progress: memoryview[float], setup: Setup, lea
     if not answer(handler.load):
         return
     while True:
-        heading, arrays = unpacked(connection.recv_bytes())
+        heading, arrays = connection.recv()
         restart_deadline()
         answer(partial(handler.do, heading, arrays))

@@ -6,6 +6,7 @@ This contains crashes, hangs and leaks. It does not contain malice: load only FM
 from __future__ import annotations
 
 import contextlib
+import json
 import linecache
 import math
 import multiprocessing
@@ -25,21 +26,13 @@ from typing import Any
 from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError, require_known
 from hvdc_ident.fmu.archive import Folder, shared_folder, unpacked_folder
-from hvdc_ident.fmu.description import Description, Setup
-from hvdc_ident.processes import (
-    MIB,
-    Budget,
-    ChildProcess,
-    Ending,
-    Message,
-    Supervisor,
-    Watch,
-    available_cores,
-    packed,
-    unpacked,
-)
-from hvdc_ident.processes.server import is_worker
-from hvdc_ident.processes.supervisor import last_line
+from hvdc_ident.fmu.description import Description, Message, Setup
+from hvdc_ident.parallel import Child, Ending, Watch, available_cores
+from hvdc_ident.parallel.progress import RESIDENT, SPACE, begin
+
+MIB = 2**20
+EXHAUSTED = 0.5
+"""Share of its memory from which a process may have run out of it: one that grows by doubling is refused from half on."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +68,44 @@ class Limits:
         return cls(**values)
 
 
+@dataclass(frozen=True)
+class Budget:
+    """The memory that a worker may take, in bytes: `most` more than it began with. None: no limit."""
+
+    most: int | None
+    resident: int = 0
+    space: int = 0
+
+    def taken(self, resident: int, space: int) -> int:
+        """Return the bytes taken since the worker began: of the address space, which the limit is on, where it is known."""
+        return max(resident - self.resident if resident else 0, space - self.space if space else 0, 0)
+
+    def exhausted(self, taken: int) -> bool:
+        """Return whether the worker may have run out of it."""
+        return self.most is not None and taken >= EXHAUSTED * self.most
+
+    def told(self, taken: int) -> str:
+        """Return the memory taken, in words."""
+        assert self.most is not None
+        return f"it had used {taken / MIB:.0f} of its {self.most / MIB:.0f} MiB of memory"
+
+    @property
+    def larger(self) -> int:
+        """A limit of twice as much, in MiB."""
+        assert self.most is not None
+        return math.ceil(2 * self.most / MIB)
+
+
 @dataclass(eq=False)
 class _FmuWorker:
-    """A process with the FMU in it. runs: requests so far. findings: number of those in the pool that were sent to it.
+    """A process with the FMU in it. memory: bytes that the FMU may take. runs: requests so far. findings: number of those in
+    the pool that were sent to it.
 
     resident, space: bytes of memory and of address space after its last answer.
     """
 
-    process: ChildProcess
+    process: Child
+    memory: int | None
     runs: int = 0
     findings: int = 0
     resident: int = 0
@@ -93,14 +116,23 @@ class _FmuWorker:
         """Number of its process, 0 before it began."""
         return self.process.pid
 
+    @property
+    def budget(self) -> Budget:
+        """The memory that it may take."""
+        return Budget(self.memory, int(self.process.progress[RESIDENT]), int(self.process.progress[SPACE]))
+
+    @property
+    def last_line(self) -> str:
+        """The last line that it printed."""
+        return " ".join(self.process.printed.rpartition("\n")[2].split())[:300]
+
 
 @dataclass(eq=False)
 class _Processes:
-    """The processes of a pool: its supervisor, workers and folder. It ends with the pool."""
+    """The processes of a pool and its folder. They end with the pool."""
 
     owner: int
     folder: Folder
-    supervisor: Supervisor | None = None
     workers: dict[int, _FmuWorker] = field(default_factory=dict)
 
     def close(self) -> None:
@@ -108,9 +140,6 @@ class _Processes:
         for worker in self.workers.values():
             worker.process.close()
         self.workers.clear()
-        if self.supervisor is not None:
-            self.supervisor.close()
-            self.supervisor = None
         if self.owner == os.getpid():
             self.folder.release()
         else:
@@ -262,11 +291,11 @@ class WorkerPool:
     def _sent(self, worker: _FmuWorker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> _FmuWorker:
         """Send a request to a worker, with what others have found out meanwhile; return the worker."""
         worker.runs += 1
-        worker.process.begin()
+        begin(worker.process.progress)
         new = dict(islice(self._findings.items(), worker.findings, None))
         worker.findings = len(self._findings)
         with contextlib.suppress(OSError):  # it is gone: noticed when it is heard
-            worker.process.connection.send_bytes(packed({**heading, "found": new}, arrays))
+            worker.process.connection.send(({**heading, "found": new}, dict(arrays)))
         return worker
 
     def _heard(self, worker: _FmuWorker, what: str) -> Message:
@@ -279,7 +308,7 @@ class WorkerPool:
                     if watch.over():
                         raise self._hung(worker, what, watch)
                     continue
-                heading, arrays = unpacked(worker.process.connection.recv_bytes())
+                heading, arrays = worker.process.connection.recv()
             except (EOFError, OSError):
                 return self._lost(worker, f"in the {what}")
             worker.resident = int(heading.get("memory", worker.resident))
@@ -291,7 +320,7 @@ class WorkerPool:
     def _failure(self, worker: _FmuWorker, heading: Mapping[str, Any]) -> SimulationError:
         """Return the failure that a worker reports, with its memory where that was used up."""
         what, t, hint = heading["failed"], heading["t"], heading["hint"]
-        budget = worker.process.budget
+        budget = worker.budget
         taken = budget.taken(worker.resident, worker.space)
         if budget.exhausted(taken):
             what, hint = f"{what}; {budget.told(taken)}", more_memory(budget)
@@ -305,25 +334,22 @@ class WorkerPool:
     def _hung(self, worker: _FmuWorker, what: str, watch: Watch) -> SimulationError:
         """End a worker that is past its deadline; return the error."""
         instants, still = watch.instants(), watch.still()
-        message = worker.process.last_line
-        end = self._end(worker) or Ending(-9)
+        message = worker.last_line
+        end = self._end(worker, trace=True) or Ending(-9)
         limit = "load" if what == "loading" else "deadline"
-        text, hint = overdue(end, worker.process.budget, what, (limit, watch.deadline), instants, still)
+        text, hint = overdue(end, worker.budget, what, (limit, watch.deadline), instants, still)
         return self._error(text, message=message, hint=hint)
 
     def _lost(self, worker: _FmuWorker, when: str) -> Message:
         """Return the answer of a worker that has ended. Raises SimulationError where a new one cannot be expected to succeed."""
-        supervisor = self._supervisor()
-        message = worker.process.last_line
+        message = worker.last_line
         end = self._end(worker)
         if end is None:
-            code = supervisor.process.poll()
-            got = f"it said: {supervisor.last}" if supervisor.last else ""
-            what = f"the process that watches the FMU's workers ended {when}, exit code {code}"
-            raise SimulationError(what, where=self.description.path.name, got=got)
+            what = f"the process that watches the FMU's worker ended {when}, exit code {worker.process.guard.returncode}"
+            raise self._error(what, message=message)
         if worker.runs > 1 and "Instantiate" in call_of(end):
             return {"again": 1}, {}  # some FMUs allow one instance a process, and crash at the second
-        text, hint = crash(end, worker.process.budget, when)
+        text, hint = crash(end, worker.budget, when)
         raise self._error(text, message=message, hint=hint)
 
     # --- processes ---
@@ -341,7 +367,7 @@ class WorkerPool:
 
     def _leaks(self, worker: _FmuWorker) -> bool:
         """Return whether the worker kept so much memory that the next run may find too little."""
-        budget = worker.process.budget
+        budget = worker.budget
         return budget.exhausted(budget.taken(worker.resident, worker.space))
 
     def _own_processes(self) -> _Processes:
@@ -355,33 +381,24 @@ class WorkerPool:
             self._finalizer = Finalize(self, self._processes.close, exitpriority=20)
         return self._processes
 
-    def _supervisor(self) -> Supervisor:
-        processes = self._own_processes()
-        if processes.supervisor is None:
-            processes.supervisor = Supervisor(
-                "hvdc_ident.fmu.worker",
-                Setup(self.description, processes.folder, self.limits.deadline),
-                memory=self.limits.memory,
-                keeps=[processes.folder.lock],
-            )
-        return processes.supervisor
-
     def _start(self, number: int) -> _FmuWorker:
         """Start a worker; return it once it has loaded the FMU."""
-        supervisor = self._supervisor()
-        begun = time.monotonic()
+        from hvdc_ident.fmu.worker import serve
+
+        processes, begun = self._own_processes(), time.monotonic()
         self.memory = 0
         self.started += 1
         worker: _FmuWorker | None = None
+        setup = Setup(self.description, processes.folder, self.limits.deadline, self.limits.memory)
         try:
-            worker = _FmuWorker(supervisor.start(self.learned))
-            self._own_processes().workers[number] = worker
+            child = Child(serve, setup, self.learned, keeps=[processes.folder.lock], finish=processes.folder.release)
+            worker = processes.workers[number] = _FmuWorker(child, self.limits.memory)
             answer, _ = self._heard(worker, "loading")
             if "failed" in answer:
                 raise self._failure(worker, answer)
-        except OSError:
-            what = "the process that watches the FMU's workers ended before one began"
-            self._broken = SimulationError(what, where=self.description.path.name, got=last_line(supervisor.printed))
+        except OSError as e:
+            what = "no process can be started for the FMU"
+            self._broken = SimulationError(what, where=self.description.path.name, got=str(e))
             self._close()
             raise self._broken from None
         except SimulationError as e:
@@ -392,17 +409,14 @@ class WorkerPool:
         self._loading_time = time.monotonic() - begun
         return worker
 
-    def _end(self, worker: _FmuWorker) -> Ending | None:
-        """End a worker; return how it ended, or None where that is not known."""
+    def _end(self, worker: _FmuWorker, *, trace: bool = False) -> Ending | None:
+        """End a worker; return how it ended, or None where that is not known. trace: where it is, if it is at work."""
         processes = self._own_processes()
         at = next((n for n, known in processes.workers.items() if known is worker), None)
-        if at is None or processes.supervisor is None:  # ended before
+        if at is None:  # ended before
             return None
         del processes.workers[at]
-        end = processes.supervisor.end(worker.process)
-        if processes.supervisor.gone:
-            processes.supervisor = None
-        return end
+        return worker.process.end(trace=trace)
 
     def _close(self) -> None:
         if self._processes is not None:
@@ -414,7 +428,7 @@ class WorkerPool:
 def _run_of(heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
     """Return a digest of everything that decides the outputs of a run."""
     decisive = {n: heading.get(n) for n in ("do", "values", "outputs", "tolerance")}
-    return sha256(packed(decisive, arrays)).digest()
+    return sha256(b"".join([json.dumps(decisive).encode(), *(n.encode() + a.tobytes() for n, a in arrays.items())])).digest()
 
 
 def _combined(parameters: list[str], shares: list[list[str]], parts: list[Message]) -> Message:
@@ -438,7 +452,7 @@ def idle_cores(busy: int) -> int:
     busy: processes that worked for the caller lately; they count as load. A process that a pool has started is one of several
     that share the cores already.
     """
-    if is_worker() or multiprocessing.parent_process() is not None:
+    if multiprocessing.parent_process() is not None:
         return 1
     try:
         others = max(os.getloadavg()[0] - busy, 0.0)

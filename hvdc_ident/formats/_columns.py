@@ -1,9 +1,9 @@
-"""Helpers of several readers: unique names, records of several rates, optional packages."""
+"""Helpers of several readers: unique names, records of several rates, optional packages, libraries that damage ends."""
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,12 @@ import numpy as np
 from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import MAX_BYTES, check_times, once
+from hvdc_ident.parallel import ChildEndedError, call
 
 TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds", "zeit", "temps", "tiempo", "tempo", "time_s", "t_s")
 """Names of a time vector, lower case, in the order of preference."""
+START = 20.0  # s for a process to begin and a small file to be read
+RATE = 5e6  # bytes a second, at least
 
 
 def own_names(labels: Sequence[str]) -> tuple[str, ...]:
@@ -37,6 +40,22 @@ def time_name(names: Sequence[str]) -> str | None:
     """The one of the names that is the time's; None where none is."""
     lower = {name.lower(): name for name in reversed(names)}
     return next((lower[n] for n in TIME_NAMES if n in lower), None)
+
+
+def guarded(read: Callable[[Path], Trajectory], path: Path) -> Trajectory:
+    """What a reader of this folder returns, read in a process of its own: some damaged files end HDF5's library, or it never ends.
+
+    Raises WaveformError: its own, or where the process ends or hangs.
+    """
+    deadline = START + path.stat().st_size / RATE
+    try:
+        found: Trajectory = call(read, path, seconds=deadline)
+    except TimeoutError:
+        raise damaged(path, f"the file could not be read within {deadline:.0f} s") from None
+    except ChildEndedError as ended:
+        said = ended.printed.rpartition("\n")[2]
+        raise damaged(path, "reading the file ended the reader", got=said[:200] or str(ended)) from None
+    return found
 
 
 def joined(parts: Sequence[Trajectory], path: Path) -> Trajectory:

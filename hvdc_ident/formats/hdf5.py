@@ -15,8 +15,7 @@ import numpy as np
 from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, damaged, joined, package, time_name
-from hvdc_ident.formats._guarded import read_guarded
+from hvdc_ident.formats._columns import check_size, checked, damaged, guarded, joined, package, time_name
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
@@ -57,7 +56,7 @@ def sample(path: Path) -> None:
 
 def _waveforms(path: Path) -> Trajectory:
     package("h5py", path)
-    return read_guarded("hdf5", path)
+    return guarded(waveforms_unguarded, path)
 
 
 def waveforms_unguarded(path: Path) -> Trajectory:

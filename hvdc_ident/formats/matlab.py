@@ -18,8 +18,7 @@ import numpy as np
 from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, damaged, joined, package, time_name
-from hvdc_ident.formats._guarded import read_guarded
+from hvdc_ident.formats._columns import check_size, checked, damaged, guarded, joined, package, time_name
 from hvdc_ident.formats._mat5 import Mat5Error, Opaque, variables
 from hvdc_ident.formats.dymola_mat import matrices_of, starts_as_version_4
 from hvdc_ident.formats.dymola_mat import recognises as is_result_file
@@ -70,7 +69,7 @@ def _waveforms(path: Path) -> Trajectory:
         top = file.read(64)
     if top.startswith(_V73):
         package("h5py", path)
-        return read_guarded("matlab", path)
+        return guarded(waveforms_unguarded, path)
     return _joined(_version_5(path) if top.startswith(_V5) else _version_4(path), path)
 
 

@@ -25,9 +25,8 @@ from hvdc_ident.summary import Results, RunSummary, summarise
 from hvdc_ident.summary.summarise import SUMMARISED
 
 if TYPE_CHECKING:
-    from hvdc_ident.study.executors.dask import DaskPool
-    from hvdc_ident.study.executors.local import OpenPool
-    from hvdc_ident.study.executors.patient import PatientPool
+    from hvdc_ident.parallel import OpenPool, PatientPool
+    from hvdc_ident.study.dask_executor import DaskExecutor
 
 
 SCHEMA = 1
@@ -281,7 +280,7 @@ def _mark(study: Study, wanted: Stage, folder: Path, options: StageOptions) -> s
 
 
 @contextmanager
-def workers_of(study: Study, options: StageOptions) -> Iterator[OpenPool | PatientPool | DaskPool | None]:
+def workers_of(study: Study, options: StageOptions) -> Iterator[OpenPool | PatientPool | DaskExecutor | None]:
     """The pool the options ask for; None where the work stays in this process.
 
     An FMU has processes of its own, which share the cores; some FMUs run in one process only. More are started where they
@@ -295,7 +294,7 @@ def workers_of(study: Study, options: StageOptions) -> Iterator[OpenPool | Patie
 @contextmanager
 def executor_of(
     study: Study, options: StageOptions, name: str
-) -> Iterator[CachingExecutor | OpenPool | PatientPool | DaskPool | None]:
+) -> Iterator[CachingExecutor | OpenPool | PatientPool | DaskExecutor | None]:
     """An executor for a stage's work of that name, whose finished pieces are kept where the options name a folder.
 
     The name tells apart the kinds of work of a study; the study's files, the seed and what is forced tell apart its

@@ -15,8 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 import hvdc_ident as hi
-from hvdc_ident.app.runs import Runs, StudyRun, first_folder, result_folders, signature, standings
-from hvdc_ident.app.worker import EVERYTHING
+from hvdc_ident.app.runs import EVERYTHING, Runs, StudyRun, first_folder, result_folders, signature, standings
 from hvdc_ident.cli import app
 from hvdc_ident.errors import InputError
 from hvdc_ident.study.pipeline import run_stage
@@ -102,7 +101,7 @@ def test_a_killed_server_loses_nothing(finished: tuple[hi.Study, StudyRun], tmp_
         from hvdc_ident.app.runs import Runs
         study = hi.load_study({str(study.path)!r})
         run = Runs().start(study, study.folder)
-        print(run._process.pid, flush=True)
+        print(run._child.guard.pid, flush=True)
         sys.stdin.read()
         """
     with subprocess.Popen(

@@ -20,7 +20,7 @@ from typing import Any
 from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
-from hvdc_ident.study.executors.local import OpenPool
+from hvdc_ident.parallel import OpenPool
 from hvdc_ident.study.store import Job
 
 

@@ -193,7 +193,7 @@ def test_nothing_of_a_worker_stays(tmp_path):
     model = load_model(build(FAULTY, tmp_path))
     simulate(model, STEP)
     host = model.pool
-    process, folder = host._processes.supervisor.process, host._processes.folder.path
+    process, folder = host._processes.workers[0].process.guard, host._processes.folder.path
     assert folder.is_dir() and process.poll() is None
     before = len(os.listdir("/proc/self/fd"))
     del model, host

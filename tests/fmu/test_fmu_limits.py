@@ -23,8 +23,8 @@ from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import InputError, ModelError, SimulationError
 from hvdc_ident.fmu import read_fmu
 from hvdc_ident.fmu.archive import LOCK, remove_abandoned_folders, shared_folder, unpacked_folder
-from hvdc_ident.fmu.worker_pool import Limits, crash, idle_cores, overdue
-from hvdc_ident.processes import MIB, Budget, Ending
+from hvdc_ident.fmu.worker_pool import MIB, Budget, Limits, crash, idle_cores, overdue
+from hvdc_ident.parallel import Ending
 
 pytestmark = needs_compiler
 
@@ -123,7 +123,7 @@ model = load_model(sys.argv[1], interface="co-simulation")
 step = experiment("step", np.linspace(0.0, 0.5, 26), {"u": InputSignal.step(0.1, 0.0, 1.0)})
 simulate(model, step)
 own = model.pool._processes
-print(own.supervisor.process.pid, own.workers[0].pid, own.folder.path, flush=True)
+print(own.workers[0].process.guard.pid, own.workers[0].pid, own.folder.path, flush=True)
 if "hang" in sys.argv:
     simulate(model, step, {"fault": 2.0})
 if "crash" in sys.argv:
@@ -198,10 +198,10 @@ def test_a_worker_that_is_killed_costs_a_message(fmu):
     with pytest.raises(SimulationError, match="ended by SIGKILL, from outside"):
         simulate(model, STEP)
     assert np.array_equal(simulate(model, STEP)["out"], rows)
-    supervisor, worker = model.pool._processes.supervisor.process.pid, model.pool._processes.workers[0].pid
+    supervisor, worker = model.pool._processes.workers[0].process.guard.pid, model.pool._processes.workers[0].pid
     os.kill(supervisor, signal.SIGKILL)
     wait_until_gone(supervisor, worker)
-    with pytest.raises(SimulationError, match=r"process that watches the FMU's workers ended .*exit code -9"):
+    with pytest.raises(SimulationError, match=r"process that watches the FMU's worker ended .*exit code -9"):
         simulate(model, STEP)
     assert np.array_equal(simulate(model, STEP)["out"], rows)
 

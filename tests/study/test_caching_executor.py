@@ -17,7 +17,7 @@ from hvdc_ident.fit import FitParameter
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.profile import profiles
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.study.executors import LocalPool
+from hvdc_ident.parallel import LocalPool
 from hvdc_ident.study.store import CachingExecutor, packed, unpacked
 from tests.fit.simulators import LeastSquares
 

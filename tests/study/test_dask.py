@@ -38,6 +38,6 @@ def test_values_and_failures_are_those_of_the_local_pool(address):
     [("spark://h:1", "no executor|no such executor"), ("dask://127.0.0.1:9", "no dask scheduler answers")],
 )
 def test_what_cannot_be_reached_is_said(monkeypatch, name, says):
-    monkeypatch.setattr("hvdc_ident.study.executors.dask.CONNECT", 0.5)
+    monkeypatch.setattr("hvdc_ident.study.dask_executor.CONNECT", 0.5)
     with pytest.raises(InputError, match=says), open_executor(name, 1):
         raise AssertionError

@@ -7,13 +7,14 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pool_jobs
 import pytest
 
 from hvdc_ident.errors import ComputationError, InputError
-from hvdc_ident.study.executors import LocalPool
+from hvdc_ident.parallel import LocalPool
 
 
 def ends(pool, job, items):
@@ -74,7 +75,7 @@ def test_workers_compute_in_one_thread_unless_told_otherwise(told, expected):
     names = ["OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NO_SUCH_NUM_THREADS"]
     code = f"""
 import os, pool_jobs
-from hvdc_ident.study.executors import LocalPool
+from hvdc_ident.parallel import LocalPool
 print([list(LocalPool(1).map(pool_jobs.environment, {names})), [os.environ.get(n) for n in {names}]])
 """
     bare = {n: v for n, v in os.environ.items() if not n.endswith("_NUM_THREADS")}
@@ -88,9 +89,36 @@ def test_workers_end_with_a_parent_that_is_killed():
     """Though they are at work."""
     code = """
 import os, pool_jobs
-from hvdc_ident.study.executors import LocalPool
+from hvdc_ident.parallel import LocalPool
 list(LocalPool(1).run(pool_jobs.end_and_hang, [os.getpid()]))
 """
     parent = _script(code, dict(os.environ))
     parent.communicate(timeout=120.0)  # ends when the last process that has its output does
     assert parent.returncode == -signal.SIGKILL
+
+
+def test_a_script_without_a_guard_around_its_main_part_is_told_so(tmp_path):
+    """Its workers would start workers without end."""
+    script = tmp_path / "script.py"
+    script.write_text("from hvdc_ident.parallel import LocalPool\nprint(list(LocalPool(1).map(abs, [1])))\n")
+    found = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=False)
+    assert found.returncode == 1 and "if __name__ == '__main__'" in found.stderr.splitlines()[-1]
+
+
+def test_items_that_end_their_worker_at_once_are_all_told_of(tmp_path):
+    """Also where this process is too busy to hear that a worker took an item before it is gone."""
+    stop = threading.Event()
+
+    def keep_busy():
+        while not stop.is_set():
+            sum(range(1000))
+
+    busy = threading.Thread(target=keep_busy)
+    busy.start()
+    try:
+        found = ends(LocalPool(2, timeout=None), pool_jobs.Job(dies=set(range(0, 12, 2))), list(range(12)))
+    finally:
+        stop.set()
+        busy.join()
+    assert [e.value for e in found[1::2]] == [i * i for i in range(1, 12, 2)]
+    assert all(e.failure.startswith("its worker") for e in found[::2])

@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 from hvdc_ident.cli import app
 from hvdc_ident.command import Work
 from hvdc_ident.executor import Made, Outcome
-from hvdc_ident.study.executors import LocalPool, PatientPool, open_executor
+from hvdc_ident.parallel import LocalPool, PatientPool
+from hvdc_ident.study.executors import open_executor
 from hvdc_ident.study.pipeline import workers_of
 from hvdc_ident.study.stages import StageOptions
 

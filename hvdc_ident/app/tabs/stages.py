@@ -11,6 +11,8 @@ from hvdc_ident.app.desk import Desk
 from hvdc_ident.app.exports import ExportButtons
 from hvdc_ident.app.result_panels import PANELS, FoundResults, Panel
 from hvdc_ident.app.runs import (
+    EVERYTHING,
+    LETTER,
     RUNS,
     StageStanding,
     StudyRun,
@@ -21,7 +23,6 @@ from hvdc_ident.app.runs import (
     standings,
 )
 from hvdc_ident.app.server import Tab
-from hvdc_ident.app.worker import EVERYTHING, LETTER
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.summary.phrases import next_sentence
 from hvdc_ident.text import percentage

@@ -67,7 +67,7 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     """Tell and keep the local analysis at the given values, where the search will take longer than `SOON`."""
     from hvdc_ident.errors import SimulationError
     from hvdc_ident.identifiability.pilot_fit import cramer_rao_bounds
-    from hvdc_ident.processes import available_cores
+    from hvdc_ident.parallel import available_cores
     from hvdc_ident.study.fitting import problem_of
     from hvdc_ident.study.study import candidate_lines
     from hvdc_ident.text import duration

@@ -1,4 +1,4 @@
-"""Executors of many runs: a pool of this machine's processes, or the workers of a dask cluster; one kind a file."""
+"""The executor of a study's work by its name: processes of this machine, or the workers of a dask cluster."""
 
 from __future__ import annotations
 
@@ -7,16 +7,13 @@ from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import InputError
-from hvdc_ident.processes import available_cores
-from hvdc_ident.study.executors.local import LocalPool, OpenPool, can_start
-from hvdc_ident.study.executors.patient import PatientPool, beginning
+from hvdc_ident.parallel import LocalPool, OpenPool, PatientPool, available_cores, can_start
+from hvdc_ident.parallel.patient import beginning
 
 if TYPE_CHECKING:
-    from hvdc_ident.study.executors.dask import DaskPool
+    from hvdc_ident.study.dask_executor import DaskExecutor
 
-
-__all__ = ["LocalPool", "PatientPool", "check_executor", "open_executor"]
-
+__all__ = ["LocalPool", "check_executor", "open_executor"]
 
 LOCAL = "local"
 DASK = ("dask://", "dask+tls://")
@@ -35,7 +32,7 @@ def check_executor(name: str) -> None:
 
 
 @contextmanager
-def open_executor(name: str, workers: int | None) -> Iterator[OpenPool | PatientPool | DaskPool | None]:
+def open_executor(name: str, workers: int | None) -> Iterator[OpenPool | PatientPool | DaskExecutor | None]:
     """Yield the executor, open; None where the work stays in this process.
 
     name: "" or "local" for this machine, with so many workers; "dask://HOST:PORT" or "dask+tls://HOST:PORT" for the
@@ -54,7 +51,7 @@ def open_executor(name: str, workers: int | None) -> Iterator[OpenPool | Patient
         with LocalPool(workers).open() as pool:
             yield pool
         return
-    from hvdc_ident.study.executors.dask import DaskPool
+    from hvdc_ident.study.dask_executor import dask_executor
 
-    with DaskPool.at(name) as cluster:
+    with dask_executor(name) as cluster:
         yield cluster

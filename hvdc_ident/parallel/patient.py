@@ -10,7 +10,7 @@ from functools import cache
 from typing import Any
 
 from hvdc_ident.executor import Outcome, in_order
-from hvdc_ident.study.executors.local import LocalPool, OpenPool
+from hvdc_ident.parallel.pool import LocalPool, OpenPool
 
 
 class PatientPool:
