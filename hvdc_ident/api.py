@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import wraps
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeAlias, TypeVar
 
@@ -422,7 +421,6 @@ def fit(
     from hvdc_ident.study import fitting
     from hvdc_ident.study.assemble import names_of, study_of
     from hvdc_ident.study.stages.identify import judged
-    from hvdc_ident.text import in_python
 
     with _open(executor) as pool, _told(progress, "fit", 4) as told:
         if isinstance(model, Problem):
@@ -430,10 +428,8 @@ def fit(
         study = _asked(study_of(model, data, parameters, fit=settings), "fit")
         fitting.need(study, "fit")
         found = report or judged(study, seed=seed, executor=pool, progress=told)
-        result = fitting.estimated(
-            study, found.to_dict(), force=names_of(force, "parameter") or (), seed=seed, executor=pool, progress=told
-        )
-        return replace(result, message=in_python(result.message))
+        forced = names_of(force, "parameter") or ()
+        return fitting.estimated(study, found, force=forced, seed=seed, executor=pool, progress=told)
 
 
 @_verb
@@ -480,7 +476,7 @@ def diagnose(
     need(study, "diagnose")
     with _open(executor) as pool, _told(progress, "diagnose", 3) as told:
         found = report or judged(study, seed=seed, executor=pool, progress=told)
-        return diagnosed(study, found.to_dict(), seed=seed, executor=pool, progress=told)
+        return diagnosed(study, found, seed=seed, executor=pool, progress=told)
 
 
 @_verb

@@ -11,8 +11,8 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
-errors lazy text toml_tables executor files processes immutable psse colours display data parameters axes expression shelf model
-plants effects
+errors lazy text next_step immutable codec toml_tables executor files processes psse colours display data
+parameters axes expression shelf model plants effects
 models formats simulate
 fmu linearize sensitivity fit identifiability discrepancy summary report study api app command run_commands cli
 """.split()  # noqa: SIM905 - one list of words, read as such

@@ -257,5 +257,5 @@ def test_a_fit_with_nothing_to_estimate_says_what_to_try_in_python() -> None:
     still = hi.Experiment(
         TIME, inputs={"u": 0.0}, outputs={"y": NOISE * np.random.default_rng(2).standard_normal(TIME.size)}
     )
-    message = hi.fit(LAG, still, {"k": (0.1, 10.0)}).message
+    message = str(hi.fit(LAG, still, {"k": (0.1, 10.0)}))
     assert 'force=["NAME"]' in message and "`hi.identify(...)`" in message and "--" not in message

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from hvdc_ident.codec import plain
 from hvdc_ident.discrepancy.candidates import additive, candidates
 from hvdc_ident.discrepancy.evidence import (
     CandidateFit,
@@ -33,7 +34,6 @@ from hvdc_ident.discrepancy.rounds import FoundForm, Round, RoundModel
 from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.effects import effects
 from hvdc_ident.expression import parse, symbol, to_text
-from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.text import listed

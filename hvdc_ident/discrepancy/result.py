@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
+from hvdc_ident.codec import plain
 from hvdc_ident.colours import EFFECT, RECORDED, ROLES
 from hvdc_ident.display import Shown, data_frame
 from hvdc_ident.display import Table as TextTable
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import InputError, SteadyStateError
-from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import interval_text, interval_words, percentage, value_by_place
 

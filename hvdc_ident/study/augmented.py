@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.codec import plain
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import ComputationError
-from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.noise import MISFIT, source_of, source_text

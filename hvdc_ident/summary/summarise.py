@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from hvdc_ident.fit.judgement import Count, Yardstick
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.summary.run_summary import (
     SETS,
     AddedEffect,
     Counting,
     FindingSummary,
     Interval,
-    NextStep,
     Outcome,
     ParameterSummary,
     PlacedValue,

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """A row for each point, as JSON and as CSV; finished points are kept in the folder and not run again."""
+    from hvdc_ident.codec import Rows
     from hvdc_ident.errors import StudyError
-    from hvdc_ident.files import Rows
     from hvdc_ident.sensitivity import sweep
     from hvdc_ident.study.checks import need_experiments
     from hvdc_ident.study.pipeline import workers_of
