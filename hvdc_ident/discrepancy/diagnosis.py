@@ -25,7 +25,7 @@ from hvdc_ident.discrepancy.moves import clock_sentence, clocks, stated
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.residual_checks import Binned
-from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect, StandIn
+from hvdc_ident.discrepancy.result import AUGMENTED, Diagnosis, FoundEffect, StandIn
 from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.discrepancy.screen import NOT_TRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.search import SearchOutcome, two_start_search
@@ -231,6 +231,7 @@ def _assembled(
         parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.given) for f in free}),
         parameters_after=FrozenMap({f.name: last.values.get(f.name, f.given) for f in free}),
         augmented=augmented,
+        augmented_model=AUGMENTED if isinstance(augmented, Model) else None,
         fallback=None if other is None else other.to_dict(),
         noise={o: noise_told(n) for o, n in first.noise.items()},
         notes=notes,

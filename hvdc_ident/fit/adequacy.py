@@ -82,7 +82,7 @@ class Adequacy:
     """
 
     verdict: Verdict
-    chi2_per_dof: float | None
+    chi2_per_dof: float | None = None
     outputs: FrozenMap[ResidualSize] = field(default_factory=FrozenMap)
     text: str = ""
     next: tuple[NextStep, ...] = ()

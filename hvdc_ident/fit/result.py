@@ -114,7 +114,7 @@ class FitResult(Coded, Shown):
     """
 
     status: Status
-    message: str
+    message: str = ""
     fitted: tuple[str, ...] = ()
     held: FrozenMap[str] = field(default_factory=FrozenMap)
     values: FrozenMap[float] = field(default_factory=FrozenMap)

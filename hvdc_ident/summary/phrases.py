@@ -131,7 +131,7 @@ def interval_name(s: RunSummary, name: str) -> str:
 
 def by_place(p: ParameterSummary) -> str:
     """Return the values of a parameter that depend on what is missing where, in words; empty for another one."""
-    return value_by_place([{**vars(v), "from": v.source} for v in p.by_place])
+    return value_by_place(p.by_place)
 
 
 def asked_text(p: ParameterSummary, *, interval: bool = False, change: bool = True) -> str:

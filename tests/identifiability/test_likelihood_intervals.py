@@ -15,9 +15,9 @@ from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.likelihood_intervals import bootstrap_rise, thresholds
 from hvdc_ident.identifiability.misspecification import heterogeneity
-from hvdc_ident.next_step import NextStep
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
 from hvdc_ident.identifiability.structural import in_words
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import LeastSquares, coloured, decay, line, recorded
 from tests.identifiability.cases import T, closed, measured, saturating

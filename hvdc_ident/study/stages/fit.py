@@ -11,7 +11,6 @@ from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_gro
 
 if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
-    from hvdc_ident.fit.residual import Curve
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
 
@@ -43,7 +42,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     data["derived"] = fitting.derived(study, result)
     if study.responses:
         data["responses"] = compared(study, {"given": study.given, "fitted": result.values})
-    files = _files(study, data, result.curves)
+    files = _files(study, result, data["derived"])
     return StageResult(data, files, failed=result.message if result.status == "not-converged" else "")
 
 
@@ -66,13 +65,14 @@ def _context(
     }
 
 
-def _files(study: Study, data: Mapping[str, Any], curves: Mapping[str, Mapping[str, Curve]]) -> dict[str, str]:
+def _files(study: Study, result: FitResult, derived: Mapping[str, Any]) -> dict[str, str]:
     """The values to paste, and the waveforms at the estimates; of an experiment that fails there is none."""
     from hvdc_ident.study.fitting import curves_csv
     from hvdc_ident.study.value_files import value_files
 
+    curves = result.curves
     waveforms = {f"fit.{e.name}.csv": curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
-    return {**value_files(study, data), **waveforms}
+    return {**value_files(study, result, derived), **waveforms}
 
 
 def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
