@@ -9,11 +9,23 @@ from typing import Literal
 Door = Literal["shell", "python", "page"]
 """Places where a sentence is read: each has its own name for a thing to do."""
 NextKind = Literal[
-    "diagnose", "separate", "letter", "narrow", "export", "identify", "force", "raise-noise", "lower-noise"
+    "diagnose",
+    "separate",
+    "letter",
+    "narrow",
+    "export",
+    "identify",
+    "fit",
+    "force",
+    "given",
+    "raise-noise",
+    "lower-noise",
 ]
 TO_DO: dict[str, dict[Door, str]] = {
     "diagnose": {"shell": "`hvdc-ident diagnose STUDY`", "python": "`hi.diagnose(...)`", "page": "the stage diagnose"},
     "identify": {"shell": "`hvdc-ident identify STUDY`", "python": "`hi.identify(...)`", "page": "the stage identify"},
+    "fit": {"shell": "`hvdc-ident fit STUDY`", "python": "`values=hi.fit(...)`", "page": "the stage fit"},
+    "given": {"shell": "`--values given`", "python": '`values="given"`', "page": "the given values"},
     "force": {"shell": "`--force NAME`", "python": '`force=["NAME"]`', "page": "a fit with `--force NAME`"},
     "letter": {"shell": "`hvdc-ident letter STUDY`", "python": "`hvdc-ident letter`", "page": "the button Letter"},
     "export": {
@@ -25,6 +37,8 @@ TO_DO: dict[str, dict[Door, str]] = {
 PURPOSES = {
     "diagnose": "looks for what the model lacks",
     "identify": "says why of each, and what to measure next",
+    "fit": "estimates what the recordings determine",
+    "given": "takes those that the model came with",
     "force": "fits one all the same",
     "letter": "writes one page on this for the model's owner",
     "export": "writes the model with the values that count (.fmu, .mo, .toml)",
@@ -33,9 +47,12 @@ PURPOSES = {
 
 @dataclass(frozen=True)
 class NextStep:
-    """Step to take next. kind: run the diagnosis; record what tells likely effects apart ("separate"); write the letter to the model's
-    owner; record what narrows the intervals; export the values; see why nothing is estimated; fit a parameter against its verdict; state
-    a larger noise, or a smaller one. text: of a recording, what to record; of a noise, its standard deviations by output."""
+    """Step to take next.
+
+    kind: run the diagnosis; record what tells likely effects apart ("separate"); write the letter to the model's owner; record what
+    narrows the intervals; export the values; see why nothing is estimated; fit; fit a parameter against its verdict; take the given
+    values; state a larger noise, or a smaller one. text: of a recording, what to record; of a noise, its standard deviations by output.
+    """
 
     kind: NextKind
     text: str = ""

@@ -172,13 +172,6 @@ def with_study(text: str, study: str, *options: str) -> str:
     return re.sub(r"(hvdc-ident [a-z]+) STUDY\b", lambda found: f"{found[1]} {typed}", text)
 
 
-def in_python(text: str) -> str:
-    """Return the text with the commands in it as Python calls, and their options as arguments."""
-    text = re.sub(r"hvdc-ident ([a-z]+) STUDY(?: --to FILE)?", r"hi.\1(...)", text)
-    text = re.sub(r"--values ([a-z]+)", r'values="\1"', text)
-    return text.replace("--force NAME", 'force=["NAME"]')
-
-
 class ValueAtPlace(Protocol):
     """The value of something if an effect is at a place. source: the signal brought in there."""
 

@@ -35,6 +35,11 @@ class EffectSize:
     ci95: tuple[float | None, float | None] | None = None
     unit: str = ""
 
+    @property
+    def interval(self) -> tuple[float | None, float | None] | None:
+        """The 95 % interval, `ci95`."""
+        return self.ci95
+
 
 @dataclass(frozen=True)
 class FoundEffect:
@@ -269,6 +274,11 @@ class Diagnosis(Coded, Shown):
     beyond_noise: bool = False
     values_by_place: FrozenMap[tuple[ValueAt, ...]] = field(default_factory=FrozenMap)
     stand_ins: tuple[StandIn, ...] = ()
+
+    @property
+    def params(self) -> FrozenMap[EffectSize]:
+        """The parameters with what was put into the model, by name. Their intervals are those of a study's diagnosis."""
+        return FrozenMap({n: EffectSize(v) for n, v in self.parameters_after.items()})
 
     @property
     def files(self) -> dict[str, str]:

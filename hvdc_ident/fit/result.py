@@ -168,6 +168,12 @@ class FitResult(Coded, Shown):
         yield f"Next: {next_phrases(self.what_next, 'python')}." if self.what_next else ""
 
     @property
+    def params(self) -> FrozenMap[Estimate]:
+        """Every parameter by name with its `value` and `interval`: the estimated ones, then those held, with the reason."""
+        held = {n: Estimate(v, reason=self.held.get(n, "")) for n, v in self.values.items() if n not in self.estimates}
+        return self.estimates | held
+
+    @property
     def what_next(self) -> tuple[NextStep, ...]:
         """What to do, the first thing first: where nothing was fitted, else by the verdict on the residuals."""
         return self.next or (self.adequacy.next if self.adequacy is not None else ())

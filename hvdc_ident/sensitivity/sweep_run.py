@@ -138,7 +138,8 @@ class SweepResult(Shown):
             for b, o in enumerate(outputs)
         }
 
-    def summary(self) -> dict[str, Any]:
+    @property
+    def heading(self) -> dict[str, Any]:
         """Return the part of sweep.json beside the points: parameters with axis and base, units, what was compared, failures."""
         kinds = {n: a for a in self.axes for n in a.names}
         return {
@@ -156,7 +157,7 @@ class SweepResult(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The sweep as sweep.json has it, without its heading."""
-        return {**self.summary(), "points": list(self.rows())}
+        return {**self.heading, "points": list(self.rows())}
 
     def to_csv(self) -> str:
         """CSV text, one row a point: parameters, rmse.OUTPUT.EXPERIMENT, status, reason; every digit of every number.

@@ -17,6 +17,7 @@ from hvdc_ident.errors import StudyError
 from hvdc_ident.fit import FitResult
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
+from hvdc_ident.next_step import NextKind, NextStep
 from hvdc_ident.study.augmented import augmented_model
 from hvdc_ident.study.study import Study
 from hvdc_ident.summary.run_summary import Counting
@@ -60,10 +61,10 @@ def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> V
     if wanted is not None and wanted not in SETS:
         raise StudyError(
             "no such set of values",
-            where="--values",
+            where="values",
             expected=", ".join(SETS),
             got=repr(wanted),
-            hint="--values given: those the model came with; start: where a search begins; fitted: those that count of a fit "
+            hint="given: those the model came with; start: where a search begins; fitted: those that count of a fit "
             "and a diagnosis; effect: those with the effect that a diagnosis found; fit: those of the fit without one",
         )
     if wanted == "given":
@@ -97,12 +98,12 @@ def _asked(results: _Results, found: ValueSet | None, why: str) -> ValueSet:
     """The values that were asked for by name. Raises StudyError, with the reason, where there are none."""
     if found is not None:
         return found
-    command = "diagnose" if why == results.no_effect else "fit"
+    command: NextKind = "diagnose" if why == results.no_effect else "fit"
     raise StudyError(
         f"there are no {'values with an effect' if command == 'diagnose' else 'fitted values'}: {why}",
         where=results.study.path.name,
         expected=f"a finished {command} of the study and its files as they are now, in {results.folder}",
-        hint=f"hvdc-ident {command} {results.study.path}, or --values given",
+        next=(NextStep(command), NextStep("given")),
     )
 
 

@@ -257,7 +257,8 @@ def test_a_value_that_depends_on_the_place_is_told_by_place_and_blames_nobody(tm
 
 
 def test_where_an_effect_does_what_a_value_does_the_value_is_not_blamed(tmp_path: Path) -> None:
-    other = {"delta_bic": 0.0, "parameters": {}, "effect": "gain", "at": ["P2"], "text": "P2 is 1.05 times what the model has", "values": {"KIP": 30.0}}
+    other = {"effect": "gain", "at": ["P2"], "text": "P2 is 1.05 times what the model has", "values": {"KIP": 30.0}}
+    other |= {"delta_bic": 0.0, "parameters": {}}
     kip = {"value": 31.5, "ci95": None, "unit": ""}
     finding = {"effect": "parameter", "probability": 1.0, "parameters": {"KIP": kip}, "places": []}
     found = diagnosis(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError, unknown_name
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ def diagnosed(
     if not gate(report, diagnosis=True).fitted:
         raise NothingIdentified(
             "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own",
-            hint="`hvdc-ident identify STUDY` says why of each, and what to measure next",
+            next=(NextStep("identify"),),
         )
     found = diagnose(
         study.model,

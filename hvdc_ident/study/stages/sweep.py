@@ -45,7 +45,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             executor=pool if store is None else CachingExecutor(store.job("sweep"), pool, by_item=True),
             progress=options.progress,
         )
-    data = {**result.summary(), "points": Rows(result.rows, len(result))}
+    data = {**result.heading, "points": Rows(result.rows, len(result))}
     reason = f"every point failed; the first: {result.failed[0]}" if len(result.failed) == len(result) else ""
     return StageResult(data, {"sweep.csv": result.to_csv()}, failed=reason)
 
