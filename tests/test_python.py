@@ -14,8 +14,10 @@ from scipy.integrate import solve_ivp
 import hvdc_ident as hi
 from hvdc_ident.aliases import MOVED
 from hvdc_ident.axes import draw_intervals
+from hvdc_ident.codec import plain
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit import Problem
+from hvdc_ident.sensitivity.sweep_points import latin_hypercube, log_grid
 from hvdc_ident.study.assemble import experiments_of
 
 T, K, STEP = 0.5, 3.0, 1.0
@@ -201,6 +203,24 @@ def test_a_result_has_its_parameters_by_name_and_comes_back_from_its_json(report
         assert again.to_dict() | digests == data | digests if result is report else again.to_dict() == data
     again = hi.fit(LAG, RECORD, BOUNDS, report=hi.IdentifiabilityReport.from_dict(report.to_dict()))
     assert dict(again.values) == pytest.approx(dict(fit.values), rel=1e-6)
+
+
+def test_tables_and_linear_results_come_back_from_their_json_too() -> None:
+    run = hi.simulate(LAG, RECORD, sensitivities=["T", "k"])
+    linear = hi.linearize(LAG, inputs="u", outputs="y")
+    one = hi.sweep(LAG, RECORD, {"T": [0.5, 1.0, 0.0]}, want=["rmse", "poles"])
+    two = hi.sweep(LAG, None, [log_grid("T", 0.5, 2.0, 3), latin_hypercube({"k": (1.0, 2.0), "unseen": (0.5, 2.0)}, 4)])
+    shown = hi.sweep(LAG, parameters={"k": [1.0, 2.0]}, want="bode")
+    assert one.failed and two.points.shape == (3, 4)
+    for result in (run, run.trajectory, linear.bode(), one, two, shown):
+        data = json.loads(json.dumps(plain(result), allow_nan=False))
+        assert plain(type(result).from_dict(data)) == data
+    again = hi.SweepResult.from_dict(one.to_dict() | {"model": "lag"})
+    assert str(again) == str(one) and again.best("y", "step") == one.best("y", "step")
+    assert hi.SweepResult.from_dict(two.to_dict()).points.shape == (3, 4)
+    assert hi.LinearModel.from_dict(linear.to_dict()).poles() == pytest.approx(linear.poles())
+    with pytest.raises(InputError, match="not the JSON of"):
+        hi.Simulation.from_dict({"time": [0.0], "signals": {"y": ["a"]}, "units": {}})
 
 
 @pytest.mark.parametrize(
