@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import wraps
 from typing import TYPE_CHECKING, Any, Literal, ParamSpec, TypeAlias, TypeVar
 
@@ -41,27 +40,27 @@ Result = TypeVar("Result")
 
 
 def _verb(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Return the function with the commands in the hints of its errors as Python calls."""
+    """Return the function as a caller in Python meets it: its errors say what to do in Python, and names of 0.2 still work."""
 
     @wraps(function)
     def verb(*arguments: Arguments.args, **settings: Arguments.kwargs) -> Result:
+        from hvdc_ident.aliases import current
         from hvdc_ident.errors import HvdcIdentError
-        from hvdc_ident.text import in_python
 
+        given, named = current(function.__name__, arguments, settings)
         try:
-            return function(*arguments, **settings)
+            return function(*given, **named)
         except HvdcIdentError as error:
-            error.hint = in_python(error.hint)
-            error.args = (str(error),)
-            raise
+            raise error.read_in("python") from error.__cause__
 
     return verb
 
 
+@_verb
 def simulate(
     model: ModelLike,
     data: Any = None,
-    parameters: Values = None,
+    values: Values = None,
     sensitivities: Names = (),
     *,
     inputs: Mapping[str, SignalLike] | None = None,
@@ -75,7 +74,7 @@ def simulate(
 
     model: a Model, a shipped name, the path of a card, an FMU or a study, or a Study.
     data: times in s, an Experiment, or the name of an experiment of the study (left out: its only one).
-    parameters: values that differ from the model's, or a FitResult. sensitivities: names of parameters.
+    values: of parameters, where they differ from the model's; or a FitResult. sensitivities: names of parameters.
     inputs: by name a number, a signal (`step`, `ramp`, `multisine`) or samples at the times; others keep the model's value.
     outputs: names of outputs or signals (default: all outputs).
     tolerance: of the integration; rtol: shorthand for one with atol = rtol / 100.
@@ -98,7 +97,7 @@ def simulate(
     return run(
         plant,
         _experiment(subject, data, inputs),
-        values_of(parameters, plant),
+        values_of(values, plant),
         names_of(sensitivities, "parameter") or (),
         outputs=names_of(outputs, "output"),
         tolerance=tolerance,
@@ -108,11 +107,12 @@ def simulate(
     )
 
 
+@_verb
 def find_operating_point(
     model: ModelLike,
     inputs: Mapping[str, float] | None = None,
     outputs: Mapping[str, float] | None = None,
-    parameters: Values = None,
+    values: Values = None,
     *,
     free: Names = None,
     at: Literal["steady", "start"] = "steady",
@@ -122,7 +122,7 @@ def find_operating_point(
 
     inputs: values of inputs (or of parameters, states and signals that are to hold). outputs: values that outputs are to
     have (a trimmed point); the inputs that move them at rest are then found, or the inputs and parameters in `free`.
-    parameters: values that differ from the model's, or a FitResult.
+    values: of parameters, where they differ from the model's; or a FitResult.
     at="start": states with a given start stand there and only the rest is solved.
     search: bounds, guess, moving, time as in `hvdc_ident.linearize.find_operating_point`.
 
@@ -137,7 +137,7 @@ def find_operating_point(
     from hvdc_ident.study.assemble import model_of, names_of, values_of
 
     plant = model_of(model)
-    fixed = {**values_of(parameters, plant), **(inputs or {})}
+    fixed = {**values_of(values, plant), **(inputs or {})}
     return find(plant, fixed, names_of(free, "parameter or input") or (), outputs=outputs, at=at, **search)
 
 
@@ -148,7 +148,7 @@ def linearize(
     *,
     inputs: Names = None,
     outputs: Names = None,
-    parameters: Values = None,
+    values: Values = None,
     sensitivities: Names = (),
     pade_order: int = 5,
     side: Side = "refuse",
@@ -156,7 +156,7 @@ def linearize(
 ) -> LinearModel:
     """Return the linear model between inputs and outputs (or signals; default: all) at an operating point.
 
-    point: default, the steady state at the model's values and `parameters`. A study gives the inputs, outputs and point of
+    point: default, the steady state at the model's values and `values`. A study gives the inputs, outputs and point of
     its [linearize] where they are not named here.
     pade_order: of every delay in the state space (frequency responses take delays exactly). sensitivities: parameters whose
     exact derivatives of A, B, C, D come along. side: of a limit on which the point lies, "refuse", "below" or "above".
@@ -177,11 +177,11 @@ def linearize(
     subject = subject_of(model)
     plant = model_of(subject)
     asked = subject.settings.linearize if is_study(subject) else None
-    values = values_of(parameters, plant)
+    known = values_of(values, plant)
     if point is None and is_study(subject):
-        point = operating_point(subject, {**subject.given, **values})
+        point = operating_point(subject, {**subject.given, **known})
     elif point is None:
-        point = find(plant, values)
+        point = find(plant, known)
     return linear_model(
         plant,
         point,
@@ -194,13 +194,14 @@ def linearize(
     )
 
 
+@_verb
 def bode(
     model: ModelLike | LinearModel,
     omega: Sequence[float] | Array | None = None,
     *,
     inputs: Names = None,
     outputs: Names = None,
-    parameters: Values = None,
+    values: Values = None,
     point: OperatingPoint | None = None,
 ) -> FrequencyResponse:
     """Return the frequency response between inputs and outputs, delays exact; it draws itself with `plot()`.
@@ -222,10 +223,11 @@ def bode(
         chosen = names_of(inputs, "input") or model.input_names, names_of(outputs, "output") or model.output_names
         linear = model.channel(*chosen)
     else:
-        linear = linearize(model, point, inputs=inputs, outputs=outputs, parameters=parameters)
+        linear = linearize(model, point, inputs=inputs, outputs=outputs, values=values)
     return linear.bode(None if omega is None else np.atleast_1d(np.asarray(omega, dtype=float)))
 
 
+@_verb
 def sensitivities(
     model: ModelLike,
     data: Any = None,
@@ -290,8 +292,8 @@ def sensitivities(
 @_verb
 def sweep(
     model: ModelLike,
-    parameters: Any = None,
     data: DataLike | None = None,
+    parameters: Any = None,
     *,
     outputs: Names = None,
     against: Any = None,
@@ -302,14 +304,14 @@ def sweep(
 ) -> SweepResult:
     """Return the RMSE of each output in each experiment, and poles where wanted, at many values of some parameters.
 
-    parameters: {name: values}, several make their product; or `grid`, `log_grid`, `latin_hypercube` of
-    `hvdc_ident.sensitivity.sweep_points`. A study has its own in [[sweep]]. data: a study, experiments or a table.
+    data: a study, experiments or a table. parameters: {name: values}, several make their product; or `grid`, `log_grid`,
+    `latin_hypercube` of `hvdc_ident.sensitivity.sweep_points`. A study has its own in [[sweep]].
     against: "data" (default where outputs were recorded), "base" (the run at the model's own values) or another model.
     want: "rmse", "poles" or "bode" (default: "rmse", without data "poles").
     executor, progress: as in `fit`. A point that fails is a row with a reason and no number.
 
     >>> import hvdc_ident as hi
-    >>> table = hi.sweep("vsc-hvdc-link", {"KIVDC": [250.0, 750.0, 1500.0]})
+    >>> table = hi.sweep("vsc-hvdc-link", parameters={"KIVDC": [250.0, 750.0, 1500.0]})
     >>> table.poles.shape
     (3, 6)
     """
@@ -322,7 +324,7 @@ def sweep(
     tables = study.settings.sweep
     if parameters is None and not tables:
         raise StudyError(
-            "no parameter to sweep", where=study.path.name, hint='sweep(model, {"NAME": np.linspace(1, 2, 11)}, data)'
+            "no parameter to sweep", where=study.path.name, hint='sweep(model, data, {"NAME": np.linspace(1, 2, 11)})'
         )
     recorded = any(e.outputs for e in study.experiments)
     if against is None:
@@ -422,7 +424,6 @@ def fit(
     from hvdc_ident.study import fitting
     from hvdc_ident.study.assemble import names_of, study_of
     from hvdc_ident.study.stages.identify import judged
-    from hvdc_ident.text import in_python
 
     with _open(executor) as pool, _told(progress, "fit", 4) as told:
         if isinstance(model, Problem):
@@ -430,10 +431,8 @@ def fit(
         study = _asked(study_of(model, data, parameters, fit=settings), "fit")
         fitting.need(study, "fit")
         found = report or judged(study, seed=seed, executor=pool, progress=told)
-        result = fitting.estimated(
-            study, found.to_dict(), force=names_of(force, "parameter") or (), seed=seed, executor=pool, progress=told
-        )
-        return replace(result, message=in_python(result.message))
+        forced = names_of(force, "parameter") or ()
+        return fitting.estimated(study, found, force=forced, seed=seed, executor=pool, progress=told)
 
 
 @_verb
@@ -480,7 +479,7 @@ def diagnose(
     need(study, "diagnose")
     with _open(executor) as pool, _told(progress, "diagnose", 3) as told:
         found = report or judged(study, seed=seed, executor=pool, progress=told)
-        return diagnosed(study, found.to_dict(), seed=seed, executor=pool, progress=told)
+        return diagnosed(study, found, seed=seed, executor=pool, progress=told)
 
 
 @_verb

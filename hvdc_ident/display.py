@@ -82,6 +82,10 @@ class Shown:
         blocks = (str(b) if isinstance(b, Table) else _wrapped(b) for b in self._screen())
         return "\n\n".join(b for b in blocks if b)
 
+    def summary(self) -> str:
+        """Return what `print` shows: one screen of text."""
+        return str(self)
+
     @property
     def lines(self) -> list[str]:
         """The screen as lines, which are as long as they are."""

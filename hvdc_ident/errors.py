@@ -22,16 +22,31 @@ from __future__ import annotations
 import difflib
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
+
+from hvdc_ident.next_step import Door, NextStep, next_phrases
 
 
 class HvdcIdentError(Exception):
     """Base of every error the package raises on purpose.
 
-    Parts that are known are printed one after the other: `what (where): expected ..., got .... Try: ...`.
+    Parts that are known are printed one after the other: `what (where): expected ..., got .... Try: ...`. next: what to do, as values,
+    which `door` has its own words for.
     """
 
-    def __init__(self, what: str, *, where: str = "", expected: str = "", got: str = "", hint: str = "") -> None:
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        expected: str = "",
+        got: str = "",
+        hint: str = "",
+        next: tuple[NextStep, ...] = (),
+        door: Door = "shell",
+    ) -> None:
         self.what, self.where, self.expected, self.got, self.hint = what, where, expected, got, hint
+        self.next, self.door = next, door
         super().__init__(str(self))
 
     def __str__(self) -> str:
@@ -40,15 +55,26 @@ class HvdcIdentError(Exception):
             text += f"; expected {self.expected}"
         if self.got:
             text += f", got {self.got}" if self.expected else f"; got {self.got}"
-        return text + (f". Try: {self.hint}" if self.hint else "")
+        tried = "; ".join(filter(None, [self.hint, next_phrases(self.next, self.door)]))
+        return text + (f". Try: {tried}" if tried else "")
 
     def at(self, where: str) -> HvdcIdentError:
         """Return the error with an outer place put before its own."""
         place = f"{where}: {self.where}" if self.where else where
-        return type(self)(self.what, where=place, expected=self.expected, got=self.got, hint=self.hint)
+        return _rebuild(type(self), self.what, {**self._parts, "where": place})
+
+    def read_in(self, door: Door) -> HvdcIdentError:
+        """Return the error itself, its next step in the words of the place where it is read from now on."""
+        self.door = door
+        self.args = (str(self),)
+        return self
+
+    @property
+    def _parts(self) -> dict[str, Any]:
+        return {n: getattr(self, n) for n in ("where", "expected", "got", "hint", "next", "door")}
 
     def __reduce__(self) -> tuple[object, ...]:
-        return _rebuild, (type(self), self.what, self.where, self.expected, self.got, self.hint)
+        return _rebuild, (type(self), self.what, self._parts)
 
 
 @contextmanager
@@ -60,8 +86,8 @@ def located(where: str) -> Iterator[None]:
         raise e.at(where) from None
 
 
-def _rebuild(kind: type[HvdcIdentError], what: str, where: str, expected: str, got: str, hint: str) -> HvdcIdentError:
-    return kind(what, where=where, expected=expected, got=got, hint=hint)
+def _rebuild(kind: type[HvdcIdentError], what: str, parts: dict[str, Any]) -> HvdcIdentError:
+    return kind(what, **parts)
 
 
 class InputError(HvdcIdentError):

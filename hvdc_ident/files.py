@@ -7,33 +7,17 @@ import csv
 import hashlib
 import io
 import json
-import math
 import os
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
+from hvdc_ident.codec import Rows, plain
 from hvdc_ident.errors import InputError
 
-T = TypeVar("T")
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """Beginnings of texts that a spreadsheet takes for a formula."""
-
-
-@dataclass(frozen=True)
-class Rows:
-    """A long list of a result that is made row by row whenever it is written, never held as a whole."""
-
-    make: Callable[[], Iterable[Any]]
-    count: int
-
-    def __iter__(self) -> Iterator[Any]:
-        return iter(self.make())
-
-    def __len__(self) -> int:
-        return self.count
 
 
 def write_text(path: Path, text: str | Iterable[str]) -> Path:
@@ -117,41 +101,6 @@ def csv_name(cell: str) -> str:
 def digest(content: bytes) -> str:
     """The sha256 of some bytes, in hex."""
     return hashlib.sha256(content).hexdigest()
-
-
-def plain(value: Any) -> Any:
-    """Return the value as JSON can hold it: mappings, lists, text, numbers; a number that is not finite becomes None."""
-    if value is None or isinstance(value, str | bool | Rows):
-        return value
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in fields(value)}
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple | set | frozenset):
-        return [plain(v) for v in (sorted(value) if isinstance(value, set | frozenset) else value)]
-    if isinstance(value, int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, complex):
-        return [plain(value.real), plain(value.imag)]
-    if isinstance(value, Path):
-        return value.as_posix()
-    raise TypeError(f"{type(value).__name__} has no JSON form")
-
-
-def read_plain(kind: type[T], data: Any) -> T:
-    """Return the frozen value of a kind that `plain` made JSON of. Raises InputError where the data are none of that kind."""
-    from pydantic import TypeAdapter, ValidationError
-
-    try:
-        return TypeAdapter(kind).validate_python(data)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(map(str, first["loc"])) or kind.__name__
-        raise InputError(f"not the JSON of a {kind.__name__}", where=where, got=first["msg"]) from None
 
 
 def json_text(value: Any) -> str:

@@ -7,7 +7,7 @@ import re
 import shlex
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 Interval = Sequence[float | None]
 """The ends of an interval; one that is None is open."""
@@ -172,26 +172,33 @@ def with_study(text: str, study: str, *options: str) -> str:
     return re.sub(r"(hvdc-ident [a-z]+) STUDY\b", lambda found: f"{found[1]} {typed}", text)
 
 
-def in_python(text: str) -> str:
-    """Return the text with the commands in it as Python calls, and their options as arguments."""
-    text = re.sub(r"hvdc-ident ([a-z]+) STUDY(?: --to FILE)?", r"hi.\1(...)", text)
-    text = re.sub(r"--values ([a-z]+)", r'values="\1"', text)
-    return text.replace("--force NAME", 'force=["NAME"]')
+class ValueAtPlace(Protocol):
+    """The value of something if an effect is at a place. source: the signal brought in there."""
+
+    @property
+    def value(self) -> float: ...
+    @property
+    def unit(self) -> str: ...
+    @property
+    def effect(self) -> str: ...
+    @property
+    def at(self) -> tuple[str, ...]: ...
+    @property
+    def source(self) -> str: ...
 
 
-def value_by_place(values: Sequence[Mapping[str, Any]]) -> str:
+def value_by_place(values: Sequence[ValueAtPlace]) -> str:
     """Return a value that depends on what is missing where, as "0.1 s if the lag is at ya, 0.4 s if it is at a or b".
 
-    values: {value, unit, effect, at, from} by place, as `values_by_place` of a diagnosis has them. Places with the same value to
-    three digits stand together.
+    Places with the same value to three digits stand together.
     """
     places: dict[str, tuple[str, dict[str, list[str]]]] = {}
     for v in values:
-        brought = f" with {v['from']}" if v.get("from") else ""
-        shown = quantity(v["value"], v.get("unit") or "")
-        by_effect = places.setdefault(f"{v['value']:.3g}", (shown, {}))[1]
-        by_effect.setdefault(v["effect"], []).append(f"{listed(v['at'])}{brought}")
-    one_effect = len({v["effect"] for v in values}) == 1
+        brought = f" with {v.source}" if v.source else ""
+        shown = quantity(v.value, v.unit)
+        by_effect = places.setdefault(f"{v.value:.3g}", (shown, {}))[1]
+        by_effect.setdefault(v.effect, []).append(f"{listed(v.at)}{brought}")
+    one_effect = len({v.effect for v in values}) == 1
     told = []
     for k, (value, by_effect) in enumerate(places.values()):
         where = " or ".join(

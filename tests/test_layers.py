@@ -11,10 +11,10 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
-errors lazy text toml_tables executor files parallel immutable psse colours display data parameters axes expression shelf model
-plants effects
+next_step errors lazy aliases text immutable codec toml_tables executor files parallel psse colours display data
+parameters axes expression shelf model plants effects
 models formats simulate
-fmu linearize sensitivity fit identifiability discrepancy summary report study api app command run_commands cli
+fmu linearize sensitivity linear fit identifiability discrepancy summary report study api app command run_commands cli
 """.split()  # noqa: SIM905 - one list of words, read as such
 
 # Rooms with rooms inside, and the order of those.

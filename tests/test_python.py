@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -11,9 +12,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hvdc_ident as hi
+from hvdc_ident.aliases import MOVED
 from hvdc_ident.axes import draw_intervals
+from hvdc_ident.codec import plain
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit import Problem
+from hvdc_ident.sensitivity.sweep_points import latin_hypercube, log_grid
 from hvdc_ident.study.assemble import experiments_of
 
 T, K, STEP = 0.5, 3.0, 1.0
@@ -129,7 +133,7 @@ def test_a_study_file_gives_what_its_parts_give(tmp_path: Any) -> None:
     assert dict(whole.values) == dict(parts.values)
     assert "study" in str(hi.check(study)) and hi.check(study).to_dict()["candidates"].keys() == {"T", "k"}
     assert hi.simulate(study)["y"].shape == TIME.shape
-    other = hi.sweep(LAG, {"T": [0.25, 0.5, 1.0]}, study, values={"k": K})
+    other = hi.sweep(LAG, study, {"T": [0.25, 0.5, 1.0]}, values={"k": K})
     assert other.best("y", "step") == {"T": 0.5}
 
 
@@ -140,14 +144,14 @@ def test_one_executor_and_one_progress_serve_all(fit: Any) -> None:
             LAG, RECORD, ["T", "k"], executor=pool, progress=lambda done, total, text: told.append((done, total, text))
         ).values
         table = hi.sweep(
-            LAG, {"T": np.linspace(0.2, 1.0, 9)}, RECORD, executor=pool, progress=lambda *x: told.append(x)
+            LAG, RECORD, {"T": np.linspace(0.2, 1.0, 9)}, executor=pool, progress=lambda *x: told.append(x)
         )
     assert {n: values[n] for n in ("T", "k")} == pytest.approx({n: fit.values[n] for n in ("T", "k")}, rel=1e-6)
     assert told[-1] == (9, 9, "points") and np.isfinite(table.rmse).all()
 
 
 def test_linear_verbs_agree_with_the_mathematics(fit: Any) -> None:
-    linear = hi.linearize(LAG, inputs="u", outputs="y", parameters=fit)
+    linear = hi.linearize(LAG, inputs="u", outputs="y", values=fit)
     assert linear.poles() == pytest.approx([-1.0 / fit.values["T"]])
     response = hi.bode(linear, [0.1, 1.0])
     s = 1j * np.array([0.1, 1.0])
@@ -163,7 +167,7 @@ def test_every_result_is_one_screen_a_table_and_a_figure(report: Any, fit: Any) 
     plt = pytest.importorskip("matplotlib.pyplot")
     run = hi.simulate(LAG, RECORD)
     linear = hi.linearize(LAG, inputs="u", outputs="y")
-    table = hi.sweep(LAG, {"T": [0.5, 1.0]}, RECORD)
+    table = hi.sweep(LAG, RECORD, {"T": [0.5, 1.0]})
     words = {
         "insensitive": report,
         "0.5": fit,
@@ -185,6 +189,71 @@ def test_every_result_is_one_screen_a_table_and_a_figure(report: Any, fit: Any) 
     assert list(fit.to_dataframe().index) == ["T", "k"]
     assert run.to_xarray()["y"].attrs["units"] == "" and linear.bode().to_xarray().shape == linear.bode().values.shape
     plt.close("all")
+
+
+def test_a_result_has_its_parameters_by_name_and_comes_back_from_its_json(report: Any, fit: Any) -> None:
+    assert fit.params["T"].value == fit.values["T"] and fit.params["T"].interval == fit.estimates["T"].ci95
+    assert fit.params["unseen"].value == 1.0 and "insensitive" in fit.params["unseen"].reason
+    assert report.params["T"].interval == report.parameters["T"].ci95
+    assert fit.summary() == str(fit) and report.summary() == str(report)
+    for result in (report, fit):
+        data = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+        again = type(result).from_dict(data)
+        digests = {"recommended_experiment": None, "sensitivities": None}
+        assert again.to_dict() | digests == data | digests if result is report else again.to_dict() == data
+    again = hi.fit(LAG, RECORD, BOUNDS, report=hi.IdentifiabilityReport.from_dict(report.to_dict()))
+    assert dict(again.values) == pytest.approx(dict(fit.values), rel=1e-6)
+
+
+def test_tables_and_linear_results_come_back_from_their_json_too() -> None:
+    run = hi.simulate(LAG, RECORD, sensitivities=["T", "k"])
+    linear = hi.linearize(LAG, inputs="u", outputs="y")
+    one = hi.sweep(LAG, RECORD, {"T": [0.5, 1.0, 0.0]}, want=["rmse", "poles"])
+    two = hi.sweep(LAG, None, [log_grid("T", 0.5, 2.0, 3), latin_hypercube({"k": (1.0, 2.0), "unseen": (0.5, 2.0)}, 4)])
+    shown = hi.sweep(LAG, parameters={"k": [1.0, 2.0]}, want="bode")
+    assert one.failed and two.points.shape == (3, 4)
+    for result in (run, run.trajectory, linear.bode(), one, two, shown):
+        data = json.loads(json.dumps(plain(result), allow_nan=False))
+        assert plain(type(result).from_dict(data)) == data
+    again = hi.SweepResult.from_dict(one.to_dict() | {"model": "lag"})
+    assert str(again) == str(one) and again.best("y", "step") == one.best("y", "step")
+    assert hi.SweepResult.from_dict(two.to_dict()).points.shape == (3, 4)
+    assert hi.LinearModel.from_dict(linear.to_dict()).poles() == pytest.approx(linear.poles())
+    with pytest.raises(InputError, match="not the JSON of"):
+        hi.Simulation.from_dict({"time": [0.0], "signals": {"y": ["a"]}, "units": {}})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (lambda: hi.sweep(LAG, {"T": [0.5, 1.0]}, RECORD), lambda: hi.sweep(LAG, RECORD, {"T": [0.5, 1.0]}), "sweep"),
+        (lambda: hi.sweep(LAG, {"T": [0.5]}, data=RECORD), lambda: hi.sweep(LAG, RECORD, {"T": [0.5]}), "sweep"),
+        (
+            lambda: hi.simulate(LAG, RECORD, parameters={"T": 0.7}).trajectory,
+            lambda: hi.simulate(LAG, RECORD, {"T": 0.7}).trajectory,
+            r"simulate\(values=...\)",
+        ),
+        (
+            lambda: hi.linearize(LAG, inputs="u", parameters={"T": 0.7}),
+            lambda: hi.linearize(LAG, inputs="u", values={"T": 0.7}),
+            r"linearize\(values=...\)",
+        ),
+        (lambda: hi.h2_norm, lambda: hi.linear.h2_norm, r"hvdc_ident\.linear\.h2_norm"),
+        (lambda: hi.morris, lambda: hi.sensitivity.morris, r"hvdc_ident\.sensitivity\.morris"),
+    ],
+)
+def test_a_form_of_the_last_release_does_the_same_and_names_the_new_one(old: Any, new: Any, message: str) -> None:
+    with pytest.warns(DeprecationWarning, match=message) as told:
+        before = old()
+    assert all(w.filename == __file__ for w in told), "the warning points at the caller's line"
+    now = new()
+    assert before is now or before.to_dict() == now.to_dict()
+
+
+def test_every_name_of_the_last_release_is_somewhere() -> None:
+    for name in " ".join(MOVED.values()).split():
+        with pytest.warns(DeprecationWarning):
+            assert getattr(hi, name) is not None
 
 
 def test_a_problem_is_fitted_as_it_stands() -> None:
@@ -257,5 +326,5 @@ def test_a_fit_with_nothing_to_estimate_says_what_to_try_in_python() -> None:
     still = hi.Experiment(
         TIME, inputs={"u": 0.0}, outputs={"y": NOISE * np.random.default_rng(2).standard_normal(TIME.size)}
     )
-    message = hi.fit(LAG, still, {"k": (0.1, 10.0)}).message
+    message = str(hi.fit(LAG, still, {"k": (0.1, 10.0)}))
     assert 'force=["NAME"]' in message and "`hi.identify(...)`" in message and "--" not in message

@@ -32,7 +32,7 @@ class Desk:
     model: AnyModel
     study: hi.Study | None = None
     spans: FrozenMap[tuple[float, float]] = field(default_factory=FrozenMap)
-    ports: FrozenMap[hi.Port] = field(default_factory=FrozenMap)
+    ports: FrozenMap[hi.linear.Port] = field(default_factory=FrozenMap)
     source: str = DEFAULT
     file: Path = Path("study.toml")
     recording: Path | None = None

@@ -61,7 +61,7 @@ class Setting:
     outputs: tuple[str, ...] = ()
     channel: tuple[str, str] = ("", "")
     opened: str = ""
-    port: hi.Port | None = None
+    port: hi.linear.Port | None = None
     record: Experiment | None = None
 
     @classmethod
@@ -115,12 +115,12 @@ class Setting:
         if self.record is not None:
             levels |= {n: float(s(float(self.time[0]))) for n, s in self.record.inputs.items()}
         own = {n: v for n, v in self.values.items() if n in self.model.parameters}
-        return hi.find_operating_point(self.model, levels, parameters=own)
+        return hi.find_operating_point(self.model, levels, values=own)
 
     def linear(self, point: hi.OperatingPoint) -> LinearModel:
         """Return the linear model of the chosen channel, or of the opened loop. Raises as `hvdc_ident.linearize` and `loop`."""
         if self.opened and isinstance(self.model, Model):
-            return hi.loop(self.model, self.opened, point).open
+            return hi.linear.loop(self.model, self.opened, point).open
         return hi.linearize(self.model, point, inputs=self.channel[0], outputs=self.channel[1])
 
     def response(self, point: hi.OperatingPoint, omega: Array | None = None) -> FrequencyResponse:
@@ -131,7 +131,7 @@ class Setting:
         if self.port is not None and isinstance(self.model, Model):
             if omega is None:
                 omega = hi.bode(self.model, point=point).omega
-            return hi.port_impedance(self.model, self.port, omega, point)
+            return hi.linear.port_impedance(self.model, self.port, omega, point)
         return hi.bode(self.linear(point), omega)
 
     def sensitivities(self) -> dict[str, dict[str, float]]:
@@ -150,7 +150,7 @@ class Setting:
 
     def margins(self, point: hi.OperatingPoint) -> str:
         """Return the margins of the opened loop in words; "" where none is opened."""
-        return str(hi.margins(self.linear(point))) if self.opened else ""
+        return str(hi.linear.margins(self.linear(point))) if self.opened else ""
 
     def poles(self, point: hi.OperatingPoint) -> Array:
         """Return the poles of the closed model, (n,), rad/s."""

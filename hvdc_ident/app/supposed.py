@@ -11,13 +11,15 @@ import numpy as np
 
 import hvdc_ident as hi
 from hvdc_ident.data import Experiment
+from hvdc_ident.discrepancy.result import FoundEffect, Rival
 from hvdc_ident.errors import ComputationError, HvdcIdentError
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.identifiability.experiment_design import ExperimentDesign, Move, single_input_designs
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.augmented import use_of
-from hvdc_ident.text import form_of, listed
+from hvdc_ident.summary.stage_results import diagnosis_of
+from hvdc_ident.text import listed
 
 
 @dataclass(frozen=True)
@@ -39,18 +41,19 @@ def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) ->
     The rivals have the parameters that their refits came to, and those of the best one where the results keep no others:
     `refitted` gives them all. None where nothing was put in; a rival that cannot be built here is left out.
     """
-    card = folder / Path(str(diagnosis.get("augmented_model") or "")).name
-    if not diagnosis.get("augmented_model") or not card.is_file():
+    result = diagnosis_of(diagnosis)
+    card = folder / Path((result and result.augmented_model) or "").name
+    if result is None or not result.augmented_model or not card.is_file():
         return ()
     best = hi.load_model(card)
-    found = diagnosis.get("effects") or []
+    found: Sequence[FoundEffect | Rival] = result.effects
     rivals = [Supposition(_named(found), best, _sizes(study, best))]
-    gains = {n: v for n, v in (diagnosis.get("parameters_after") or {}).items() if n in study.model.parameters}
+    gains = {n: v for n, v in result.parameters_after.items() if n in study.model.parameters}
     plant = study.model.with_values(gains)
-    for k, group in enumerate(diagnosis.get("ambiguity") or []):
+    for k, group in enumerate(result.ambiguity):
         for other in (r for r in group if k >= len(found) or _place_of(r) != _place_of(found[k])):
             effects = [*found[:k], other, *found[k + 1 :]]
-            own = {n: v["value"] for n, v in (other.get("values") or {}).items() if n in gains}
+            own = {n: v.value for n, v in other.values.items() if n in gains}
             try:
                 model = hi.apply_effects(plant.with_values(own), [use_of(e) for e in effects])
             except HvdcIdentError:  # a formula, or an unknown input: no effect that can be put in by its name
@@ -59,8 +62,8 @@ def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) ->
     return tuple(rivals)
 
 
-def _place_of(effect: Mapping[str, Any]) -> tuple[str, tuple[str, ...], str]:
-    return effect["effect"], tuple(effect["at"]), effect.get("from", "")
+def _place_of(effect: FoundEffect | Rival) -> tuple[str, tuple[str, ...], str]:
+    return effect.effect, effect.at, effect.source
 
 
 def refitted(study: hi.Study, rival: Supposition) -> Supposition:
@@ -84,12 +87,12 @@ def refitted(study: hi.Study, rival: Supposition) -> Supposition:
     return replace(rival, model=rival.model.with_values({u.name: found.values[u.name] for u in unknowns}), fitted=True)
 
 
-def _named(effects: Sequence[Mapping[str, Any]]) -> str:
+def _named(effects: Sequence[FoundEffect | Rival]) -> str:
     """Return the effects with their places in words."""
     parts = []
     for e in effects:
-        source = f" from {e['from']}" if e.get("from") else ""
-        parts.append(f"{form_of(e)} at {listed(e['at'])}{source}")
+        source = f" from {e.source}" if e.source else ""
+        parts.append(f"{e.name} at {listed(e.at)}{source}")
     return "; ".join(parts) or "as found"
 
 

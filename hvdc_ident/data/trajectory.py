@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.codec import read_fields
 from hvdc_ident.display import Shown, Table, axes_of, data_frame, first_rows, library
 from hvdc_ident.errors import StudyError, WaveformError, unknown_name
 from hvdc_ident.text import with_unit
@@ -39,6 +40,15 @@ class Origin:
     time_column: str = ""
     converted: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Lists:
+    """A trajectory as JSON has it."""
+
+    time: Array
+    signals: Mapping[str, Array]
+    units: Mapping[str, str]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -142,6 +152,13 @@ class Trajectory(Shown):
             "signals": {n: self[n].tolist() for n in self.names},
             "units": dict(zip(self.names, self.units, strict=True)),
         }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
+        """Return the trajectory that `to_dict` wrote. Raises InputError for anything else."""
+        table = read_fields(_Lists, data)
+        columns = np.reshape(list(table.signals.values()), (len(table.signals), table.time.size)).T
+        return cls(table.time, columns, tuple(table.signals), tuple(table.units.get(n, "") for n in table.signals))
 
     def _column(self, name: str) -> int:
         try:

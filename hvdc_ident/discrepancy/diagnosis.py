@@ -10,6 +10,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from hvdc_ident.codec import plain
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.candidate_table import lines
 from hvdc_ident.discrepancy.candidates import entries
@@ -24,7 +25,7 @@ from hvdc_ident.discrepancy.moves import clock_sentence, clocks, stated
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.residual_checks import Binned
-from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect, StandIn
+from hvdc_ident.discrepancy.result import AUGMENTED, Diagnosis, FoundEffect, StandIn
 from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.discrepancy.screen import NOT_TRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.search import SearchOutcome, two_start_search
@@ -41,9 +42,9 @@ from hvdc_ident.discrepancy.verdict import (
 )
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, Simulator
 from hvdc_ident.fit.noise import LOUDER, QUIETER, OutputNoise
+from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.simulate import ModelSimulator
@@ -71,7 +72,7 @@ def diagnose(
     places: Iterable[str | tuple[str, ...]] | None = None,
     tolerance: Mapping[str, float] | None = None,
     held: Mapping[str, float] | None = None,
-    report: Mapping[str, Any] | None = None,
+    report: IdentifiabilityReport | None = None,
     options: DiagnosisOptions | None = None,
     seed: int = 0,
     executor: Executor | None = None,
@@ -86,7 +87,7 @@ def diagnose(
     slots with shared parameters (default:
     every slot, and families of like slots).
     tolerance: by output, an error (in its unit) below which a gap is of no interest. held: values of other parameters.
-    report: `IdentifiabilityReport.to_dict()` of these data, whose identifiable set is fitted; without one, the set that
+    report: of these data, whose identifiable set is fitted; without one, the set that
     the sensitivities at the pilot fit can distinguish.
 
     Raises StudyError or UnknownNameError where there is nothing to diagnose, SimulationError where the nominal model
@@ -230,6 +231,7 @@ def _assembled(
         parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.given) for f in free}),
         parameters_after=FrozenMap({f.name: last.values.get(f.name, f.given) for f in free}),
         augmented=augmented,
+        augmented_model=AUGMENTED if isinstance(augmented, Model) else None,
         fallback=None if other is None else other.to_dict(),
         noise={o: noise_told(n) for o, n in first.noise.items()},
         notes=notes,

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from hvdc_ident.codec import NOT_STORED, Coded
 from hvdc_ident.discrepancy.candidates import additive, candidates
 from hvdc_ident.discrepancy.evidence import (
     CandidateFit,
@@ -33,7 +34,6 @@ from hvdc_ident.discrepancy.rounds import FoundForm, Round, RoundModel
 from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.effects import effects
 from hvdc_ident.expression import parse, symbol, to_text
-from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.text import listed
@@ -46,7 +46,7 @@ TIME_KNOTS = 24
 
 
 @dataclass(frozen=True, eq=False)
-class DescribedForm:
+class DescribedForm(Coded):
     """A form outside the catalogue, described. kind: term, filter, curve, disturbance or nothing.
 
     at: the insertion point; expression and coefficients: of a term or a filter; curve: of the others, {over, at, value, std}.
@@ -60,11 +60,7 @@ class DescribedForm:
     coefficients: FrozenMap[Any] = field(default_factory=FrozenMap)
     delta_bic: float | None = None
     curve: Mapping[str, Any] | None = None
-    refit: Refit | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON takes it, without the model."""
-        return {n: plain(getattr(self, n)) for n in self.__dataclass_fields__ if n != "refit"}
+    refit: Refit | None = field(default=None, metadata=NOT_STORED)
 
 
 def refitted_forms(

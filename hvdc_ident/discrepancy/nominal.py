@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,8 @@ from hvdc_ident.fit import FitParameter, Problem, Simulator, StartOutcome
 from hvdc_ident.fit.noise import GIVEN, OutputNoise, noise_of, stated_by
 from hvdc_ident.fit.residual import ResidualBlock, passed_draws, whitened_together
 from hvdc_ident.fit.simulator import approximate, observe
-from hvdc_ident.identifiability.gate import gate, gated, searched
+from hvdc_ident.identifiability import IdentifiabilityReport
+from hvdc_ident.identifiability.gate import gate, gated
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import independent, null_directions
@@ -263,7 +264,7 @@ def nominal(
     experiments: Sequence[Experiment],
     parameters: Sequence[FitParameter],
     held: Mapping[str, float],
-    report: Mapping[str, Any] | None,
+    report: IdentifiabilityReport | None,
     *,
     starts: int | None,
     seed: int,
@@ -281,7 +282,7 @@ def nominal(
     begun: tuple[StartOutcome, ...] = ()
     if report is not None:
         problem = gated(problem, gate(report, diagnosis=True))
-        begun = searched(report, [f.name for f in problem.free])
+        begun = report.pilot.ends_over([f.name for f in problem.free])
     # What is known of the noise goes into the records: a fit keeps weights of its own for deterministic outputs only.
     with_noise = tuple(
         off_jumps(e).with_(noise=FrozenMap({o: n for o in e.outputs if (n := _stated(e, o, noise[o])) is not None}))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
+from hvdc_ident.codec import NOT_STORED, Coded, stored_as
 from hvdc_ident.colours import EFFECT, RECORDED, ROLES
 from hvdc_ident.display import Shown, data_frame
 from hvdc_ident.display import Table as TextTable
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import InputError, SteadyStateError
-from hvdc_ident.files import plain
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import interval_text, interval_words, percentage, value_by_place
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable"]
 AUGMENTED = "augmented-model.toml"
-AS_LINES = ("augmented", "candidates", "effects", "ambiguity", "findings", "values_by_place", "stand_ins")
-"""Fields that JSON writes in another form."""
 MAX_DRAWN = 10
 """Candidates in the figure, the best by BIC."""
 Table = Mapping[str, Mapping[str, float | None]]
@@ -37,6 +35,11 @@ class EffectSize:
     ci95: tuple[float | None, float | None] | None = None
     unit: str = ""
 
+    @property
+    def interval(self) -> tuple[float | None, float | None] | None:
+        """The 95 % interval, `ci95`."""
+        return self.ci95
+
 
 @dataclass(frozen=True)
 class FoundEffect:
@@ -48,10 +51,16 @@ class FoundEffect:
 
     effect: str
     at: tuple[str, ...]
-    parameters: FrozenMap[EffectSize]
-    text: str
-    chosen_from: int
-    source: str = ""
+    parameters: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
+    text: str = ""
+    chosen_from: int | None = None
+    source: str = field(default="", metadata=stored_as("from", optional=True))
+    stored_properties: ClassVar[tuple[str, ...]] = ("late",)
+
+    @property
+    def name(self) -> str:
+        """The effect by its name in the catalogue."""
+        return self.effect
 
     @property
     def late(self) -> float | None:
@@ -74,14 +83,20 @@ class Rival:
     at: tuple[str, ...]
     delta_bic: float
     parameters: FrozenMap[float] = field(default_factory=FrozenMap)
-    source: str = ""
+    source: str = field(default="", metadata=stored_as("from", optional=True))
     refitted: bool = True
-    expression: str = ""
-    same_as: str = ""
-    akin: str = ""
-    prior: float = 1.0
+    expression: str = field(default="", metadata=stored_as("expression", optional=True))
+    same_as: str = field(default="", metadata=stored_as("same_as", optional=True))
+    akin: str = field(default="", metadata=stored_as("akin", optional=True))
+    prior: float = field(default=1.0, metadata=NOT_STORED)
     values: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
-    off_given: float = 0.0
+    off_given: float = field(default=0.0, metadata=NOT_STORED)
+    stored_properties: ClassVar[tuple[str, ...]] = ("late",)
+
+    @property
+    def name(self) -> str:
+        """The effect, with its formula where it is outside the catalogue."""
+        return f"{self.effect} {self.expression}".rstrip()
 
     @property
     def late(self) -> float | None:
@@ -99,7 +114,7 @@ class Place:
 
     at: tuple[str, ...]
     probability: float
-    source: str = ""
+    source: str = field(default="", metadata=stored_as("from", optional=True))
     effect: str = ""
     parameters: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
     values: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
@@ -114,7 +129,7 @@ class ValueAt:
     unit: str
     effect: str
     at: tuple[str, ...]
-    source: str = ""
+    source: str = field(default="", metadata=stored_as("from", optional=True))
 
 
 @dataclass(frozen=True)
@@ -130,11 +145,11 @@ class Finding:
     """
 
     effect: str
-    same_as: tuple[str, ...]
-    probability: float
-    parameters: FrozenMap[EffectSize]
-    places: tuple[Place, ...]
-    text: str
+    same_as: tuple[str, ...] = ()
+    probability: float = 0.0
+    parameters: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
+    places: tuple[Place, ...] = ()
+    text: str = ""
     equivalent_delay: EffectSize | None = None
     share: float | None = None
 
@@ -152,7 +167,7 @@ class StandIn:
     parameters: FrozenMap[float]
     values: FrozenMap[float]
     text: str
-    source: str = ""
+    source: str = field(default="", metadata=stored_as("from", optional=True))
 
 
 @dataclass(frozen=True)
@@ -189,7 +204,7 @@ class Line:
     size: FrozenMap[float] = field(default_factory=FrozenMap)
     delta_bic: float | None = None
     holdout_rmse: float | None = None
-    source: str = ""
+    source: str = field(default="", metadata=stored_as("from", optional=True))
     round: int = 1
 
 
@@ -203,17 +218,17 @@ class Gap:
     held_out: what "holdout" is: experiments, or (with none of that role) parts of the fitted ones, predicted from the rest.
     """
 
-    nominal: Mapping[str, Table]
-    refitted: Mapping[str, Table]
-    augmented: Mapping[str, Table]
-    noise_floor: FrozenMap[float]
-    pooled: Mapping[str, Mapping[str, float | None]]
-    shrink_holdout: float | None
+    nominal: Mapping[str, Table] = field(default_factory=dict)
+    refitted: Mapping[str, Table] = field(default_factory=dict)
+    augmented: Mapping[str, Table] = field(default_factory=dict)
+    noise_floor: FrozenMap[float] = field(default_factory=FrozenMap)
+    pooled: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
+    shrink_holdout: float | None = None
     held_out: str = "experiments"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Diagnosis(Shown):
+class Diagnosis(Coded, Shown):
     """The outcome of a diagnosis; `to_dict` is the JSON.
 
     verdict: named, no-evidence, not-excited, ambiguous or unnameable; text: why, in one or two sentences.
@@ -224,7 +239,8 @@ class Diagnosis(Shown):
     candidates: every candidate's line, the best first. location: where model and data differ.
     gap: before and after. remaining: what is left. beyond_noise: whether that is more than noise; the values and
     the intervals then hold only if nothing else is missing. parameters_*: by name; `parameters_refitted` are the
-    nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in.
+    nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in, and where the
+    diagnosis was read from JSON. augmented_model: the name of its card in `files`; None where it has none.
     fallback: the form found outside the catalogue, if one was looked for. noise: standard deviation and AR coefficient by output,
     and where they come from.
     findings: what is missing, each effect with its probability and its likely places, the likeliest first. remainder: {share of
@@ -235,18 +251,19 @@ class Diagnosis(Shown):
     """
 
     verdict: Verdict
-    text: str
-    effects: tuple[FoundEffect, ...]
-    ambiguity: tuple[tuple[Rival, ...], ...]
-    separating_experiment: Mapping[str, Any]
-    candidates: tuple[Line, ...]
-    location: Mapping[str, Any]
-    gap: Gap
-    remaining: Mapping[str, Any]
-    parameters_before: FrozenMap[float]
-    parameters_refitted: FrozenMap[float]
-    parameters_after: FrozenMap[float]
-    augmented: AnyModel | None = None
+    text: str = ""
+    effects: tuple[FoundEffect, ...] = ()
+    ambiguity: tuple[tuple[Rival, ...], ...] = ()
+    separating_experiment: Mapping[str, Any] | None = None
+    candidates: tuple[Line, ...] = ()
+    location: Mapping[str, Any] = field(default_factory=dict)
+    gap: Gap = field(default_factory=Gap)
+    remaining: Mapping[str, Any] = field(default_factory=dict)
+    parameters_before: FrozenMap[float] = field(default_factory=FrozenMap)
+    parameters_refitted: FrozenMap[float] = field(default_factory=FrozenMap)
+    parameters_after: FrozenMap[float] = field(default_factory=FrozenMap)
+    augmented: AnyModel | None = field(default=None, metadata=NOT_STORED)
+    augmented_model: str | None = None
     fallback: Mapping[str, Any] | None = None
     noise: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
@@ -258,17 +275,10 @@ class Diagnosis(Shown):
     values_by_place: FrozenMap[tuple[ValueAt, ...]] = field(default_factory=FrozenMap)
     stand_ins: tuple[StandIn, ...] = ()
 
-    def to_dict(self) -> dict[str, Any]:
-        """The diagnosis as JSON takes it; `augmented_model` is the name of the card that `files` holds."""
-        out = {name: plain(getattr(self, name)) for name in self.__dataclass_fields__ if name not in AS_LINES}
-        out["effects"] = [_member(e) for e in self.effects]
-        out["ambiguity"] = [[_member(r) for r in group] for group in self.ambiguity]
-        out["findings"] = [plain(f) | {"places": [as_line(p) for p in f.places]} for f in self.findings]
-        out["stand_ins"] = [as_line(s) for s in self.stand_ins]
-        out["values_by_place"] = {n: [as_line(v) for v in each] for n, each in self.values_by_place.items()}
-        out["candidates"] = [as_line(line) for line in self.candidates]
-        out["augmented_model"] = next(iter(self.files), None)
-        return out
+    @property
+    def params(self) -> FrozenMap[EffectSize]:
+        """The parameters with what was put into the model, by name. Their intervals are those of a study's diagnosis."""
+        return FrozenMap({n: EffectSize(v) for n, v in self.parameters_after.items()})
 
     @property
     def files(self) -> dict[str, str]:
@@ -279,7 +289,7 @@ class Diagnosis(Shown):
         from hvdc_ident.model import Model, write_card
         from hvdc_ident.simulate import with_guesses
 
-        if not isinstance(self.augmented, Model):
+        if self.augmented_model is None or not isinstance(self.augmented, Model):
             return {}
         try:
             card = with_guesses(self.augmented)
@@ -290,12 +300,12 @@ class Diagnosis(Shown):
         about += f"; fitted values, with what was added to the model; given were {given}"
         for name, values in self._by_place.items():
             about += f"; {name} depends on what is missing where: {values}"
-        return {AUGMENTED: write_card(replace(card, description=about))}
+        return {self.augmented_model: write_card(replace(card, description=about))}
 
     @property
     def _by_place(self) -> dict[str, str]:
         """The values that depend on which of the likely effects and places is the true one, in words, by parameter."""
-        return {n: value_by_place([as_line(v) for v in each]) for n, each in self.values_by_place.items()}
+        return {n: value_by_place(each) for n, each in self.values_by_place.items()}
 
     def _screen(self) -> Iterator[str | TextTable]:
         yield f"Diagnosis: {self.verdict}. {self.text}"
@@ -387,16 +397,3 @@ def _two_axes() -> Any:
 
     settings: dict[str, Any] = {"figsize": (10.0, 4.2), "layout": "constrained", "width_ratios": [1.0, 1.4]}
     return plt.subplots(1, 2, **settings)[1]
-
-
-def as_line(value: FoundEffect | Rival | Line | Place | ValueAt | StandIn) -> dict[str, Any]:
-    """A line with `from` only where a signal is brought in."""
-    out = {k: plain(getattr(value, k)) for k in value.__dataclass_fields__ if k != "source"}
-    return out | ({"from": value.source} if value.source else {})
-
-
-def _member(value: FoundEffect | Rival) -> dict[str, Any]:
-    """Return the line of `as_line`, with `late` only where it is one kind of delay or another, and `expression` where it is a formula."""
-    left_out, optional = ("prior", "off_given"), ("expression", "same_as", "akin")
-    out = {k: v for k, v in as_line(value).items() if k not in left_out and (k not in optional or v)}
-    return out | ({} if value.late is None else {"late": value.late})

@@ -21,7 +21,7 @@ from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import LISTED, REFUTED, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
-from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict, as_line
+from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict
 from hvdc_ident.discrepancy.rounds import FoundForm
 from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.effects import effects
@@ -183,7 +183,7 @@ def headline(
     tolerance that is stated for it."""
     left = judgement.remainder
     if judgement.verdict != "named" or left is None:
-        values = [f"{n} is {value_by_place([as_line(v) for v in each])}." for n, each in (depend or {}).items()]
+        values = [f"{n} is {value_by_place(each)}." for n, each in (depend or {}).items()]
         return " ".join([judgement.text, *values])
     explains = "Together they explain" if len(findings) > 1 else "It explains"
     rest = f"what remains is {figures(left.noise_units, 3)} times the noise"

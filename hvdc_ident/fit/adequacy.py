@@ -22,13 +22,13 @@ from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Curve, ResidualBlock, stretches
 from hvdc_ident.fit.whitening import independent_samples
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.text import times_text
 
 LEVEL = 1e-3
 """Chance of a verdict against the model or the noise where both are right, over all outputs, or all parameters, together."""
 MATTERS = 2.0
 """Ratio of the residual's power to the noise's from which intervals that rest on the noise are wrong (see above)."""
-NEXT = "hvdc-ident diagnose STUDY"
 MOVED = "what the model lacks may move the estimates by more than any noise, so that no interval is given"
 """The consequence of a misfit for what is estimated. A fit leaves of a missing effect what no parameter can make good, and that does
 not tell how much of it the parameters have made good."""
@@ -76,16 +76,16 @@ class Adequacy:
     verdict: fits; does-not-fit; noise-understated (white residuals above the noise stated: not the mark of a wrong model);
     noise-overstated; not-judged (no noise is known but the residual's own). chi2_per_dof: over all outputs, against the noise
     stated. outputs: by output, of all its records together, or of one that alone is above its noise. signals: by output and
-    experiment. text: the verdict in words, empty where it fits; next: the command to run, or what to do.
+    experiment. text: the verdict in words, empty where it fits; next: what to do, the first thing first.
     systematic: whether a residual is more than a noise that is known: the model lacks something, which moves the estimates by
     what no residual tells. Rows alone do not tell correlated noise from that.
     """
 
     verdict: Verdict
-    chi2_per_dof: float | None
+    chi2_per_dof: float | None = None
     outputs: FrozenMap[ResidualSize] = field(default_factory=FrozenMap)
     text: str = ""
-    next: str = ""
+    next: tuple[NextStep, ...] = ()
     systematic: bool = False
     signals: FrozenMap[FrozenMap[ResidualSize]] = field(default_factory=FrozenMap)
 
@@ -290,23 +290,20 @@ def _quantile(dof: float, behind: float, chance: float) -> float:
 
 def _sentence(
     sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapping[str, str], *, systematic: bool
-) -> tuple[str, str]:
+) -> tuple[str, tuple[NextStep, ...]]:
     """Return the verdict in words, and what to do."""
     parts = [_line(o, s, sources[o]) for o, s in sizes.items() if s.verdict == verdict]
     text = "; ".join(p for p in parts if p)
     if verdict == "does-not-fit":
-        return f"{text}: {MOVED if systematic else CORRELATED}", NEXT
+        return f"{text}: {MOVED if systematic else CORRELATED}", (NextStep("diagnose"),)
     values = ", ".join(
         f"{o} = {s.noise * s.times:.3g}" for o, s in sizes.items() if s.verdict == verdict and s.noise and s.times
     )
     if verdict == "noise-understated":
-        return text, f"state noise = {{{values}}} if the instrument may be as noisy as that; else {NEXT}"
+        return text, (NextStep("raise-noise", values), NextStep("diagnose"))
     if verdict == "noise-overstated":
-        return (
-            text,
-            f"state noise = {{{values}}}, or leave it out to have it estimated: the intervals are too wide as they are",
-        )
-    return text, ""
+        return text, (NextStep("lower-noise", values),)
+    return text, ()
 
 
 def _line(output: str, size: ResidualSize, source: str) -> str:

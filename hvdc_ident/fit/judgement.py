@@ -6,12 +6,13 @@ It is made once for a set of values, by signal (an output of an experiment), and
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.codec import Coded
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.data.units import same_unit
 from hvdc_ident.fit.adequacy import ResidualSize, sizes_of_runs
@@ -60,7 +61,7 @@ class Count:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Judgement(Coded):
     """The verdict on the model with one set of values: whether it follows its recordings.
 
     by: what the verdict is held against: the study's tolerance where it states one, else the windows of a profile that it names,
@@ -69,24 +70,34 @@ class Judgement:
 
     by: Yardstick
     signals: FrozenMap[FrozenMap[SignalJudgement]]
+    stored_properties: ClassVar[tuple[str, ...]] = ("follows", "counts")
 
     @property
     def follows(self) -> bool | None:
         """The verdict by what the errors are held against."""
         return self.count(self.by).verdict
 
+    @property
+    def counts(self) -> dict[Yardstick, Count]:
+        """How many signals passed, failed and were not judged, by what the errors are held against."""
+        return {by: self.count(by) for by in get_args(Yardstick)}
+
     def count(self, by: Yardstick) -> Count:
         """Return how many signals passed, failed and were not judged."""
         each = [s.follows[by] for line in self.signals.values() for s in line.values()]
         return Count(each.count(True), each.count(False), each.count(None))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the verdict, the counts by what the errors are held against, and the signals, as JSON takes it."""
-        signals = {
-            o: {e: vars(s) | {"follows": dict(s.follows)} for e, s in line.items()} for o, line in self.signals.items()
-        }
-        counts = {by: vars(self.count(by)) for by in ("noise", "tolerance", "windows")}
-        return {"by": self.by, "follows": self.follows, "counts": counts, "signals": signals}
+
+@dataclass(frozen=True)
+class Judgements(Coded):
+    """The judgements that a stage makes, by set of values: given, fitted, effect.
+
+    tolerance: of the RMSE that the study states, by output. profile: of the windows; its `named` says whether the study names it.
+    """
+
+    tolerance: Mapping[str, float] = field(default_factory=dict)
+    profile: Mapping[str, Any] = field(default_factory=dict)
+    sets: Mapping[str, Judgement] = field(default_factory=dict)
 
 
 def judge(

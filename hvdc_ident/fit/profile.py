@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
+from hvdc_ident.codec import NOT_STORED
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress, mapped
@@ -48,9 +49,9 @@ class Profile:
     upper: Side
     values: Array
     rises: Array
-    thetas: Array
     threshold: float
     one_sided: bool = False
+    thetas: Array = field(default_factory=lambda: np.zeros((0, 0)), metadata=NOT_STORED)
 
     @property
     def ci95(self) -> tuple[float | None, float | None]:
@@ -157,7 +158,7 @@ def trend_profiles(
         distance = values - value
         thetas = np.tile(optimum.theta, (values.size, 1)) + np.outer(distance, covariance[:, i] / covariance[i, i])
         rises = push * np.abs(distance) + 0.5 * distance**2 / covariance[i, i]
-        by_name[name] = Profile(name, value, lower, upper, values, rises, thetas, rise, on_bound)
+        by_name[name] = Profile(name, value, lower, upper, values, rises, rise, on_bound, thetas)
     return FrozenMap(by_name)
 
 
@@ -238,7 +239,7 @@ def _profile(sides: Sequence[tuple[ProfilePath, Side]]) -> Profile:
     thetas = np.array([end.theta for _, end in points])[order]
     rises = np.array([end.at.cost for _, end in points])[order] - best.at.cost
     value = float(best.theta[path.i])
-    return Profile(path.name, value, lower, upper, thetas[:, path.i], rises, thetas, path.rise, path.on_bound)
+    return Profile(path.name, value, lower, upper, thetas[:, path.i], rises, path.rise, path.on_bound, thetas)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from hvdc_ident.codec import NOT_STORED, Coded
 from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
-from hvdc_ident.files import plain
 from hvdc_ident.fit.adequacy import Adequacy
 from hvdc_ident.fit.jump_instants import PlacedInstant
 from hvdc_ident.fit.residual import Curve
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import estimate_texts, in_python, interval_text
+from hvdc_ident.next_step import NextStep, next_phrases
+from hvdc_ident.text import estimate_texts, interval_text
 
 NOT_ASKED = "not a candidate"
 """Reason of a parameter that is held because it was not asked for."""
@@ -55,6 +56,11 @@ class Estimate:
     reason: str = ""
     ci95_independent: tuple[float, float] | None = None
 
+    @property
+    def interval(self) -> tuple[float | None, float | None] | None:
+        """The 95 % interval, `ci95`."""
+        return self.ci95
+
     def without_interval(self, why: str) -> Estimate:
         """Return the estimate without standard deviation and interval, and why."""
         reason = f"{self.reason}; {why}" if self.reason else why
@@ -73,12 +79,6 @@ class StartOutcome:
     evaluations: int
     group: int | None = None
 
-    @classmethod
-    def of(cls, line: Mapping[str, Any]) -> StartOutcome:
-        """Return the outcome that a line of the JSON is."""
-        start, end = FrozenMap(line["start"]), FrozenMap(line["end"])
-        return cls(start, end, line["cost"], line["status"], line["message"], line["evaluations"])
-
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
@@ -90,7 +90,7 @@ class Covariance:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FitResult(Shown):
+class FitResult(Coded, Shown):
     """The outcome of a fit; `to_dict` is the JSON.
 
     fitted: names of the free parameters. held: the reason for each other one. values: fitted ones and those held at
@@ -104,7 +104,7 @@ class FitResult(Shown):
     rho, effective_samples: AR(1) coefficient of the residuals and independent samples, by output.
     correlation: between the estimates. residual_tests: by output and experiment. starts: outcomes of the multistart.
     search_doubt: in words, that one start alone reached the lowest cost; the message begins with it. Empty otherwise.
-    per_experiment: statistics over fits to single experiments, where they were made.
+    next: what to try where nothing was fitted. per_experiment: statistics over fits to single experiments, where they were made.
     loss, whitening: what residuals cost, and the AR coefficients they were whitened with, by output.
     dof: degrees of freedom of Student's t behind the intervals, None where the noise is known and white (its square is
     the F quantile of one parameter). goodness, validation: see there.
@@ -114,10 +114,10 @@ class FitResult(Shown):
     """
 
     status: Status
-    message: str
-    fitted: tuple[str, ...]
-    held: FrozenMap[str]
-    values: FrozenMap[float]
+    message: str = ""
+    fitted: tuple[str, ...] = ()
+    held: FrozenMap[str] = field(default_factory=FrozenMap)
+    values: FrozenMap[float] = field(default_factory=FrozenMap)
     estimates: FrozenMap[Estimate] = field(default_factory=FrozenMap)
     nuisance: FrozenMap[FrozenMap[Estimate]] = field(default_factory=FrozenMap)
     cost: float | None = None
@@ -135,19 +135,16 @@ class FitResult(Shown):
     residual_tests: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     starts: tuple[StartOutcome, ...] = ()
     search_doubt: str = ""
+    next: tuple[NextStep, ...] = ()
     per_experiment: Mapping[str, Any] = field(default_factory=dict)
     loss: str = "linear"
     whitening: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     dof: float | None = None
     goodness: Mapping[str, Any] = field(default_factory=dict)
     validation: Mapping[str, Any] = field(default_factory=dict)
-    covariance: Covariance | None = field(default=None, metadata={"json": False})
-    instants: Mapping[str, PlacedInstant] = field(default_factory=dict, metadata={"json": False})
-    curves: Mapping[str, Mapping[str, Curve]] = field(default_factory=dict, metadata={"json": False})
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the result as JSON takes it: full precision, None for what is not finite."""
-        return {f.name: plain(getattr(self, f.name)) for f in fields(self) if f.metadata.get("json", True)}
+    covariance: Covariance | None = field(default=None, metadata=NOT_STORED)
+    instants: Mapping[str, PlacedInstant] = field(default_factory=dict, metadata=NOT_STORED)
+    curves: Mapping[str, Mapping[str, Curve]] = field(default_factory=dict, metadata=NOT_STORED)
 
     def _screen(self) -> Iterator[str | Table]:
         yield f"Fit: {self.status}. {self.message[:1].upper()}{self.message[1:]}."
@@ -168,7 +165,18 @@ class FitResult(Shown):
             (f"{o}, {x}", *((c.get(o) or {}).get(x) for c in columns)) for o, line in self.rmse.items() for x in line
         ]
         yield Table(("RMSE of", "given", "start", "fitted"), tuple(errors)) if errors else ""
-        yield f"Next: {in_python(self.adequacy.next)}" if self.adequacy is not None and self.adequacy.next else ""
+        yield f"Next: {next_phrases(self.what_next, 'python')}." if self.what_next else ""
+
+    @property
+    def params(self) -> FrozenMap[Estimate]:
+        """Every parameter by name with its `value` and `interval`: the estimated ones, then those held, with the reason."""
+        held = {n: Estimate(v, reason=self.held.get(n, "")) for n, v in self.values.items() if n not in self.estimates}
+        return self.estimates | held
+
+    @property
+    def what_next(self) -> tuple[NextStep, ...]:
+        """What to do, the first thing first: where nothing was fitted, else by the verdict on the residuals."""
+        return self.next or (self.adequacy.next if self.adequacy is not None else ())
 
     def _quality(self) -> str:
         """Return the verdict on the residuals, in a line."""

@@ -416,5 +416,5 @@ def _in_fmu_names(model: FmuModel, use: EffectUse, error: InputError) -> InputEr
     def renamed(text: str) -> str:
         return re.sub(r"\b[uy](\d+)\b", lambda m: names[int(m[1])] if int(m[1]) < len(names) else str(m[0]), text)
 
-    parts = {k: renamed(getattr(error, k)) for k in ("where", "expected", "got", "hint")}
+    parts: dict[str, Any] = {k: renamed(getattr(error, k)) for k in ("where", "expected", "got", "hint")}
     return type(error)(renamed(error.what), **parts)

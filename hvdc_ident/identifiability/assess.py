@@ -15,7 +15,6 @@ import numpy as np
 from hvdc_ident.data import Experiment
 from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.jump_instants import moving_parameters
@@ -40,7 +39,7 @@ from hvdc_ident.identifiability.practical import (
     without_insensitive,
     without_null_directions,
 )
-from hvdc_ident.identifiability.report import IdentifiabilityReport
+from hvdc_ident.identifiability.report import CONDITIONS, Contribution, Held, IdentifiabilityReport, Pilot
 from hvdc_ident.identifiability.structural import StructuralAnalysis, structural_analysis
 from hvdc_ident.identifiability.verdicts import WIDE, scale_of, unjudged_verdict, with_misfit_remark
 from hvdc_ident.immutable import FrozenMap, joined
@@ -182,29 +181,29 @@ def _assembled(
     return IdentifiabilityReport(
         parameters=FrozenMap({n: assessment.verdicts[n] for n in assessment.free}),
         identifiable=fitted,
-        held=FrozenMap(held),
+        held=FrozenMap({n: Held(v, why) for n, (v, why) in held.items()}),
         structure=structure,
         combinations=tuple(assessment.combinations),
         collinear=collinear_subsets(matrix, first.names)[:200],
         correlation=last.uncertainty.correlation() if last is not None else {},
-        shares=whole.information.shares(),
-        heterogeneity=tests,
-        misspecification=misspecification(last, tests, assessment.units) if last else Misspecification(False, ()),
+        experiments=FrozenMap({e: Contribution(share) for e, share in whole.information.shares().items()}),
+        misspecification=misspecification(last, tests, assessment.units) if last else Misspecification(),
         recommended=advice if isinstance(advice, Recommendation) else None,
         not_recommended=advice if isinstance(advice, str) else "",
         thresholds=FrozenMap(assessment.thresholds),
-        pilot={
-            "status": result.status,
-            "message": result.message,
-            "search_doubt": result.search_doubt,
-            "starts": len(result.starts),
-            "ends": [plain(s) for s in result.starts],
-            "cost": first.cost,
-            "chi2_per_dof": first.misfit,
-            "effective_samples": dict(first.uncertainty.effective),
-            "noise_source": dict(result.noise_source),
-        },
-        notes=tuple(assessment.notes),
+        profiles=FrozenMap({n: v.profile for n, v in assessment.verdicts.items() if v.profile is not None}),
+        pilot=Pilot(
+            result.status,
+            result.message,
+            result.search_doubt,
+            len(result.starts),
+            result.starts,
+            first.cost,
+            first.misfit,
+            dict(first.uncertainty.effective),
+            dict(result.noise_source),
+        ),
+        notes=(*assessment.notes, CONDITIONS),
         sensitivities=_sensitivities(assessment, whole),
         not_judged=unjudged,
         optima=assessment.optima,
@@ -324,7 +323,7 @@ def identifiability_by_group(
         structure=replace(whole.structure, status="decided" if decided else "not decided"),
         recommended=advised.recommended,
         not_recommended=advised.not_recommended,
-        notes=(*whole.notes, *notes),
+        notes=(*whole.notes, *notes, CONDITIONS),
     )
 
 
@@ -336,8 +335,8 @@ def _noted(report: IdentifiabilityReport, part: Problem) -> IdentifiabilityRepor
     signs = tuple(f"{mine}: {s}" for s in report.misspecification.signs)
     return replace(
         report,
-        notes=(first, *(f"{mine}: {n}" for n in report.notes)),
+        notes=(first, *(f"{mine}: {n}" for n in report.notes if n != CONDITIONS)),
         misspecification=replace(report.misspecification, signs=signs),
-        pilot={"groups": [{"parameters": list(report.parameters), **report.pilot}]},
+        pilot=Pilot(groups=(replace(report.pilot, parameters=tuple(report.parameters)),)),
         sensitivities=None,  # of a model that the groups share
     )

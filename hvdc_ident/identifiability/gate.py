@@ -6,13 +6,15 @@ standard deviation, those on a bound with a one-sided limit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from hvdc_ident.errors import require_known
-from hvdc_ident.fit import Estimate, FitResult, Problem, StartOutcome
+from hvdc_ident.fit import Estimate, FitResult, Problem
+from hvdc_ident.identifiability.report import Held, IdentifiabilityReport
+from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.next_step import NextStep
 
 
 @dataclass(frozen=True)
@@ -24,30 +26,29 @@ class Gate:
     """
 
     fitted: tuple[str, ...]
-    held: FrozenMap[tuple[float, str]]
+    held: FrozenMap[Held]
     conditional_on: FrozenMap[tuple[str, ...]]
     forced: tuple[str, ...] = ()
 
 
-def gate(report: Mapping[str, Any], force: Sequence[str] = (), *, diagnosis: bool = False) -> Gate:
-    """Return the gate that a report, as its `to_dict` or its JSON, sets up; `force` names parameters to fit all the same.
+def gate(report: IdentifiabilityReport, force: Sequence[str] = (), *, diagnosis: bool = False) -> Gate:
+    """Return the gate that a report sets up; `force` names parameters to fit all the same.
 
     diagnosis: free too what is not judged for the misfit alone: a parameter held at a wrong value is a gap of
     its own, and would be named as an effect.
     Raises UnknownNameError for a forced name that is no candidate.
     """
-    parameters = report["parameters"]
+    parameters = report.parameters
     require_known("candidate", force, parameters, where="force")
-    selectable = {*report["identifiable"], *(report.get("not_judged", ()) if diagnosis else ())}
+    selectable = {*report.identifiable, *(report.not_judged if diagnosis else ())}
     forced = tuple(n for n in parameters if n in force and n not in selectable)
     fitted = tuple(n for n in parameters if n in selectable or n in forced)
     held = {}
-    for n, h in report["held"].items():
-        unit = f" {parameters[n]['unit']}" if parameters[n].get("unit") else ""
+    for n, h in report.held.items():
         if n not in fitted:
-            reason = f"{parameters[n]['verdict']}, held at {h['value']:.6g}{unit}: {h['reason']}"
-            held[n] = (float(h["value"]), reason)
-    given = {n: tuple(c for c in parameters[n]["conditional_on"] if c in held) for n in fitted}
+            at = f"{h.value:.6g} {parameters[n].unit}".rstrip()
+            held[n] = Held(h.value, f"{parameters[n].verdict}, held at {at}: {h.reason}")
+    given = {n: tuple(c for c in parameters[n].conditional_on if c in held) for n in fitted}
     return Gate(fitted, FrozenMap(held), FrozenMap({n: c for n, c in given.items() if c}), forced)
 
 
@@ -56,26 +57,15 @@ def gated(problem: Problem, selection: Gate) -> Problem:
     return replace(
         problem,
         free=tuple(f for f in problem.free if f.name in selection.fitted),
-        held=problem.held | {n: v for n, (v, _) in selection.held.items()},
-        why=problem.why | {n: why for n, (_, why) in selection.held.items()},
+        held=problem.held | {n: h.value for n, h in selection.held.items()},
+        why=problem.why | {n: h.reason for n, h in selection.held.items()},
         conditional_on=problem.conditional_on | selection.conditional_on,
     )
 
 
-def searched(report: Mapping[str, Any], names: Sequence[str]) -> tuple[StartOutcome, ...]:
-    """Return the outcomes of the report's search over these parameters, for a fit of them to take up; none where it made none.
-
-    Of a report by groups those of the group that has them.
-    """
-    pilot = report.get("pilot") or {}
-    pilots = pilot.get("groups") or [pilot]
-    found = (p["ends"] for p in pilots if p.get("ends") and set(names) <= set(p.get("parameters", names)))
-    return tuple(StartOutcome.of(line) for line in next(found, ()))
-
-
 def gated_fit(
     problem: Problem,
-    report: Mapping[str, Any],
+    report: IdentifiabilityReport,
     fit: Callable[[Problem], FitResult],
     *,
     force: Sequence[str] = (),
@@ -83,7 +73,7 @@ def gated_fit(
 ) -> FitResult:
     """Return the fit of the identifiable set, its estimates as the report allows them to be stated.
 
-    report: `IdentifiabilityReport.to_dict()`. fit: does the fit it is given. Weak and local parameters get the profile's
+    fit: does the fit it is given. Weak and local parameters get the profile's
     interval and no std; those at a bound stand at it with their one-sided limit; forced ones are marked.
     whole: the fit is of all data at once, as the report's profiles are; else only weak ones take theirs.
     Where nothing is left to fit the status is "failed" and the message says so. One that is held on a bound makes the
@@ -91,16 +81,17 @@ def gated_fit(
     """
     selection = gate(report, force)
     if not selection.fitted:
-        reasons = FrozenMap({n: why for n, (_, why) in selection.held.items()})
-        values = FrozenMap({n: v for n, (v, _) in selection.held.items()})
+        said = ", ".join(f"{n} is {v.verdict}" for n, v in report.parameters.items())
+        diagnosis = (NextStep("diagnose"),) if report.not_judged else ()
         return FitResult(
             "failed",
-            _nothing_to_fit(report),
+            f"no candidate can be estimated from these data: {said}",
             (),
-            reasons,
-            values,
+            FrozenMap({n: h.reason for n, h in selection.held.items()}),
+            FrozenMap({n: h.value for n, h in selection.held.items()}),
             estimates=_at_bound(report, selection),
             rmse_given=problem.rmse_given,
+            next=(*diagnosis, NextStep("identify"), NextStep("force")),
         )
     result = fit(gated(problem, selection))
     if result.status == "failed":
@@ -110,7 +101,7 @@ def gated_fit(
         n: e if systematic else _stated(n, e, report, selection, whole=whole) for n, e in result.estimates.items()
     }
     on_bound = _at_bound(report, selection)
-    ordered = {n: {**estimates, **on_bound}.get(n) for n in report["parameters"]}
+    ordered = {n: {**estimates, **on_bound}.get(n) for n in report.parameters}
     stated = FrozenMap({n: e for n, e in ordered.items() if e is not None})
     # What is held on a bound was given elsewhere: before the fit it stood there.
     before = problem.rmse_given if on_bound else result.rmse_given
@@ -121,33 +112,18 @@ def gated_fit(
     return replace(result, status="at-bound", message=f"{result.message}; {held}")
 
 
-def _nothing_to_fit(report: Mapping[str, Any]) -> str:
-    """Return the message: every candidate with its verdict, and what to do."""
-    said = ", ".join(f"{n} is {line['verdict']}" for n, line in report["parameters"].items())
-    unjudged = report.get("not_judged", ())
-    diagnose = (
-        f"{', '.join(unjudged)} may be once the misfit is explained: run `hvdc-ident diagnose STUDY`; "
-        if unjudged
-        else ""
-    )
-    return (
-        f"no candidate can be estimated from these data: {said}. Try: {diagnose}`hvdc-ident identify STUDY` says why and "
-        "what to measure next; --force NAME fits one all the same"
-    )
-
-
-def _stated(name: str, e: Estimate, report: Mapping[str, Any], selection: Gate, *, whole: bool) -> Estimate:
+def _stated(name: str, e: Estimate, report: IdentifiabilityReport, selection: Gate, *, whole: bool) -> Estimate:
     """Return an estimate in the form its verdict allows."""
-    line = report["parameters"][name]
+    line = report.parameters[name]
     if name in selection.forced:
-        return replace(e, reason=f"forced, against the report: {line['verdict']}. {line['reason']}")
+        return replace(e, reason=f"forced, against the report: {line.verdict}. {line.reason}")
     interval = _interval(line)
-    weak = line["verdict"] == "weak" or (line.get("std") is None)
+    weak = line.verdict == "weak" or line.std is None
     other_set = bool(selection.forced) or not whole
     if interval is None or (other_set and not weak):
         return replace(e, std=None, std_raw=None) if weak else e
-    if line["verdict"] == "locally-identifiable" and not interval[0] <= e.value <= interval[1]:
-        return replace(e, reason=f"at another optimum than the report's. {line['reason']}")
+    if line.verdict == "locally-identifiable" and not interval[0] <= e.value <= interval[1]:
+        return replace(e, reason=f"at another optimum than the report's. {line.reason}")
     if not interval[0] <= e.value <= interval[1]:
         return (
             replace(e, std=None, std_raw=None, ci95=None, method="none", reason="the fit and the pilot fit disagree")
@@ -155,29 +131,22 @@ def _stated(name: str, e: Estimate, report: Mapping[str, Any], selection: Gate, 
             else e
         )
     if not weak:
-        return replace(e, std=line["std"], ci95=interval, method="profile")
+        return replace(e, std=line.std, ci95=interval, method="profile")
     note = " (its interval is that of the report's own fit, of all data and without forced ones)" if other_set else ""
     return replace(
-        e, std=None, std_raw=None, ci95=interval, method="profile", reason=f"{line['verdict']}: {line['reason']}{note}"
+        e, std=None, std_raw=None, ci95=interval, method="profile", reason=f"{line.verdict}: {line.reason}{note}"
     )
 
 
-def _interval(line: Mapping[str, Any]) -> tuple[float, float] | None:
-    ci = line.get("ci95")
-    return (float(ci[0]), float(ci[1])) if ci and ci[0] is not None and ci[1] is not None else None
+def _interval(line: Verdict) -> tuple[float, float] | None:
+    low, high = line.ci95 or (None, None)
+    return None if low is None or high is None else (low, high)
 
 
-def _at_bound(report: Mapping[str, Any], selection: Gate) -> FrozenMap[Estimate]:
+def _at_bound(report: IdentifiabilityReport, selection: Gate) -> FrozenMap[Estimate]:
     """Return the held ones that stand on a bound, with their one-sided limit."""
     found = {}
-    for n, line in report["parameters"].items():
-        if line["verdict"] == "at-bound" and n in selection.held:
-            found[n] = Estimate(
-                float(line["value"]),
-                None,
-                _interval(line),
-                "one-sided",
-                unit=line.get("unit", ""),
-                reason=line["reason"],
-            )
+    for n, line in report.parameters.items():
+        if line.verdict == "at-bound" and n in selection.held:
+            found[n] = Estimate(line.value, None, _interval(line), "one-sided", unit=line.unit, reason=line.reason)
     return FrozenMap(found)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 from scipy.special import stdtrit
 
+from hvdc_ident.codec import stored_as
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
@@ -208,7 +209,7 @@ class OtherOptimum:
     """An optimum as good as the best within the noise. values: by unknown, in its unit; rise: of the cost above the best."""
 
     values: FrozenMap[float]
-    rise: float
+    rise: float = field(metadata=stored_as("cost_rise"))
 
 
 def other_optima(

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from scipy.special import chdtrc
@@ -18,6 +19,7 @@ from hvdc_ident.fit.adequacy import LEVEL
 from hvdc_ident.fit.uncertainty import TWO_SIDED, score_covariance
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.sensitivity import independent, normalised, pivoted_order, standard_deviations
 from hvdc_ident.text import percentage, span, times_text
 
@@ -98,17 +100,27 @@ def _stacked(optimum: LocalAnalysis, names: list[str]) -> tuple[Array, list[Arra
 
 @dataclass(frozen=True)
 class Misspecification:
-    """Verdict on the model: flag, true where it lacks something; the signs of it in words; what to run next."""
+    """Signs in words that the model lacks something, and the test of whether the experiments agree, by parameter."""
 
-    flag: bool
-    signs: tuple[str, ...]
-    pointer: str = ""
+    signs: tuple[str, ...] = ()
+    heterogeneity: FrozenMap[Heterogeneity] = field(default_factory=FrozenMap)
+    stored_properties: ClassVar[tuple[str, ...]] = ("next",)
+
+    @property
+    def flag(self) -> bool:
+        """True where the model lacks something."""
+        return bool(self.signs)
+
+    @property
+    def next(self) -> NextStep | None:
+        """The diagnosis, which looks for what the model lacks; None where nothing shows that it does."""
+        return NextStep("diagnose") if self.signs else None
 
 
 def misspecification(
     optimum: LocalAnalysis, tests: FrozenMap[Heterogeneity], units: dict[str, str]
 ) -> Misspecification:
-    """Return the flag and its reasons: experiments that disagree on a parameter, or residuals larger than the noise given.
+    """Return the signs: experiments that disagree on a parameter, or residuals larger than the noise given.
 
     LEVEL is that of the test of all parameters together (Bonferroni). With noise of 1e-4 everything is significant: so each sign is
     given with its size, in the parameter's unit.
@@ -123,8 +135,7 @@ def misspecification(
             )
     if optimum.excess > 1.0:
         signs.append(f"the residuals are {times_text(float(np.sqrt(optimum.excess)))} the noise")
-    pointer = "the model may lack an effect; hvdc-ident diagnose STUDY looks for it" if signs else ""
-    return Misspecification(bool(signs), tuple(signs), pointer)
+    return Misspecification(tuple(signs), tests)
 
 
 def noise_half_widths(whole: LocalAnalysis, fitted: Sequence[str], others: Sequence[str]) -> dict[str, float]:

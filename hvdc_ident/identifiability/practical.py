@@ -181,7 +181,7 @@ def _profile_of_instant(instant: PlacedInstant, value: float) -> Profile:
     """Return the profile of a parameter that moves an instant: it ends where the instant passes a row, or before."""
     values, rises, thetas = (np.array(column) for column in zip(*instant.points, strict=True))
     lower, upper = Side("closed", instant.low), Side("closed", instant.high)
-    return Profile(instant.name, value, lower, upper, values, rises, thetas, instant.rise)
+    return Profile(instant.name, value, lower, upper, values, rises, instant.rise, thetas=thetas)
 
 
 def without_insensitive(assessment: Assessment, optimum: LocalAnalysis) -> LocalAnalysis | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -132,14 +132,15 @@ class StructuralAnalysis:
     sensitivities' error. points: how many points of the numerical method could be simulated.
     """
 
-    status: str
-    method: str
-    admissible: tuple[str, ...]
+    status: str = "not decided"
+    method: str = ""
+    admissible: tuple[str, ...] = ()
     combinations: tuple[Combination, ...] = ()
     note: str = ""
     unmoved: tuple[str, ...] = ()
     moving: tuple[str, ...] = ()
     points: int = 0
+    stored_properties: ClassVar[tuple[str, ...]] = ("unidentifiable",)
 
     @property
     def local(self) -> bool:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from hvdc_ident.codec import NOT_STORED
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.profile import Profile
 from hvdc_ident.text import figures_of, quantity, span, times_text
@@ -55,9 +56,14 @@ class Verdict:
     collinearity: float | None = None
     partner: str = ""
     conditional_on: tuple[str, ...] = ()
-    profile: Profile | None = None
+    profile: Profile | None = field(default=None, metadata=NOT_STORED)
     scale: float | None = None
     optima: tuple[float, ...] = ()
+
+    @property
+    def interval(self) -> tuple[float | None, float | None] | None:
+        """The 95 % interval, `ci95`."""
+        return self.ci95
 
     def noted(self, *notes: str) -> Verdict:
         """Return the verdict with remarks added to its reason."""

@@ -393,7 +393,8 @@ def compare(first: LinearModel, second: LinearModel) -> ModelDistance:
     Every number depends on units: scale both first (`LinearModel.scaled`) so that 1 matters equally in each channel.
     Raises LinearizationError where the numbers of inputs or outputs differ.
 
-    >>> from hvdc_ident import compare, linearize, load_model
+    >>> from hvdc_ident import linearize, load_model
+    >>> from hvdc_ident.linear import compare
     >>> link = load_model("vsc-hvdc-link")
     >>> channel = {"inputs": "Vdcref1", "outputs": "Vdc1"}
     >>> other = linearize(link.with_values({"KIVDC": 500.0}), **channel)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.codec import read_fields
 from hvdc_ident.display import Shown, Table, data_frame, first_rows
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.linearize.system import Array
@@ -16,6 +17,18 @@ if TYPE_CHECKING:
     import xarray
 
     from hvdc_ident.linearize.linear_model import LinearModel
+
+
+@dataclass(frozen=True, eq=False)
+class _Lists:
+    """A frequency response as JSON has it: real and imaginary part, (n, outputs, inputs)."""
+
+    omega: Array
+    outputs: tuple[str, ...]
+    inputs: tuple[str, ...]
+    real: Array
+    imag: Array
+    source: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,6 +125,12 @@ class FrequencyResponse(Shown):
             "imag": self.values.imag.tolist(),
             "source": self.source,
         }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> FrequencyResponse:
+        """Return the response that `to_dict` wrote, without units. Raises InputError for anything else."""
+        found = read_fields(_Lists, data)
+        return cls(found.omega, found.real + 1j * found.imag, found.outputs, found.inputs, source=found.source)
 
 
 def transfer(model: LinearModel, s: Array) -> Array:

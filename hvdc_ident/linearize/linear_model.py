@@ -389,6 +389,13 @@ class LinearModel(Shown):
 
         return to_dict(self)
 
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> LinearModel:
+        """Return the model that `to_dict` wrote, without its operating point. Raises ModelError for anything else."""
+        from hvdc_ident.linearize.export.json_text import from_dict
+
+        return from_dict(dict(data))
+
 
 def _eigenvalue(value: complex) -> str:
     """Return an eigenvalue as text, its conjugate with it."""

@@ -119,7 +119,8 @@ def loop(
 
     point: of the closed model; default, its steady state.
 
-    >>> from hvdc_ident import load_model, loop, margins
+    >>> from hvdc_ident import load_model
+    >>> from hvdc_ident.linear import loop, margins
     >>> opened = loop(load_model("vsc-hvdc-link"), "Irorder1")
     >>> round(margins(opened).phase_margin.value, 1)
     65.3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hvdc_ident.fit.uncertainty import MOVED
+from hvdc_ident.next_step import next_sentence
 from hvdc_ident.report.html import badge, estimate, number, prose, table, table_of, text, typeset
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
@@ -13,7 +14,6 @@ from hvdc_ident.summary.phrases import (
     condition,
     finding_name,
     interval_name,
-    next_sentence,
     not_judged,
     place_texts,
     remainder_sentence,

@@ -6,12 +6,13 @@ Collinear subsets, null directions, inflation and the order in which parameters 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 
+from hvdc_ident.codec import stored_as
 from hvdc_ident.data import Array
 from hvdc_ident.immutable import FrozenMap
 
@@ -139,7 +140,7 @@ def inflation_index(matrix: Array) -> Array:
 class Collinear:
     """A set of parameters and its collinearity index."""
 
-    names: tuple[str, ...]
+    names: tuple[str, ...] = field(metadata=stored_as("parameters"))
     index: float
 
 

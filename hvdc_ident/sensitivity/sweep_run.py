@@ -12,10 +12,12 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from hvdc_ident.codec import read_fields
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.errors import ComputationError, require_known, unknown_name
@@ -41,6 +43,57 @@ if TYPE_CHECKING:
 
 
 # --- result ---
+
+
+@dataclass(frozen=True)
+class _Swept:
+    """A parameter in sweep.json."""
+
+    unit: str
+    base: float
+    kind: Literal["grid", "log", "list", "latin-hypercube"]
+    points: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A point in sweep.json."""
+
+    values: Mapping[str, float]
+    rmse: Mapping[str, Mapping[str, float | None]]
+    status: str
+    reason: str = ""
+    poles: NDArray[np.complex128] | None = None
+    bode: Mapping[str, Mapping[str, NDArray[np.complex128]]] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class _Told:
+    """The sweep.json that a sweep writes."""
+
+    parameters: Mapping[str, _Swept]
+    against: str
+    units: Mapping[str, str]
+    wanted: tuple[str, ...]
+    points: tuple[_Point, ...]
+    omega: Array = field(default_factory=lambda: np.zeros(0))
+
+
+def _axes_of(parameters: Mapping[str, _Swept], values: Array) -> tuple[Samples, ...]:
+    """Return the axes whose product the rows of values are; the parameters of a Latin hypercube move together."""
+    groups: list[tuple[str, ...]] = []
+    for name, p in parameters.items():
+        if groups and p.kind == parameters[groups[-1][-1]].kind == "latin-hypercube":
+            groups[-1] = (*groups[-1], name)
+        else:
+            groups.append((name,))
+    axes, repeat, names = [], len(values), list(parameters)
+    for group in groups:
+        length = parameters[group[0]].points
+        repeat //= max(length, 1)
+        columns = [names.index(n) for n in group]
+        axes.append(Samples(group, values[: length * repeat : max(repeat, 1), columns], parameters[group[0]].kind))
+    return tuple(axes)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -138,7 +191,8 @@ class SweepResult(Shown):
             for b, o in enumerate(outputs)
         }
 
-    def summary(self) -> dict[str, Any]:
+    @property
+    def heading(self) -> dict[str, Any]:
         """Return the part of sweep.json beside the points: parameters with axis and base, units, what was compared, failures."""
         kinds = {n: a for a in self.axes for n in a.names}
         return {
@@ -156,7 +210,44 @@ class SweepResult(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """The sweep as sweep.json has it, without its heading."""
-        return {**self.summary(), "points": list(self.rows())}
+        return {**self.heading, "points": list(self.rows())}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> SweepResult:
+        """Return the sweep that `to_dict` wrote, or that a sweep.json holds. Raises InputError for anything else."""
+        told = read_fields(_Told, data)
+        rows, names = told.points, list(told.parameters)
+        values = np.array([[p.values[n] for n in names] for p in rows], dtype=float).reshape(len(rows), len(names))
+        first = rows[0] if rows else _Point({}, {}, "done")
+        series = tuple((o, e) for o, line in first.rmse.items() for e in line)
+        whole = next((p for p in rows if p.bode is not None), first)
+        channels = (tuple(next(iter((whole.bode or {}).values()), {})), tuple(whole.bode or {}))
+        modes = max((p.poles.size for p in rows if p.poles is not None), default=0)
+        shape = (told.omega.size, len(channels[1]), len(channels[0]))
+        poles = [p.poles if p.poles is not None else np.full(modes, np.nan) for p in rows]
+        response = [
+            np.full(shape, np.nan)
+            if p.bode is None
+            else np.array([[p.bode[o][i] for i in channels[0]] for o in channels[1]]).transpose(2, 0, 1)
+            for p in rows
+        ]
+        rmse = [[np.nan if (v := p.rmse[o][e]) is None else v for o, e in series] for p in rows]
+        return cls(
+            str(data.get("model", "")),
+            _axes_of(told.parameters, values),
+            FrozenMap({n: p.unit for n, p in told.parameters.items()}),
+            series,
+            tuple(told.units.get(o, "") for o, _ in series),
+            told.against,
+            FrozenMap({n: p.base for n, p in told.parameters.items()}),
+            np.array(rmse, dtype=float).reshape(len(rows), len(series)),
+            np.array(poles, dtype=complex).reshape(len(rows), modes),
+            told.omega,
+            np.array(response, dtype=complex).reshape(len(rows), *shape),
+            channels,
+            {k: p.reason for k, p in enumerate(rows) if p.status == "failed"},
+            told.wanted,
+        )
 
     def to_csv(self) -> str:
         """CSV text, one row a point: parameters, rmse.OUTPUT.EXPERIMENT, status, reason; every digit of every number.

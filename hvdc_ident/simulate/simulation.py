@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.codec import read_fields
 from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import require_known
@@ -45,6 +46,14 @@ class Statistics:
     evaluations: int
     segments: int
     forced: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Beside:
+    """What the JSON of a simulation has beside its outputs."""
+
+    sensitivities: Mapping[str, Mapping[str, Array]]
+    statistics: Statistics
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,3 +126,12 @@ class Simulation(Shown):
             "sensitivities": derivatives if self.parameters else {},
             "statistics": self.statistics.__dict__,
         }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Simulation:
+        """Return the simulation that `to_dict` wrote, without its notes. Raises InputError for anything else."""
+        table, beside = Trajectory.from_dict(data), read_fields(_Beside, data)
+        by_output = [list(beside.sensitivities.get(o, {}).values()) for o in table.names]
+        parameters = tuple(next(iter(beside.sensitivities.values()), {}))
+        gradients = np.reshape(by_output, (len(table.names), len(parameters), table.time.size)).transpose(2, 0, 1)
+        return cls(table, parameters, gradients, beside.statistics)

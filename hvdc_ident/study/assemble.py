@@ -19,9 +19,11 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.models import is_shipped, load_model
 from hvdc_ident.parameters import Parameter
+from hvdc_ident.toml_tables import validated
 
 if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult
+    from hvdc_ident.study.schema import ParameterTable
     from hvdc_ident.study.study import Study
 
 ModelLike: TypeAlias = "AnyModel | Study | str | Path"
@@ -184,7 +186,7 @@ def _fitting(e: Experiment, model: AnyModel) -> Experiment:
     return e.with_(measured=replace(table, units=tuple(model.outputs[o].unit for o in table.names)))
 
 
-def lines_of(parameters: ParametersLike, model: AnyModel) -> dict[str, dict[str, Any]]:
+def lines_of(parameters: ParametersLike, model: AnyModel, where: str) -> dict[str, ParameterTable]:
     """Return the lines of a study's [parameters] that are meant.
 
     A name alone is estimated from the model's value within the model's bounds. (min, max) are bounds; where the model's value
@@ -209,7 +211,7 @@ def lines_of(parameters: ParametersLike, model: AnyModel) -> dict[str, dict[str,
                 f"'{name}' is an input, not a parameter", where="parameters", hint="an experiment's inputs"
             )
     require_known("parameter", parameters, model.parameters, f"model '{model.name}'")
-    return {name: _line(name, given, model.parameters[name].value) for name, given in parameters.items()}
+    return {name: _line(name, given, model.parameters[name].value, where) for name, given in parameters.items()}
 
 
 def _named(item: Any) -> tuple[str, Any]:
@@ -235,19 +237,22 @@ def _no_parameter(given: Any) -> StudyError:
     )
 
 
-def _line(name: str, given: Any, value: float) -> dict[str, Any]:
+def _line(name: str, given: Any, value: float, where: str) -> ParameterTable:
     """Return one line of [parameters]. Raises StudyError for what is none."""
+    from hvdc_ident.study.schema import ParameterTable
+
     if given is None:
-        return {}
+        return ParameterTable()
     if isinstance(given, Parameter):
         given = {"start": given.value, "min": given.min, "max": given.max}
     elif hasattr(given, "start") and hasattr(given, "given"):  # a parameter of a fit
         given = {k: getattr(given, k) for k in ("start", "min", "max", "given")}
     if isinstance(given, Mapping):
         numbers = {k: float(v) for k, v in given.items() if _is_number(v)}
-        return {k: numbers.get(k, v) for k, v in given.items() if np.isfinite(numbers.get(k, 0.0))}
+        line = {k: numbers.get(k, v) for k, v in given.items() if np.isfinite(numbers.get(k, 0.0))}
+        return validated(ParameterTable, line, f"{where}, parameters.{name}", StudyError)
     if _is_number(given):
-        return {"start": float(given)}
+        return ParameterTable(start=float(given))
     pair = list(given) if isinstance(given, Sequence | np.ndarray) and not isinstance(given, str) else []
     if len(pair) != 2 or not all(map(_is_number, pair)):
         raise StudyError(
@@ -265,8 +270,9 @@ def _line(name: str, given: Any, value: float) -> dict[str, Any]:
             got=f"({low:g}, {high:g})",
             hint=f"({high:g}, {low:g})" if high < low else "leave it out if it is not to move",
         )
-    bounds = {k: v for k, v in (("min", low), ("max", high)) if np.isfinite(v)}
-    return bounds if low <= value <= high else bounds | {"start": float(np.clip(0.5 * (low + high), low, high))}
+    line = {k: v for k, v in (("min", low), ("max", high)) if np.isfinite(v)}
+    line |= {} if low <= value <= high else {"start": float(np.clip(0.5 * (low + high), low, high))}
+    return ParameterTable.model_validate(line)
 
 
 def _is_number(value: Any) -> bool:
@@ -282,8 +288,8 @@ def study_of(
     Raises InputError: StudyError, UnknownNameError or WaveformError.
     """
     from hvdc_ident.study.checks import check_questions
-    from hvdc_ident.study.parse import checked
     from hvdc_ident.study.recordings import with_noise
+    from hvdc_ident.study.schema import TABLES, ModelTable, StudyFile
     from hvdc_ident.study.study import Study, candidates_of, load_study, with_nuisances, with_unknowns
 
     found = subject_of(subject)
@@ -294,13 +300,14 @@ def study_of(
     if source is None and isinstance(data, Study):
         source, data = replace(data, model=model), None
     where = source.path.name if source else model.name
-    base: dict[str, Any] = {"schema": 1, "model": {"source": model.name}}
-    if source:
-        base = source.settings.model_dump(by_alias=True, exclude_unset=True)
-    if parameters is not None:
-        base["parameters"] = lines_of(parameters, model)
-    base |= {table: {**(base.get(table) or {}), **keys} for table, keys in tables.items() if keys}
-    settings = checked(base, where)
+    settings = source.settings if source else StudyFile.model_validate({"schema": 1, "model": ModelTable(source=model.name)})
+    changes: dict[str, Any] = {} if parameters is None else {"parameters": lines_of(parameters, model, where)}
+    for name, keys in tables.items():
+        if keys:
+            own = getattr(settings, name)
+            whole = {**(own.model_dump(by_alias=True, exclude_unset=True) if own else {}), **keys}
+            changes[name] = validated(TABLES[name], whole, f"{where}, {name}", StudyError)
+    settings = settings.model_copy(update=changes)
     if parameters is not None or source is None:
         model = with_unknowns(settings, model, where)
         candidates = candidates_of(settings, model, where)

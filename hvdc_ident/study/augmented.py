@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.effects import apply_effects
+from hvdc_ident.codec import plain
+from hvdc_ident.discrepancy.result import FoundEffect, Rival
+from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.errors import ComputationError
-from hvdc_ident.files import plain
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.noise import MISFIT, source_of, source_text
@@ -26,23 +27,22 @@ if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
 
-def augmented_model(study: Study, diagnosis: Mapping[str, Any], folder: Path) -> AnyModel:
-    """Return the model with what a diagnosis put in, at its values. diagnosis: its JSON; folder: where its files stand.
+def augmented_model(study: Study, diagnosis: Diagnosis, folder: Path) -> AnyModel:
+    """Return the model with what a diagnosis put in, at its values. folder: where its files stand.
 
     It is the card that the diagnosis wrote; an FMU, which has none, gets the effects anew.
     """
-    card = diagnosis.get("augmented_model")
-    if card:
-        return read_card(folder / Path(str(card)).name)
-    own = {n: float(v) for n, v in diagnosis["parameters_after"].items() if n in study.model.parameters}
-    return apply_effects(study.model.with_values(own), [use_of(e) for e in diagnosis["effects"]])
+    if diagnosis.augmented_model:
+        return read_card(folder / Path(diagnosis.augmented_model).name)
+    own = {n: v for n, v in diagnosis.parameters_after.items() if n in study.model.parameters}
+    return apply_effects(study.model.with_values(own), [use_of(e) for e in diagnosis.effects])
 
 
-def use_of(effect: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an effect of the results as `apply_effects` and a study's [[model.effect]] take it."""
-    values = {n: p["value"] if isinstance(p, Mapping) else p for n, p in (effect.get("parameters") or {}).items()}
-    more = {k: effect[k] for k in ("from", "expression") if effect.get(k)}
-    return {"effect": effect["effect"], "at": effect["at"], "parameters": values, **more}
+def use_of(effect: FoundEffect | Rival) -> EffectUse:
+    """Return an effect of the results as `apply_effects` takes it, at its sizes."""
+    sizes = {n: p if isinstance(p, float) else p.value for n, p in effect.parameters.items()}
+    expression = "" if isinstance(effect, FoundEffect) else effect.expression
+    return EffectUse(effect.effect, effect.at, FrozenMap(sizes), source=effect.source, expression=expression)
 
 
 def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -116,9 +116,7 @@ def _estimates(
 
 def _estimate(found: Diagnosis, name: str, estimate: dict[str, Any]) -> dict[str, Any]:
     """Return an estimate; without a value where that depends on what is missing, with those by place instead."""
-    from hvdc_ident.discrepancy.result import as_line
-
-    depend = [as_line(v) for v in found.values_by_place.get(name, ())]
+    depend = plain(found.values_by_place.get(name, ()))
     if not depend:
         return estimate
     why = "it depends on which of the likely effects and places is the true one"

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hvdc_ident.codec import plain
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import InputError
-from hvdc_ident.files import plain
 from hvdc_ident.report.comparison import comparison_page
 from hvdc_ident.study.stages import Stage, stages
 from hvdc_ident.summary import Results, RunSummary

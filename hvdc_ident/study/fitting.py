@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,13 +13,12 @@ import sympy as sp
 from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.files import csv_columns
 from hvdc_ident.fit import FitResult, Group, Problem, StartOutcome, fit, fit_each, fit_individually
-from hvdc_ident.fit.judgement import judge
+from hvdc_ident.fit.judgement import Judgements, judge
 from hvdc_ident.fit.likelihood import loss
 from hvdc_ident.fit.partial_fits import part_of
 from hvdc_ident.fit.residual import Curve, compared_rows
 from hvdc_ident.fit.tolerance_profile import tolerance
 from hvdc_ident.identifiability import gated_fit
-from hvdc_ident.identifiability.gate import searched
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.checks import need_candidates, need_experiments, need_start
@@ -30,6 +29,7 @@ from hvdc_ident.study.study import priors
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment, Trajectory
     from hvdc_ident.executor import Executor, Progress
+    from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
 
 
@@ -83,18 +83,18 @@ def need(study: Study, stage: str) -> None:
 
 def estimated(
     study: Study,
-    report: Mapping[str, Any],
+    report: IdentifiabilityReport,
     *,
     force: Sequence[str] = (),
     seed: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> FitResult:
-    """Return the fit of the candidates that a report, as its `to_dict`, calls identifiable, and of those that are forced."""
+    """Return the fit of the candidates that a report calls identifiable, and of those that are forced."""
 
     def fit_of(open_set: Problem) -> FitResult:
         settled = with_settings(study, open_set)
-        return fitted(study, settled, partial(searched, report), seed=seed, executor=executor, progress=progress)
+        return fitted(study, settled, report.pilot.ends_over, seed=seed, executor=executor, progress=progress)
 
     return gated_fit(problem_of(study), report, fit_of, force=force, whole=as_reported(study))
 
@@ -166,12 +166,11 @@ def curves_of_run(experiment: Experiment, run: Trajectory) -> dict[str, Curve]:
 
 def judgement_of(
     study: Study, sets: Mapping[str, Mapping[str, Mapping[str, Curve]]], result: FitResult | None = None
-) -> dict[str, Any]:
-    """Return whether the model follows the recordings, as a stage's JSON says it, by set of values.
+) -> Judgements:
+    """Return whether the model follows the recordings, by set of values.
 
     sets: by name, the curves of every output by experiment and output. result: the fit that gave the curves named "fitted", whose own
-    judgement of the residuals then holds. Beside each `Judgement`: the tolerance that the study states, by output, and the profile of
-    the windows; its `named` says whether the study names it.
+    judgement of the residuals then holds.
     """
     asked, stated = asked_of(study), study.settings.diagnose
     profile = tolerance(asked.tolerance, study.path.parent)
@@ -179,15 +178,15 @@ def judgement_of(
     named = "tolerance" in asked.model_fields_set
     units = {n: o.unit for n, o in study.model.outputs.items()}
     sizes = result.adequacy.signals if result is not None and result.adequacy is not None else {}
-    found: dict[str, Any] = {}
+    found = {}
     for name, runs in sets.items():
         recorded = {e.name: runs[e.name] for e in study.experiments if e.name in runs}
         own = sizes if name == "fitted" else {}
         found[name] = judge(
             recorded, study.experiments, units, profile, tolerance=tolerances, named=named, sizes=own
-        ).to_dict()
+        )
     head = {k: getattr(profile, k) for k in ("name", "version", "title", "source", "notes", "unit")}
-    return {"tolerance": tolerances, "profile": {**head, "named": named}, "sets": found}
+    return Judgements(tolerances, {**head, "named": named}, found)
 
 
 def curves_at_given(study: Study) -> dict[str, dict[str, Curve]]:

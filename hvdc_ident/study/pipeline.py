@@ -11,9 +11,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hvdc_ident.codec import plain
 from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.executor import Progress, StageProgress
-from hvdc_ident.files import digest, json_pieces, json_text, plain, write_text
+from hvdc_ident.files import digest, json_pieces, json_text, write_text
 from hvdc_ident.model import Model
 from hvdc_ident.study.checks import steady_notes, violations
 from hvdc_ident.study.executors import open_executor

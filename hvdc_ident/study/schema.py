@@ -677,3 +677,7 @@ class StudyFile(TomlTable):
     fit: FitTable | None = optional("How the parameters are estimated.", "[fit]")
     diagnose: DiagnoseTable | None = optional("How the effects that the model lacks are searched for.", "[diagnose]")
     letter: LetterTable | None = optional("Author, addressee and plant of the letter. No result depends on it.", "[letter]")
+
+
+TABLES: dict[str, type[TomlTable]] = {"identifiability": IdentifiabilityTable, "fit": FitTable, "diagnose": DiagnoseTable}
+"""Tables of stages whose keys a call in Python may give."""

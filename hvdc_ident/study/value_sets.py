@@ -7,18 +7,22 @@ estimated together with an effect, and the model with that effect. fitted: which
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
+from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.errors import StudyError
+from hvdc_ident.fit import FitResult
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
+from hvdc_ident.next_step import NextKind, NextStep
 from hvdc_ident.study.augmented import augmented_model
 from hvdc_ident.study.study import Study
 from hvdc_ident.summary.run_summary import Counting
-from hvdc_ident.summary.summarise import NO_ESTIMATES, counting_of
+from hvdc_ident.summary.stage_results import NO_ESTIMATES, diagnosis_of, fit_of
+from hvdc_ident.summary.summarise import counting_of
 from hvdc_ident.text import figures, listed, percentage
 
 SetName = Literal["given", "start", "fitted", "effect", "fit"]
@@ -57,10 +61,10 @@ def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> V
     if wanted is not None and wanted not in SETS:
         raise StudyError(
             "no such set of values",
-            where="--values",
+            where="values",
             expected=", ".join(SETS),
             got=repr(wanted),
-            hint="--values given: those the model came with; start: where a search begins; fitted: those that count of a fit "
+            hint="given: those the model came with; start: where a search begins; fitted: those that count of a fit "
             "and a diagnosis; effect: those with the effect that a diagnosis found; fit: those of the fit without one",
         )
     if wanted == "given":
@@ -94,12 +98,12 @@ def _asked(results: _Results, found: ValueSet | None, why: str) -> ValueSet:
     """The values that were asked for by name. Raises StudyError, with the reason, where there are none."""
     if found is not None:
         return found
-    command = "diagnose" if why == results.no_effect else "fit"
+    command: NextKind = "diagnose" if why == results.no_effect else "fit"
     raise StudyError(
         f"there are no {'values with an effect' if command == 'diagnose' else 'fitted values'}: {why}",
         where=results.study.path.name,
         expected=f"a finished {command} of the study and its files as they are now, in {results.folder}",
-        hint=f"hvdc-ident {command} {results.study.path}, or --values given",
+        next=(NextStep(command), NextStep("given")),
     )
 
 
@@ -110,14 +114,15 @@ def _given(study: Study, why: str = "") -> ValueSet:
 
 @dataclass(frozen=True)
 class _Results:
-    """The fit and the diagnosis that stand in a folder, as JSON, each empty where there is none, and why."""
+    """The fit and the diagnosis that stand in a folder, each None where there is none, and why; marks: their fingerprints."""
 
     study: Study
     folder: Path
-    fit: Mapping[str, Any]
+    fit: FitResult | None
     no_fit: str
-    diagnosis: Mapping[str, Any]
+    diagnosis: Diagnosis | None
     stale: str
+    marks: tuple[str, str]
 
     @classmethod
     def of(cls, study: Study, folder: Path) -> _Results:
@@ -125,11 +130,13 @@ class _Results:
         from hvdc_ident.study.pipeline import standing
 
         fit, no_fit = standing(study, "fit", folder)
-        if not no_fit and fit.get("status") in NO_ESTIMATES:
-            no_fit = f"the fit in {folder} ended as {fit['status']}: {fit.get('message', '')}"
+        result = None if no_fit else fit_of(fit)
+        if result is not None and result.status in NO_ESTIMATES:
+            no_fit, result = f"the fit in {folder} ended as {result.status}: {result.message}", None
         diagnosis, why = standing(study, "diagnose", folder)
-        stale = why if diagnosis else ""
-        return cls(study, folder, {} if no_fit else fit, no_fit, {} if why else diagnosis, stale)
+        diagnosed = None if why else diagnosis_of(diagnosis)
+        marks = (fit["fingerprint"] if result is not None else "", diagnosis["fingerprint"] if diagnosed is not None else "")
+        return cls(study, folder, result, no_fit, diagnosed, why if diagnosis else "", marks)
 
     @property
     def counts(self) -> Counting:
@@ -139,53 +146,55 @@ class _Results:
     @property
     def no_effect(self) -> str:
         """Why there are no values with an effect, where there are none."""
-        if not self.diagnosis:
+        if self.diagnosis is None:
             return self.stale or "no diagnose has run"
-        return f"the diagnosis in {self.folder} found none to put into the model ({self.diagnosis['verdict']})"
+        return f"the diagnosis in {self.folder} found none to put into the model ({self.diagnosis.verdict})"
 
     def fitted(self) -> tuple[ValueSet | None, str]:
         """Return the values that count, and why they are not to be taken unasked."""
         if not self.counts.name:
             return None, self.no_fit
         found = self.with_effect("fitted") if self.counts.name == "effect" else self.of_fit("fitted")
-        if self.fit.get("status") in NOT_BY_ITSELF:
-            end = f"the fit in {self.folder} ended as {self.fit['status']}: {self.fit['message']}"
+        if self.fit is not None and self.fit.status in NOT_BY_ITSELF:
+            end = f"the fit in {self.folder} ended as {self.fit.status}: {self.fit.message}"
             return found, f"{end}; --values fitted takes the best"
         return found, ""
 
     def of_fit(self, name: Literal["fitted", "fit"]) -> ValueSet:
         """Return the values of the fit, by that name."""
         study, fit, counts = self.study, self.fit, self.counts
-        values = study.given | {n: float(fit["values"][n]) for n in study.candidates if n in fit["values"]}
+        assert fit is not None
+        values = study.given | {n: fit.values[n] for n in study.candidates if n in fit.values}
+        how = _outcome(fit, list(study.candidates))
         if name == "fitted" and not counts.doubt:
-            note = f"fitted values of study '{study.name}' ({_outcome(fit)})"
+            note = f"fitted values of study '{study.name}' ({how})"
         else:
-            note = f"{'fitted values' if name == 'fitted' else 'fit values'} of study '{study.name}', without an effect ({_outcome(fit)})"
+            note = f"{'fitted values' if name == 'fitted' else 'fit values'} of study '{study.name}', without an effect ({how})"
         why = counts.doubt
         if counts.added:
             why += f"{'; ' if why else ''}--values effect takes those with {counts.added}"
         note += f": {why}" if why else ""
         note += f"; {self.stale}" if self.stale else ""
-        return ValueSet(name, values, note, "fit", fit["fingerprint"], self.diagnosis.get("fingerprint", ""))
+        return ValueSet(name, values, note, "fit", *self.marks)
 
     def with_effect(self, name: Literal["fitted", "effect"]) -> ValueSet:
         """Return the values fitted together with the effect, by that name, and the model that they hold in."""
         study, own = self.study, self.study.model.parameters
+        assert self.diagnosis is not None
         model = augmented_model(study, self.diagnosis, self.folder)
         moved = {n: q.value for n, q in model.parameters.items() if n not in own or q.value != own[n].value}
         values = FrozenMap({n: model.parameters[n].value for n in study.given} | moved)
         note = f"{name} values of study '{study.name}', with {self.counts.added} in the model, {self._standing_of_effect()}"
-        marks = self.fit.get("fingerprint", ""), self.diagnosis["fingerprint"]
-        return ValueSet(name, values, note, "effect", *marks, model)
+        return ValueSet(name, values, note, "effect", *self.marks, model)
 
     def _standing_of_effect(self) -> str:
         """Return how sure the diagnosis is of the effect, and of its places, in words."""
         if self.counts.name != "effect":
             return f"the best that was found, and not certain: {self.counts.doubt}"
         places = [
-            listed(f"{', '.join(p['at'])} ({percentage(p['probability'])})" for p in f["places"])
-            for f in self.diagnosis.get("findings") or ()
-            if len(f.get("places") or ()) > 1
+            listed(f"{', '.join(p.at)} ({percentage(p.probability)})" for p in f.places)
+            for f in (self.diagnosis.findings if self.diagnosis is not None else ())
+            if len(f.places) > 1
         ]
         rest = (
             f"; its likely places: {'; '.join(places)}; at another one than this the values may differ"
@@ -195,12 +204,11 @@ class _Results:
         return f"as the diagnosis named it{rest}"
 
 
-def _outcome(fit: Mapping[str, Any]) -> str:
+def _outcome(fit: FitResult, candidates: Sequence[str]) -> str:
     """Return how a fit ended, and how far above the noise: what a reader has to know of its values."""
-    held = [n for n in fit.get("candidates", {}) if n not in (fit.get("fitted") or [])]
-    chi = fit.get("chi2_per_dof")
-    verdict = str((fit.get("adequacy") or {}).get("verdict", ""))
-    parts = [f"fit {fit['status']}", *(["the model does not fit these records"] if verdict == "does-not-fit" else [])]
-    parts += [f"chi2/dof {figures(chi, 3)}"] if isinstance(chi, int | float) else []
+    held = [n for n in candidates if n not in fit.fitted]
+    misfit = fit.adequacy is not None and fit.adequacy.verdict == "does-not-fit"
+    parts = [f"fit {fit.status}", *(["the model does not fit these records"] if misfit else [])]
+    parts += [f"chi2/dof {figures(fit.chi2_per_dof, 3)}"] if fit.chi2_per_dof is not None else []
     parts += [f"held: {', '.join(held)}"] if held else []
     return ", ".join(parts)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Literal
+from typing import Any
 
 from hvdc_ident.fit.uncertainty import WIDER
+from hvdc_ident.next_step import TO_DO, Door
 from hvdc_ident.summary.run_summary import (
     FindingSummary,
-    NextStep,
     ParameterSummary,
     Quantity,
     RemainderSummary,
@@ -38,22 +38,6 @@ SUBJECTS: dict[str, str] = {
     "effect": "The model with the effect",
 }
 AT_BOUND = "at its bound"
-Door = Literal["shell", "python", "page"]
-"""Places where a sentence is read: each has its own name for a thing to do."""
-TO_DO: dict[str, dict[Door, str]] = {
-    "diagnose": {"shell": "`hvdc-ident diagnose STUDY`", "python": "`hi.diagnose(...)`", "page": "the stage diagnose"},
-    "letter": {"shell": "`hvdc-ident letter STUDY`", "python": "`hvdc-ident letter`", "page": "the button Letter"},
-    "export": {
-        "shell": "`hvdc-ident export STUDY --to FILE`",
-        "python": "`hi.export(...)`",
-        "page": "a button below Take away",
-    },
-}
-PURPOSES = {
-    "diagnose": "looks for what the model lacks",
-    "letter": "writes one page on this for the model's owner",
-    "export": "writes the model with the values that count (.fmu, .mo, .toml)",
-}
 
 
 # --- whether the model follows ---
@@ -147,7 +131,7 @@ def interval_name(s: RunSummary, name: str) -> str:
 
 def by_place(p: ParameterSummary) -> str:
     """Return the values of a parameter that depend on what is missing where, in words; empty for another one."""
-    return value_by_place([{**vars(v), "from": v.source} for v in p.by_place])
+    return value_by_place(p.by_place)
 
 
 def asked_text(p: ParameterSummary, *, interval: bool = False, change: bool = True) -> str:
@@ -287,13 +271,6 @@ def gained_sentence(s: RunSummary) -> str:
 
 
 # --- what to do next ---
-
-
-def next_sentence(step: NextStep, door: Door = "shell") -> str:
-    """Return what to do, as a sentence for a terminal, a notebook or the workbench."""
-    if step.text:
-        return f"Measure next: {step.text}"
-    return f"Next: {TO_DO[step.kind][door]} {PURPOSES[step.kind]}."
 
 
 def advice(s: RunSummary) -> str:

@@ -16,6 +16,7 @@ from hvdc_ident.data import Trajectory
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import csv_name
 from hvdc_ident.summary.run_summary import RunSummary
+from hvdc_ident.summary.stage_results import StageResults
 from hvdc_ident.summary.summarise import STAGES, judgements_of, lines_of, summarise
 
 
@@ -52,6 +53,11 @@ class Results:
         return self.stages.get(stage, {})
 
     @cached_property
+    def objects(self) -> StageResults:
+        """The results as objects. Raises InputError for what is no result of this version."""
+        return StageResults.read(self.stages)
+
+    @cached_property
     def summary(self) -> RunSummary:
         """Summary of the results."""
         return summarise(self.stages, self.swing, self.heading)
@@ -59,12 +65,12 @@ class Results:
     @property
     def units(self) -> dict[str, str]:
         """Unit of every recorded output, by its name."""
-        return {**(self.get("simulation").get("units") or {}), **(self.get("fit").get("units") or {})}
+        return {**self.objects.simulated.units, **self.objects.of_fit.units}
 
     @property
-    def experiments(self) -> dict[str, dict[str, Any]]:
+    def experiments(self) -> dict[str, Mapping[str, Any]]:
         """Role, event, window, recording and status of every experiment, by its name."""
-        return {**(self.get("simulation").get("experiments") or {}), **(self.get("fit").get("experiments") or {})}
+        return {**self.objects.simulated.experiments, **self.objects.of_fit.experiments}
 
     def noise(self, experiment: str, output: str) -> float | None:
         """The standard deviation of a recorded output's noise, in its unit, given or from the rows before the event; else None."""
@@ -90,8 +96,9 @@ class Results:
 
     def windows(self, name: str | None) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
         """Yield output, experiment and the errors within the windows of the profile, of every signal with a set of values."""
-        for output, experiment, about in lines_of(judgements_of(self.stages).get(name, {}) if name else {}):
-            yield output, experiment, about["windows"]
+        judgement = judgements_of(self.objects).get(name or "")
+        for output, experiment, about in lines_of(judgement) if judgement is not None else ():
+            yield output, experiment, about.windows
 
     def swing(self, output: str, experiment: str) -> float | None:
         """The peak-to-peak value of a recorded signal, in its unit; None where its recording is not at hand."""

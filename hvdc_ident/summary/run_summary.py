@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from hvdc_ident.codec import Coded
 from hvdc_ident.display import Shown, Table
-from hvdc_ident.files import plain, read_plain
 from hvdc_ident.fit.judgement import Count, Yardstick
 from hvdc_ident.fit.uncertainty import narrow
+from hvdc_ident.next_step import NextStep
 
 Outcome = Literal["pass", "fail", "not judged"]
 SETS = ("given", "fitted", "effect")
@@ -18,7 +19,6 @@ SETS = ("given", "fitted", "effect")
 Interval = tuple[float | None, float | None]
 Signal = tuple[str, str]
 """An output and an experiment."""
-NextKind = Literal["diagnose", "separate", "letter", "narrow", "export"]
 
 
 @dataclass(frozen=True)
@@ -235,17 +235,8 @@ class RemainderSummary:
     times: float | None = None
 
 
-@dataclass(frozen=True)
-class NextStep:
-    """Step to take next. kind: run the diagnosis; record what tells likely effects apart ("separate"); write the letter to the model's
-    owner; record what narrows the intervals; export the values. text: of a recording, what to record."""
-
-    kind: NextKind
-    text: str = ""
-
-
 @dataclass(frozen=True, repr=False)
-class RunSummary(Shown):
+class RunSummary(Coded, Shown):
     """Summary of the results of a study, decided once; `to_dict` is `summary.json`, and printed it is the screen of a run.
 
     verdict: whether the model follows its recordings, with the values that `about` names: the fitted ones where there are some, else
@@ -293,16 +284,6 @@ class RunSummary(Shown):
         from hvdc_ident.summary.screen import blocks
 
         return blocks(self, "python")
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the summary as JSON holds it."""
-        found: dict[str, Any] = plain(self)
-        return found
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> RunSummary:
-        """Return the summary that a JSON holds. Raises InputError where it holds none."""
-        return read_plain(cls, data)
 
     @property
     def judged(self) -> SetSummary | None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from hvdc_ident.display import Table
+from hvdc_ident.next_step import Door, next_sentence
 from hvdc_ident.summary.phrases import (
-    Door,
     condition,
     counting_sentence,
     gained_sentence,
-    next_sentence,
     remainder_sentence,
     verdict_sentence,
     worst_text,

@@ -6,15 +6,19 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from hvdc_ident.fit.judgement import Count, Yardstick
+from hvdc_ident.discrepancy import Diagnosis
+from hvdc_ident.discrepancy.result import EffectSize
+from hvdc_ident.fit.judgement import Judgement, Judgements, SignalJudgement, Yardstick
+from hvdc_ident.fit.result import Estimate, FitResult
 from hvdc_ident.fit.uncertainty import narrow
+from hvdc_ident.identifiability import Verdict
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.summary.run_summary import (
     SETS,
     AddedEffect,
     Counting,
     FindingSummary,
     Interval,
-    NextStep,
     Outcome,
     ParameterSummary,
     PlacedValue,
@@ -28,14 +32,12 @@ from hvdc_ident.summary.run_summary import (
     SignalError,
     SignalSummary,
 )
-from hvdc_ident.text import form_of, listed, quantity
+from hvdc_ident.summary.stage_results import NO_ESTIMATES, Candidate, Json, StageResults
+from hvdc_ident.text import capital, listed, quantity
 
-Json = Mapping[str, Any]
 Swing = Callable[[str, str], float | None]
 STAGES: dict[str, str] = {"given": "simulation", "fitted": "fit", "effect": "discrepancy"}
 """Sets of values in the order of a page, with the stage that judges them and whose CSV files hold the runs with them."""
-NO_ESTIMATES = (None, "failed", "not-converged")
-"""Ends of a fit whose numbers are no estimates."""
 ADDED = {"term": "formula", "filter": "filter", "curve": "curve"}
 """Words for what stands in the model in place of an effect of the catalogue."""
 SUMMARISED = ("run", "simulation", "identifiability", "fit", "discrepancy", "linearization")
@@ -55,23 +57,21 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
     """Return the summary of results. stages: their JSON by the name of its file; what a study did not ask for is missing.
 
     swing: the peak-to-peak value of a recorded signal by output and experiment, in its unit; None where it is not at hand.
-    heading: study, model, software, seed and sources of the run; results of other sources are of an earlier state of the study, and
-    say nothing. Without one it is that of the results.
+    heading: study, model, software, seed and sources of the run; results of other sources are of an earlier state of the study, or of
+    another version, and say nothing. Without one it is that of the results. Raises InputError for what is no result.
     """
     heading = heading or stages.get("run") or stages.get("fit") or next(iter(stages.values()), {})
-    stages = {n: data for n, data in stages.items() if data.get("sources") == heading.get("sources")}
-    fit, diagnosis, identified = (stages.get(n) or {} for n in ("fit", "discrepancy", "identifiability"))
-    simulation = stages.get("simulation") or {}
-    counting = counting_of(fit, diagnosis)
-    judgements = judgements_of(stages)
-    about = _about(stages)
-    limits: Yardstick = "tolerance" if about.get("tolerance") else "windows"
+    stages = {n: data for n, data in stages.items() if all(data.get(k) == heading.get(k) for k in ("sources", "software"))}
+    found = StageResults.read(stages)
+    counting = counting_of(found.fit, found.diagnosis)
+    judgements = judgements_of(found)
+    about = _about(found)
+    limits: Yardstick = "tolerance" if about.tolerance else "windows"
     sets = {name: _set(j, limits, swing) for name, j in judgements.items()}
     plain = [n for n in sets if n != "effect"]
     judged = plain[-1] if plain else None
-    units = {**(simulation.get("units") or {}), **(fit.get("units") or {})}
-    experiments = {**(simulation.get("experiments") or {}), **(fit.get("experiments") or {})}
-    parameters = _parameters(stages, fit, diagnosis, counting)
+    parameters = _parameters(found, counting)
+    diagnosis = found.diagnosis
     return RunSummary(
         study=str(heading.get("study", "")),
         model=str(heading.get("model", "")),
@@ -82,28 +82,28 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
         about=judged,
         limits=limits,
         sets=sets,
-        signals=_signals(judgements, judged, limits, units, experiments),
-        tolerance=dict(about.get("tolerance") or {}),
-        profile=dict(about.get("profile") or {}),
+        signals=_signals(judgements, judged, limits, found),
+        tolerance=dict(about.tolerance),
+        profile=dict(about.profile),
         counting=counting,
         parameters=parameters,
-        diagnosis=str(diagnosis.get("verdict") or ""),
-        said=str(diagnosis.get("text") or ""),
-        findings=_findings(diagnosis),
-        effects=_effects(diagnosis),
-        rivals=_rivals(diagnosis),
-        late=_late(diagnosis),
-        stand_ins=tuple(str(x["text"]) for x in diagnosis.get("stand_ins") or ()),
-        remainder=_remainder(diagnosis, counting),
+        diagnosis="" if diagnosis is None else diagnosis.verdict,
+        said="" if diagnosis is None else diagnosis.text,
+        findings=() if diagnosis is None else _findings(diagnosis),
+        effects=() if diagnosis is None else _effects(diagnosis),
+        rivals=() if diagnosis is None else _rivals(diagnosis),
+        late=None if diagnosis is None else _late(diagnosis),
+        stand_ins=() if diagnosis is None else tuple(x.text for x in diagnosis.stand_ins),
+        remainder=RemainderSummary() if diagnosis is None else _remainder(diagnosis, counting),
         conditional={
             "given": False,
-            "fitted": conditional(fit, diagnosis, effect=False),
-            "effect": conditional(fit, diagnosis, effect=True),
+            "fitted": conditional(found.fit, diagnosis, effect=False),
+            "effect": conditional(found.fit, diagnosis, effect=True),
         },
-        fit=str(fit.get("status") or ""),
-        search_doubt=str(fit.get("search_doubt") or ""),
-        next=_next(fit, diagnosis, identified, parameters),
-        unadvised=str(identified.get("not_recommended") or "") if not added_to(diagnosis) else "",
+        fit="" if found.fit is None else found.fit.status,
+        search_doubt="" if found.fit is None else found.fit.search_doubt,
+        next=_next(found, parameters),
+        unadvised="" if added_to(diagnosis) else found.identified.not_recommended,
         failures=_failures(stages),
     )
 
@@ -111,234 +111,210 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
 # --- which values count ---
 
 
-def counting_of(fit: Json, diagnosis: Json) -> Counting:
-    """Return which values count. fit, diagnosis: their JSON, empty where they have not run or do not stand."""
-    added, kind, verdict = _added(diagnosis), added_to(diagnosis), diagnosis.get("verdict")
+def counting_of(fit: FitResult | None, diagnosis: Diagnosis | None) -> Counting:
+    """Return which values count. None: it has not run, or does not stand."""
+    added, kind, verdict = _added(diagnosis), added_to(diagnosis), diagnosis.verdict if diagnosis is not None else ""
     if verdict == "named" and added:
         return Counting("effect", added, kind)
     doubt = ""
     if verdict == "ambiguous" and added:
-        depend = diagnosis.get("values_by_place") or {}
+        assert diagnosis is not None
+        depend = diagnosis.values_by_place
         what = f": {listed(depend)} depend{'s' if len(depend) == 1 else ''} on where the effect is" if depend else ""
         doubt = f"the diagnosis is ambiguous{what}"
     elif verdict == "unnameable":
         doubt = "something is missing that the diagnosis cannot name"
-    return Counting("" if fit.get("status") in NO_ESTIMATES else "fit", added, kind, doubt)
+    return Counting("" if fit is None or fit.status in NO_ESTIMATES else "fit", added, kind, doubt)
 
 
-def estimates_that_count(fit: Json, diagnosis: Json) -> dict[str, dict[str, Any]]:
-    """Return the estimates that count, by parameter, as a fit's JSON has them: `value`, `std`, `ci95`, `unit`, ...
+def estimates_that_count(
+    fit: FitResult | None, diagnosis: Diagnosis | None, later: Mapping[str, Estimate]
+) -> dict[str, Estimate]:
+    """Return the estimates that count, by parameter. later: those of the diagnosis with what it put in.
 
     With an effect, a parameter that was estimated without an interval has its value alone.
     """
-    if counting_of(fit, diagnosis).name != "effect":
-        return {n: dict(e) for n, e in (fit.get("estimates") or {}).items()}
-    after, later = diagnosis.get("parameters_after") or {}, diagnosis.get("estimates_after") or {}
-    fitted = (*later, *(fit.get("fitted") or ()))
-    return {n: {"value": v, **(later.get(n) or {})} for n, v in after.items() if n in fitted}
+    own = {} if fit is None else dict(fit.estimates)
+    if diagnosis is None or counting_of(fit, diagnosis).name != "effect":
+        return own
+    fitted = (*later, *(fit.fitted if fit is not None else ()))
+    return {n: later.get(n) or Estimate(v) for n, v in diagnosis.parameters_after.items() if n in fitted}
 
 
-def added_to(diagnosis: Json) -> str:
+def added_to(diagnosis: Diagnosis | None) -> str:
     """Return the kind of the addition in an augmented model: "effect", "formula", "filter" or "curve"; empty without one."""
-    if diagnosis.get("effects"):
+    if diagnosis is None:
+        return ""
+    if diagnosis.effects:
         return "effect"
-    kind = (diagnosis.get("fallback") or {}).get("kind", "") if diagnosis.get("augmented_model") else ""
+    kind = (diagnosis.fallback or {}).get("kind", "") if diagnosis.augmented_model else ""
     return ADDED.get(kind, "")
 
 
-def _added(diagnosis: Json) -> str:
+def _added(diagnosis: Diagnosis | None) -> str:
     """Return the effects with their places and sizes in words, "lag at P (T = 350 ms)"; else the kind of the addition."""
     parts = []
-    for e in diagnosis.get("effects") or ():
-        sizes = [
-            f"{n} = {quantity(p['value'], p.get('unit') or '')}"
-            for n, p in (e.get("parameters") or {}).items()
-            if p.get("value") is not None
-        ]
-        source = f" from {e['from']}" if e.get("from") else ""
-        parts.append(f"{form_of(e)} at {listed(e['at'])}{source}" + (f" ({', '.join(sizes)})" if sizes else ""))
+    for e in diagnosis.effects if diagnosis is not None else ():
+        sizes = [f"{n} = {quantity(p.value, p.unit)}" for n, p in e.parameters.items() if math.isfinite(p.value)]
+        source = f" from {e.source}" if e.source else ""
+        parts.append(f"{e.effect} at {listed(e.at)}{source}" + (f" ({', '.join(sizes)})" if sizes else ""))
     kind = added_to(diagnosis)
     return "; ".join(parts) or (f"a {kind}" if kind else "")
 
 
-def beyond_noise(diagnosis: Json) -> bool:
-    """Return True where what the model of a diagnosis leaves is more than noise: something else is missing.
-
-    The diagnosis says so itself; of one of an earlier version its tests do.
-    """
-    left = diagnosis.get("remaining") or {}
-    tested = bool(diagnosis.get("doubt")) or (not left.get("adequate", True) and left.get("material", True))
-    return bool(diagnosis.get("beyond_noise", tested))
-
-
-def conditional(fit: Json, diagnosis: Json, *, effect: bool) -> bool:
+def conditional(fit: FitResult | None, diagnosis: Diagnosis | None, *, effect: bool) -> bool:
     """Return True where values hold only if nothing else is missing, so that no interval of theirs is one of 95 %.
 
     effect: those with what the model lacks, judged by what is left with it. Else those of a fit of the model as it is: by the
     residuals of the fit, and by a diagnosis that found something missing, or something left that it could not name.
     """
+    beyond = diagnosis is not None and diagnosis.beyond_noise
     if effect:
-        return beyond_noise(diagnosis)
-    misfit = (fit.get("adequacy") or {}).get("verdict") == "does-not-fit"
-    return misfit or bool(added_to(diagnosis)) or beyond_noise(diagnosis)
+        return beyond
+    misfit = fit is not None and fit.adequacy is not None and fit.adequacy.verdict == "does-not-fit"
+    return misfit or bool(added_to(diagnosis)) or beyond
 
 
 # --- whether the model follows ---
 
 
-def judgements_of(stages: Mapping[str, Json]) -> dict[str, Json]:
-    """Return the judgement of the model with each set of values that there is. stages: their JSON by the name of its file."""
-    fit, diagnosis = (stages.get(n) or {} for n in ("fit", "discrepancy"))
-    found: dict[str, Json] = {}
-    for stage in STAGES.values():
-        for name, judgement in (_judged(stages, stage).get("sets") or {}).items():
-            found.setdefault(name, judgement)
-    wanted = {"given": True, "fitted": bool(_fitted(fit)), "effect": bool(added_to(diagnosis))}
-    names = [n for n in SETS if wanted[n] and (found.get(n) or {}).get("signals")]
-    return {n: found[n] for n in names}
+def judgements_of(found: StageResults) -> dict[str, Judgement]:
+    """Return the judgement of the model with each set of values that there is."""
+    each: dict[str, Judgement] = {}
+    for context in (found.simulated, found.of_fit, found.of_diagnosis):
+        for name, judgement in context.judgement.sets.items():
+            each.setdefault(name, judgement)
+    wanted = {"given": True, "fitted": bool(found.fitted), "effect": bool(added_to(found.diagnosis))}
+    return {n: each[n] for n in SETS if wanted[n] and n in each and each[n].signals}
 
 
-def _judged(stages: Mapping[str, Json], stage: str) -> Json:
-    return (stages.get(stage) or {}).get("judgement") or {}
-
-
-def _about(stages: Mapping[str, Json]) -> Json:
+def _about(found: StageResults) -> Judgements:
     """Return the tolerance and the profile that the errors were held against, by the last stage that judged."""
-    return next((j for stage in reversed(STAGES.values()) if (j := _judged(stages, stage))), {})
+    each = (context.judgement for context in (found.of_diagnosis, found.of_fit, found.simulated))
+    return next((j for j in each if j.sets), Judgements())
 
 
 def _outcome(follows: bool | None) -> Outcome:
     return "not judged" if follows is None else "pass" if follows else "fail"
 
 
-def _set(judgement: Json, limits: Yardstick, swing: Swing) -> SetSummary:
-    counts = {by: Count(**count) for by, count in judgement["counts"].items()}
+def _set(judgement: Judgement, limits: Yardstick, swing: Swing) -> SetSummary:
     unknown: dict[str, None] = {}
     why: dict[str, dict[str, None]] = {}
     for output, _, about in lines_of(judgement):
-        if about["follows"]["noise"] is None:
+        if about.follows["noise"] is None:
             unknown[output] = None
-        if about["follows"][limits] is None:
+        if about.follows[limits] is None:
             why.setdefault(_unjudged(about, limits), {})[output] = None
     return SetSummary(
-        _outcome(judgement["follows"]),
-        judgement["by"],
-        counts["noise"],
-        counts[limits],
+        _outcome(judgement.follows),
+        judgement.by,
+        judgement.count("noise"),
+        judgement.count(limits),
         _worst(judgement, swing),
         {reason: tuple(outputs) for reason, outputs in why.items()},
         tuple(unknown),
     )
 
 
-def _unjudged(about: Json, limits: Yardstick) -> str:
+def _unjudged(about: SignalJudgement, limits: Yardstick) -> str:
     """Return why a signal has no verdict in the limits; "" where the study states no tolerance for it."""
-    return "" if limits == "tolerance" else str(about["windows"].get("reason") or "no limit in its unit")
+    return "" if limits == "tolerance" else str(about.windows.get("reason") or "no limit in its unit")
 
 
-def lines_of(judgement: Json) -> Iterable[tuple[str, str, Json]]:
+def lines_of(judgement: Judgement) -> Iterable[tuple[str, str, SignalJudgement]]:
     """Yield the output, the experiment and the judgement of each signal."""
-    for output, line in (judgement.get("signals") or {}).items():
+    for output, line in judgement.signals.items():
         for experiment, about in line.items():
             yield output, experiment, about
 
 
-def _worst(judgement: Json, swing: Swing) -> Signal | None:
+def _worst(judgement: Judgement, swing: Swing) -> Signal | None:
     """Return the signal with the largest error: over its tolerance, else its noise, else its recorded range."""
     shares: tuple[dict[Signal, float], ...] = ({}, {}, {})
     for output, experiment, about in lines_of(judgement):
-        scales = (about["tolerance"], about["noise"])
+        scales = (about.tolerance, about.noise)
         for kind, scale in enumerate((*scales, None if any(scales) else swing(output, experiment))):
             if scale:
-                shares[kind][output, experiment] = about["rmse"] / scale
+                shares[kind][output, experiment] = about.rmse / scale
     ranked: dict[Signal, float] = next((s for s in shares if s), {})
     return max(ranked, key=lambda signal: ranked[signal], default=None)
 
 
 def _signals(
-    judgements: Mapping[str, Json], judged: str | None, limits: Yardstick, units: Json, experiments: Json
+    judgements: Mapping[str, Judgement], judged: str | None, limits: Yardstick, found: StageResults
 ) -> tuple[SignalSummary, ...]:
-    errors: dict[Signal, dict[str, Json]] = {}
+    units = {**found.simulated.units, **found.of_fit.units}
+    experiments = {**found.simulated.experiments, **found.of_fit.experiments}
+    errors: dict[Signal, dict[str, SignalJudgement]] = {}
     for name, judgement in judgements.items():
         for output, experiment, about in lines_of(judgement):
             errors.setdefault((output, experiment), {})[name] = about
-    by: Yardstick = judgements[judged]["by"] if judged else "noise"
-    found = []
+    by: Yardstick = judgements[judged].by if judged else "noise"
+    lines = []
     for (output, experiment), each in errors.items():
         one = each.get(judged) if judged else None
-        verdict = _outcome(one["follows"][by] if one else None)
+        verdict = _outcome(one.follows[by] if one else None)
         reason = "no noise is known" if verdict == "not judged" else ""
         if one and by != "noise" and verdict == "not judged":
             reason = _unjudged(one, by) or "the study states no tolerance"
         role = str((experiments.get(experiment) or {}).get("role") or "fit")
         scales = next(iter(each.values()))
         errors_of = {n: _error(a, limits) for n, a in each.items()}
-        line = (str(units.get(output, "")), scales["noise"], scales["tolerance"], verdict, reason, errors_of)
-        found.append(SignalSummary(output, experiment, role, *line))
-    return tuple(found)
+        line = (units.get(output, ""), scales.noise, scales.tolerance, verdict, reason, errors_of)
+        lines.append(SignalSummary(output, experiment, role, *line))
+    return tuple(lines)
 
 
-def _error(about: Json, limits: Yardstick) -> SignalError:
-    rmse = float(about["rmse"])
-    noise, tolerance = (rmse / about[k] if about[k] else None for k in ("noise", "tolerance"))
-    follows = about["follows"]
-    return SignalError(
-        rmse, float(about["peak"]), noise, tolerance, _outcome(follows["noise"]), _outcome(follows[limits])
-    )
+def _error(about: SignalJudgement, limits: Yardstick) -> SignalError:
+    noise, tolerance = (about.rmse / scale if scale else None for scale in (about.noise, about.tolerance))
+    on_noise, in_limits = (_outcome(about.follows[by]) for by in ("noise", limits))
+    return SignalError(about.rmse, about.peak, noise, tolerance, on_noise, in_limits)
 
 
 # --- the values ---
 
 
-def _fitted(fit: Json) -> tuple[str, ...]:
-    """Return the parameters that a fit estimated; none where it failed."""
-    return () if fit.get("status") in NO_ESTIMATES else tuple(fit.get("fitted") or ())
-
-
-def _parameters(
-    stages: Mapping[str, Json], fit: Json, diagnosis: Json, counting: Counting
-) -> tuple[ParameterSummary, ...]:
-    identified, simulation = stages.get("identifiability") or {}, stages.get("simulation") or {}
-    lines = fit.get("candidates") or identified.get("candidates") or simulation.get("candidates")
-    lines = lines or {n: {"given": g} for n, g in (diagnosis.get("parameters_before") or {}).items()}
-    fitted, estimates = _fitted(fit), fit.get("estimates") or {}
-    bounds = {n: e for n, e in estimates.items() if fitted and n not in fitted and e.get("method") == "one-sided"}
-    after = diagnosis.get("parameters_after") or {} if counting.kind else {}
-    later = diagnosis.get("estimates_after") or {}
-    refitted = diagnosis.get("parameters_refitted") or {}
-    held = fit.get("held") or {n: h.get("reason", "") for n, h in (identified.get("held") or {}).items()}
-    found = []
+def _parameters(found: StageResults, counting: Counting) -> tuple[ParameterSummary, ...]:
+    fit, diagnosis, identified = found.fit, found.diagnosis, found.identified
+    lines = found.of_fit.candidates or found.of_identified.candidates or found.simulated.candidates
+    if not lines and diagnosis is not None:
+        lines = {n: Candidate(given) for n, given in diagnosis.parameters_before.items()}
+    fitted, estimates, later = found.fitted, found.estimates, found.of_diagnosis.estimates_after
+    bounds = {n: e for n, e in estimates.items() if fitted and n not in fitted and e.method == "one-sided"}
+    after = diagnosis.parameters_after if diagnosis is not None and counting.kind else {}
+    refitted = diagnosis.parameters_refitted if diagnosis is not None else {}
+    held = fit.held if fit is not None and fit.held else {n: h.reason for n, h in identified.held.items()}
+    summaries = []
     for name, line in lines.items():
-        alone = (fit.get("values") or {}).get(name) if name in fitted else (bounds.get(name) or {}).get("value")
+        alone = bounds[name].value if name in bounds else fit.values.get(name) if fit and name in fitted else None
         by_place = tuple(
-            PlacedValue(v["value"], str(v.get("unit") or ""), v["effect"], tuple(v["at"]), str(v.get("from") or ""))
-            for v in (diagnosis.get("values_by_place") or {}).get(name) or ()
+            PlacedValue(v.value, v.unit, v.effect, v.at, v.source)
+            for v in (diagnosis.values_by_place.get(name, ()) if diagnosis is not None else ())
         )
-        effect = after.get(name) if not by_place and (name in fitted or name in later or not fit) else None
+        effect = after.get(name) if not by_place and (name in fitted or name in later or fit is None) else None
         # Without a fit there are no other values than those with the effect.
         counts = effect is not None and counting.name != "fit"
         value = None if by_place else effect if counts else alone
         own = _interval(estimates.get(name)) if alone is not None else None
         with_it = _interval(later.get(name)) if effect is not None else None
         interval = None if value is None else with_it if counts else own
-        bounded = value is not None and ((not counts and name in bounds) or value in (line.get("min"), line.get("max")))
-        given = line.get("given")
-        found.append(
+        bounded = value is not None and ((not counts and name in bounds) or value in (line.min, line.max))
+        summaries.append(
             ParameterSummary(
-                name, str(line.get("unit") or ""), value, interval, given, alone, own, effect, with_it,
+                name, line.unit, value, interval, line.given, alone, own, effect, with_it,
                 refitted=refitted.get(name),
-                moved=_leaves_out(interval or with_it, given),
-                reason="" if value is not None or by_place else str(held.get(name) or ""),
+                moved=_leaves_out(interval or with_it, line.given),
+                reason="" if value is not None or by_place else held.get(name, ""),
                 at_bound=bounded,
                 by_place=by_place,
             )
         )  # fmt: skip
-    return tuple(found)
+    return tuple(summaries)
 
 
-def _interval(estimate: Json | None) -> Interval | None:
-    ends = (estimate or {}).get("ci95")
-    return (ends[0], ends[1]) if ends else None
+def _interval(estimate: Estimate | EffectSize | Verdict | None) -> Interval | None:
+    return estimate.ci95 if estimate is not None else None
 
 
 def _leaves_out(interval: Interval | None, given: float | None) -> bool | None:
@@ -352,95 +328,76 @@ def _leaves_out(interval: Interval | None, given: float | None) -> bool | None:
 # --- what is missing ---
 
 
-def _quantities(sizes: Json | None) -> dict[str, Quantity]:
-    return {
-        n: Quantity(p["value"], str(p.get("unit") or ""), _interval(p))
-        for n, p in (sizes or {}).items()
-        if p.get("value") is not None
-    }
+def _quantities(sizes: Mapping[str, EffectSize]) -> dict[str, Quantity]:
+    return {n: Quantity(p.value, p.unit, p.ci95) for n, p in sizes.items() if math.isfinite(p.value)}
 
 
-def _findings(diagnosis: Json) -> tuple[FindingSummary, ...]:
-    own = {(e["effect"], tuple(e["at"]), e.get("from", "")): str(e["text"]) for e in diagnosis.get("effects") or ()}
-    depend = diagnosis.get("values_by_place") or {}
+def _findings(diagnosis: Diagnosis) -> tuple[FindingSummary, ...]:
+    own = {(e.effect, e.at, e.source): e.text for e in diagnosis.effects}
+    depend = diagnosis.values_by_place
     found = []
-    for f in diagnosis.get("findings") or ():
+    for f in diagnosis.findings:
         places = tuple(
             PlaceSummary(
-                tuple(p["at"]),
-                float(p.get("probability") or 0.0),
-                str(p.get("from") or ""),
-                _quantities(p.get("parameters")) | _quantities({n: v for n, v in p["values"].items() if n in depend})
-                if depend and p.get("values")
+                p.at,
+                p.probability,
+                p.source,
+                _quantities(p.parameters) | _quantities({n: v for n, v in p.values.items() if n in depend})
+                if depend and p.values
                 else {},
             )
-            for p in f.get("places") or ()
+            for p in f.places
         )
         at = (places[0].at, places[0].source) if places else ((), "")
         # Of a place that the values depend on, the finding's own sentence tells what each implies.
-        said = "" if depend else own.get((f["effect"], *at), "")
-        delay = (f.get("equivalent_delay") or {}).get("value")
-        found.append(
-            FindingSummary(
-                f["effect"],
-                tuple(f.get("same_as") or (f["effect"],)),
-                (said or str(f.get("text") or "")).rstrip("."),
-                float(f["probability"]),
-                _quantities(f.get("parameters")),
-                () if f["effect"] == "parameter" else places,
-                delay,
-            )
-        )
+        said = "" if depend else own.get((f.effect, *at), "")
+        delay = f.equivalent_delay.value if f.equivalent_delay is not None else None
+        text, listed_places = (said or f.text).rstrip("."), () if f.effect == "parameter" else places
+        sizes = _quantities(f.parameters)
+        found.append(FindingSummary(f.effect, f.same_as or (f.effect,), text, f.probability, sizes, listed_places, delay))
     return tuple(found)
 
 
-def _effects(diagnosis: Json) -> tuple[AddedEffect, ...]:
-    found = []
-    for e in diagnosis.get("effects") or ():
-        about = (str(e.get("from") or ""), str(e.get("text") or "").rstrip("."), _quantities(e.get("parameters")))
-        found.append(AddedEffect(form_of(e), tuple(e["at"]), *about, e.get("chosen_from")))
-    return tuple(found)
+def _effects(diagnosis: Diagnosis) -> tuple[AddedEffect, ...]:
+    return tuple(
+        AddedEffect(e.effect, e.at, e.source, e.text.rstrip("."), _quantities(e.parameters), e.chosen_from)
+        for e in diagnosis.effects
+    )
 
 
-def _rivals(diagnosis: Json) -> tuple[RivalSummary, ...]:
+def _rivals(diagnosis: Diagnosis) -> tuple[RivalSummary, ...]:
     """Return what the recordings cannot tell from the effects in the model, each once."""
-    own = [(e["effect"], list(e["at"]), e.get("from", "")) for e in diagnosis.get("effects") or ()]
-    each = [r for group in diagnosis.get("ambiguity") or () for r in group]
-    others = [r for r in each if (r["effect"], list(r["at"]), r.get("from", "")) not in own]
-    return tuple(dict.fromkeys(RivalSummary(form_of(r), tuple(r["at"])) for r in others))
+    own = [(e.effect, e.at, e.source) for e in diagnosis.effects]
+    others = [r for group in diagnosis.ambiguity for r in group if (r.effect, r.at, r.source) not in own]
+    return tuple(dict.fromkeys(RivalSummary(r.name, r.at) for r in others))
 
 
-def _late(diagnosis: Json) -> tuple[float, float] | None:
+def _late(diagnosis: Diagnosis) -> tuple[float, float] | None:
     """Return the least and the largest delay of a slow signal over the only ambiguity set, s; None where one of it has none."""
-    groups = diagnosis.get("ambiguity") or ()
-    late = [r.get("late") for group in groups for r in group if r.get("refitted", True)]
-    if len(groups) != 1 or len(late) < 2 or any(v is None or v <= 0.0 for v in late):
+    late = [r.late for group in diagnosis.ambiguity for r in group if r.refitted]
+    known = [v for v in late if v is not None and v > 0.0]
+    if len(diagnosis.ambiguity) != 1 or len(late) < 2 or len(known) < len(late):
         return None
-    return min(late), max(late)
+    return min(known), max(known)
 
 
-def _remainder(diagnosis: Json, counting: Counting) -> RemainderSummary:
+def _remainder(diagnosis: Diagnosis, counting: Counting) -> RemainderSummary:
     """Return what is left with the additions in the model; nothing where nothing was added."""
-    more = beyond_noise(diagnosis)
-    remaining = diagnosis.get("remaining") or {}
-    explained = remaining.get("explained_share")
-    doubt = str(diagnosis.get("doubt") or "") if counting.kind else ""
-    gap = diagnosis.get("gap") or {}
-    shrink = gap.get("shrink_holdout") if counting.kind else None
-    against = str(gap.get("held_out") or "experiments")
-    pooled = ((gap.get("pooled") or {}).get("augmented") or {}).get("holdout")
+    remaining, gap = diagnosis.remaining, diagnosis.gap
+    doubt = diagnosis.doubt if counting.kind else ""
+    shrink = gap.shrink_holdout if counting.kind else None
+    pooled = (gap.pooled.get("augmented") or {}).get("holdout")
     adequate = bool(remaining.get("adequate", bool(doubt)))
     # Of a formula, a filter or a curve no more is known: the shares are those of the best of the catalogue.
-    left = diagnosis.get("remainder") or {} if counting.kind == "effect" else {}
+    left = diagnosis.remainder if counting.kind == "effect" else {}
     share, held_out = (_share(left.get(k)) for k in ("share", "held_out"))
     if (left.get("p") or 0.0) >= LEVEL:
         share = None
     record = str(left.get("record") or "") if held_out is not None else ""
     times = left.get("record_units") if record else None
     at = str(left.get("at") or "") if share is not None else ""
-    return RemainderSummary(
-        more, adequate, explained, share, held_out, record, times, at, doubt, shrink, against, pooled
-    )
+    told = (remaining.get("explained_share"), share, held_out, record, times, at, doubt, shrink, gap.held_out, pooled)
+    return RemainderSummary(diagnosis.beyond_noise, adequate, *told)
 
 
 def _share(value: Any) -> float | None:
@@ -450,40 +407,39 @@ def _share(value: Any) -> float | None:
 # --- what to do next ---
 
 
-def _next(
-    fit: Json, diagnosis: Json, identified: Json, parameters: tuple[ParameterSummary, ...]
-) -> tuple[NextStep, ...]:
+def _next(found: StageResults, parameters: tuple[ParameterSummary, ...]) -> tuple[NextStep, ...]:
     """Return what to do, the first thing first.
 
     Advice on narrower intervals is of the model without an effect: it is void once one was put in, and needless where every value
     is known closely enough for any change to be told.
     """
-    found = []
-    if advice := _advice(diagnosis.get("separating_experiment")):
-        found.append(NextStep("separate", advice))
-    if diagnosis.get("augmented_model"):
-        found.append(NextStep("letter"))
-    if not diagnosis.get("verdict") and (fit.get("adequacy") or {}).get("verdict") == "does-not-fit":
-        found.append(NextStep("diagnose"))
-    own = {n: v for n, v in (identified.get("parameters") or {}).items() if not fit.get("estimates")}
+    fit, diagnosis, steps = found.fit, found.diagnosis, []
+    if diagnosis is not None and (advice := _advice((diagnosis.separating_experiment or {}).get("text"))):
+        steps.append(NextStep("separate", advice))
+    if diagnosis is not None and diagnosis.augmented_model:
+        steps.append(NextStep("letter"))
+    misfit = fit is not None and fit.adequacy is not None and fit.adequacy.verdict == "does-not-fit"
+    if diagnosis is None and misfit:
+        steps.append(NextStep("diagnose"))
+    own = {} if found.estimates else found.identified.parameters
     known = bool(parameters) and all(p.determined or _closely(own.get(p.name)) for p in parameters)
-    if not added_to(diagnosis) and not known and (advice := _advice(identified.get("recommended_experiment"))):
-        found.append(NextStep("narrow", advice))
-    if fit.get("estimates") and not found:
-        found.append(NextStep("export"))
-    return tuple(found)
+    wanted = found.of_identified.advice
+    if not added_to(diagnosis) and not known and wanted is not None and (advice := _advice(wanted.text)):
+        steps.append(NextStep("narrow", advice))
+    if found.estimates and not steps:
+        steps.append(NextStep("export"))
+    return tuple(steps)
 
 
-def _closely(verdict: Json | None) -> bool:
+def _closely(verdict: Verdict | None) -> bool:
     """Return whether a parameter is known closely enough by its verdict, where no fit has run."""
-    ends, value = _interval(verdict), (verdict or {}).get("value")
-    return ends is not None and value is not None and narrow(value, ends)
+    return verdict is not None and verdict.ci95 is not None and narrow(verdict.value, verdict.ci95)
 
 
-def _advice(about: Json | None) -> str:
+def _advice(text: str | None) -> str:
     """Return what to record, as a sentence; empty where nothing is advised."""
-    said = str((about or {}).get("text") or "").strip().rstrip(".")
-    return f"{said[:1].upper()}{said[1:]}." if said else ""
+    said = (text or "").strip().rstrip(".")
+    return f"{capital(said)}." if said else ""
 
 
 def _failures(stages: Mapping[str, Json]) -> dict[str, str]:

@@ -39,6 +39,6 @@ fit.to_dataframe()
 # ## The loop that they give
 # %%
 fitted = link.with_values(fit.values)
-print(hi.margins(hi.loop(fitted, "Irorder1")))
+print(hi.linear.margins(hi.linear.loop(fitted, "Irorder1")))
 # %%
 hi.bode(fitted, inputs="Vdcref1", outputs="Irorder1").plot()

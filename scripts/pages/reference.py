@@ -6,6 +6,7 @@ import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from html import escape
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,16 @@ EXAMPLE = re.compile(r"^### (\S+)\n```python\n(.*?)^```$", re.MULTILINE | re.DOT
 KINDS = {
     "Models and inputs": "Model Parameter Input load_model apply_effects step ramp multisine InputSignal",
     "Data": "Experiment read_waveforms Trajectory load_study Study new_study check",
-    "Simulation and sweeps": "simulate Simulation sweep SweepResult sensitivities linear_sensitivities morris sobol",
+    "Simulation and sweeps": "simulate Simulation sweep SweepResult sensitivities linear.linear_sensitivities sensitivity.morris "
+    "sensitivity.sobol",
     "Estimation": "identify IdentifiabilityReport fit FitResult",
     "Diagnosis and comparison": "diagnose Diagnosis compare_runs RunComparison",
-    "Operating points": "find_operating_point OperatingPoint point_at continuation",
-    "Linear models": "linearize LinearModel bode one_sided symbolic_transfer root_locus balanced",
-    "Loops and margins": "loop margins loop_margins plant_and_controller ncf_margin",
-    "Distances and norms": "compare gap nu_gap h2_norm hinf_norm linf_norm",
-    "Frequency responses": "Port port_impedance port_admittance MeasuredResponse read_response response_at_tones "
-    "response_from_record simulated_response",
+    "Operating points": "find_operating_point OperatingPoint linear.point_at linear.continuation",
+    "Linear models": "linearize LinearModel bode linear.one_sided linear.symbolic_transfer linear.root_locus linear.balanced",
+    "Loops and margins": "linear.loop linear.margins linear.loop_margins linear.plant_and_controller linear.ncf_margin",
+    "Distances and norms": "linear.compare linear.gap linear.nu_gap linear.h2_norm linear.hinf_norm linear.linf_norm",
+    "Frequency responses": "linear.Port linear.port_impedance linear.port_admittance linear.MeasuredResponse linear.read_response "
+    "linear.response_at_tones linear.response_from_record linear.simulated_response",
     "Export": "export __version__",
 }
 
@@ -168,8 +170,9 @@ def python_names() -> str:
     lines = [
         "# Python interface",
         "",
-        "Everything in `hvdc_ident.__all__`. The examples form one session, in the order of [this list](#session); each is run in the",
-        "tests. A *model* is a `Model`, the name of a shipped model or a path; *data* are an `Experiment`, a table or path, or a `Study`.",
+        "Everything in `hvdc_ident.__all__`, and what specialists use of `hi.linear`. The examples form one session, in the order of",
+        "[this list](#session); each is run in the tests. A *model* is a `Model`, the name of a shipped model or a path; *data* are an",
+        "`Experiment`, a table or path, or a `Study`.",
         "",
     ]
     for kind, names in KINDS.items():
@@ -178,7 +181,7 @@ def python_names() -> str:
     for kind, names in KINDS.items():
         lines += [f"## {kind}", ""]
         for name in names.split():
-            lines += _entry(name, getattr(hvdc_ident, name), shown[name])
+            lines += _entry(name, attrgetter(name)(hvdc_ident), shown[name])
     order = ", ".join(f"[`{n}`](#{n})" for n in shown)
     lines += ["## Order of the examples {: #session }", "", order, ""]
     return "\n".join(lines)

@@ -21,10 +21,9 @@ from hvdc_ident.data import trajectory
 from hvdc_ident.identifiability import identifiability
 from hvdc_ident.identifiability.experiment_design import Move
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.next_step import NextStep, next_sentence
 from hvdc_ident.report.overlay import Overlay, overlay_of
 from hvdc_ident.summary import Results
-from hvdc_ident.summary.phrases import next_sentence
-from hvdc_ident.summary.run_summary import NextStep
 from hvdc_ident.summary.tables import findings_table, sets_table, verdicts_table
 from tests.app.small_study import LATE
 

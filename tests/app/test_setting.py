@@ -29,7 +29,7 @@ def test_the_linear_model_stands_at_the_levels_before_the_event() -> None:
     setting = Setting.of(LINK).with_course("Pref2", InputCourse("step", 0.5, 0.2)).with_value("KPVDC", 30.0)
     point = setting.point()
     assert point.outputs["P2"] == pytest.approx(0.5, abs=1e-9)
-    expected = hi.linearize(LINK, hi.find_operating_point(LINK, {"Pref2": 0.5}, parameters={"KPVDC": 30.0}))
+    expected = hi.linearize(LINK, hi.find_operating_point(LINK, {"Pref2": 0.5}, values={"KPVDC": 30.0}))
     np.testing.assert_allclose(np.sort_complex(setting.poles(point)), np.sort_complex(expected.poles()), rtol=1e-8)
 
 
@@ -37,15 +37,15 @@ def test_the_margins_are_those_of_the_opened_loop() -> None:
     setting = Setting.of(LINK)
     assert setting.margins(setting.point()) == ""
     opened_at = replace(setting, opened="Irorder1")
-    assert opened_at.margins(setting.point()) == str(hi.margins(hi.loop(LINK, "Irorder1", setting.point())))
+    assert opened_at.margins(setting.point()) == str(hi.linear.margins(hi.linear.loop(LINK, "Irorder1", setting.point())))
 
 
 def test_an_impedance_is_seen_at_a_port() -> None:
-    dc = hi.Port(source="Iload1", voltage="Vdc1", current="-Iload1")
+    dc = hi.linear.Port(source="Iload1", voltage="Vdc1", current="-Iload1")
     setting = replace(Setting.of(LINK), port=dc)
     omega = np.array([1.0, 10.0, 100.0])
     seen = setting.response(setting.point(), omega)
-    np.testing.assert_allclose(seen.values, hi.port_impedance(LINK, dc, omega, setting.point()).values)
+    np.testing.assert_allclose(seen.values, hi.linear.port_impedance(LINK, dc, omega, setting.point()).values)
 
 
 def test_sensitivities_are_the_derivatives_by_the_parameters() -> None:

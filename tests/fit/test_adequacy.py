@@ -9,6 +9,7 @@ from scipy.stats import f as f_distribution
 
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.adequacy import cross_correlation
+from hvdc_ident.next_step import NextStep, next_phrases
 from tests.fit.simulators import Closed, coloured, line, parameters, recorded
 
 T = np.linspace(0.0, 1.0, 200)
@@ -43,7 +44,7 @@ def test_a_bend_that_the_model_lacks_does_not_fit_and_leaves_no_interval(bend):
     judged, estimate = result.adequacy, result.estimates["b"]
     assert judged.verdict == "does-not-fit"
     assert judged.chi2_per_dof == pytest.approx(result.chi2_per_dof)
-    assert "times the stated noise" in judged.text and judged.next == "hvdc-ident diagnose STUDY"
+    assert "times the stated noise" in judged.text and judged.next == (NextStep("diagnose"),)
     assert estimate.value == pytest.approx(2.0 + bend, abs=0.1)
     assert estimate.ci95 is None and estimate.std is None and "no interval" in estimate.reason
 
@@ -56,7 +57,7 @@ def test_a_noise_told_too_large_or_too_small_is_told_with_its_factor(factor):
     y0 = white(3) - np.polyval(np.polyfit(T, white(3), 1), T)
     actual = float(np.sqrt(y0 @ y0 / (T.size - 2)))
     for judged, times in ((large, 0.1 * factor / actual), (small, actual * factor / 0.1)):
-        assert f" {times:.2g} times" in judged.text and "noise = {y = 0.1" in judged.next
+        assert f" {times:.2g} times" in judged.text and "noise = {y = 0.1" in next_phrases(judged.next)
         assert judged.outputs["y"].noise * judged.outputs["y"].times == pytest.approx(actual, rel=1e-6)
 
 

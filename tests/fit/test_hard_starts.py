@@ -213,7 +213,7 @@ def test_identify_and_fit_of_one_run_stand_at_one_optimum():
     report = hi.identify(parse_card(WAVE), wave_record(), names)
     found = hi.fit(parse_card(WAVE), wave_record(), names, report=report)
     assert found.values["f"] == pytest.approx(report.parameters["f"].value, rel=1e-6)
-    assert [dict(s.start) for s in found.starts] == [line["start"] for line in report.pilot["ends"]]
+    assert [dict(s.start) for s in found.starts] == [dict(s.start) for s in report.pilot.ends]
 
 
 def test_starts_that_agree_leave_no_doubt():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,7 +20,7 @@ from tests.identifiability.cases import closed, line_and_nothing, measured, prod
 
 
 def both(plant, data, free, force=()):
-    report = identifiability(plant, data, free, starts=2).to_dict()
+    report = identifiability(plant, data, free, starts=2)
     return report, gated_fit(Problem(plant, tuple(data), tuple(free)), report, partial(fit, starts=2), force=force)
 
 
@@ -39,7 +40,7 @@ def test_weak_ones_have_an_interval_and_no_std() -> None:
     report, found = both(plant, [measured(plant, {"a": 5, "b": 1.5}, 2.0, t=np.linspace(0, 1, 80))], free)
     b = found.estimates["b"]
     assert b.std is None and b.std_raw is None and b.method == "profile" and b.reason.startswith("weak")
-    assert list(b.ci95) == report["parameters"]["b"]["ci95"] and b.ci95[0] <= b.value <= b.ci95[1]
+    assert b.ci95 == report.parameters["b"].ci95 and b.ci95[0] <= b.value <= b.ci95[1]
     assert found.estimates["a"].std is not None
 
 
@@ -49,19 +50,19 @@ def test_what_a_fit_elsewhere_than_the_report_may_state() -> None:
     free = (FitParameter("a", 1.0, -5, 5), FitParameter("b", 0.0, -5, 5))
     data = [measured(plant, {"a": 1.5, "b": 0.5}, 0.05)]
     report, here = both(plant, data, free)
-    line = report["parameters"]["a"]
-    assert line["verdict"] == "locally-identifiable" and here.estimates["a"].method == "profile"
+    line = report.parameters["a"]
+    assert line.verdict == "locally-identifiable" and here.estimates["a"].method == "profile"
     # The fit begins and ends at the other sign; of b it finds what the report does.
-    problem = Problem(plant, tuple(data), (FitParameter("a", -line["value"], -5, 5), free[1]))
+    problem = Problem(plant, tuple(data), (FitParameter("a", -line.value, -5, 5), free[1]))
     there = gated_fit(problem, report, partial(fit, starts=1))
     a, b = there.estimates["a"], there.estimates["b"]
-    assert a.value == pytest.approx(-line["value"], rel=1e-3) and a.reason.startswith("at another optimum than the report's")
+    assert a.value == pytest.approx(-line.value, rel=1e-3) and a.reason.startswith("at another optimum than the report's")
     assert a.ci95[0] < a.value < a.ci95[1] and a.method == "covariance"
-    assert list(b.ci95) == report["parameters"]["b"]["ci95"] and b.method == "profile"
+    assert b.ci95 == report.parameters["b"].ci95 and b.method == "profile"
     # Of records with another offset b is not where the report has it: a known one keeps the fit's own interval, a weak one none.
     moved = Problem(plant, (measured(plant, {"a": 1.5, "b": 3.0}, 0.05),), free)
     assert gated_fit(moved, report, partial(fit, starts=1)).estimates["b"].method == "covariance"
-    weak = {**report, "parameters": {**report["parameters"], "b": {**report["parameters"]["b"], "verdict": "weak"}}}
+    weak = replace(report, parameters=report.parameters | {"b": replace(report.parameters["b"], verdict="weak")})
     b = gated_fit(moved, weak, partial(fit, starts=1)).estimates["b"]
     assert (b.method, b.ci95, b.std) == ("none", None, None) and "disagree" in b.reason
 
@@ -71,8 +72,8 @@ def test_where_the_fit_leaves_more_than_noise_no_interval_of_the_report_stands()
     plant = closed(line, a=1.0, b=1.0)
     free = (FitParameter("a", 1, -5, 5), FitParameter("b", 1, -5, 5))
     straight = measured(plant, {"a": 1, "b": 2}, 0.01)
-    report = identifiability(plant, [straight], free, starts=1).to_dict()
-    assert all(line["ci95"] is not None for line in report["parameters"].values())
+    report = identifiability(plant, [straight], free, starts=1)
+    assert all(line.ci95 is not None for line in report.parameters.values())
     y = straight.measured["y"] + 0.1 * np.sin(40.0 * straight.time)
     wavy = recorded("e", straight.time, {"y": 0.01}, y=y)
     for e in gated_fit(Problem(plant, (wavy,), free), report, partial(fit, starts=1)).estimates.values():

@@ -36,7 +36,7 @@ def test_every_group_is_judged_on_its_own_data() -> None:
     )
     assert report.parameters["a"].ci95 == pytest.approx(alone.parameters["a"].ci95)
     assert any(n == "a, b: judged alone, on y in e, the other candidates held." for n in report.notes)
-    assert set(report.shares["e"]) == set(model.values)
+    assert set(report.experiments["e"].information) == set(model.values)
 
 
 def test_later_groups_hold_what_earlier_ones_found() -> None:
@@ -56,7 +56,7 @@ def test_one_report_in_json_with_advice_for_who_needs_it() -> None:
     coarse = [on_model(model, "e", STEP, ["y", "control"], 0.05)]
     groups = [Group(("kp", "ki"), ("control",)), Group(("b", "a"), ("y",))]
     report = identifiability_by_group(model, coarse, still, groups, pair=("a", "kp"), starts=1)
-    assert report.parameters["a"].verdict == "insensitive" and report.held["a"][0] == 0.8
+    assert report.parameters["a"].verdict == "insensitive" and report.held["a"].value == 0.8
     found = report.to_dict()
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert list(found["parameters"]) == ["a", "b", "kp", "ki"] and len(found["pilot"]["groups"]) == 2

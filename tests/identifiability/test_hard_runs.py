@@ -43,7 +43,7 @@ def test_a_weak_parameter_is_held_at_another_value_where_its_given_one_cannot_be
         closed(narrow_pass, a=0.0, b=1.0, c=4.0), [recorded("e", T, {"y": 1e-2}, y=y)], free, starts=6
     )
     assert report.identifiable == ("a", "b")
-    value, why = report.held["c"]
+    value, why = report.held["c"].value, report.held["c"].reason
     assert 0.01 <= value < 8.0 / 5.0 and report.parameters["c"].value == value
     assert "at its given value, 4, the model cannot be run" in why
     assert "at its given value, 4, the model cannot be run" in report.parameters["c"].reason

@@ -17,6 +17,7 @@ from hvdc_ident.identifiability.likelihood_intervals import bootstrap_rise, thre
 from hvdc_ident.identifiability.misspecification import heterogeneity
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis, pilot_fit
 from hvdc_ident.identifiability.structural import in_words
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import LeastSquares, coloured, decay, line, recorded
 from tests.identifiability.cases import T, closed, measured, saturating
@@ -31,9 +32,9 @@ def slopes(values, noise=0.05, seed=0):
 
 def test_experiments_that_disagree_set_the_flag_with_their_spread() -> None:
     report = identifiability(LINE, slopes([2.0, 2.0, 2.5]), FREE, starts=1)
-    assert report.misspecification.flag and "diagnose" in report.misspecification.pointer
+    assert report.misspecification.flag and report.misspecification.next == NextStep("diagnose")
     assert any("disagree on b" in s for s in report.misspecification.signs)
-    h = report.heterogeneity["b"]
+    h = report.misspecification.heterogeneity["b"]
     assert h.dof == 2 and h.p < 1e-6 and h.i2 > 0.9
     assert list(h.estimates.values()) == pytest.approx([2.0, 2.0, 2.5], abs=0.05)
     assert h.spread == pytest.approx(np.std([2.0, 2.0, 2.5]), rel=0.1)

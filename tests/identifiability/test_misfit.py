@@ -55,7 +55,7 @@ def test_what_only_the_misfit_hides_is_not_judged_and_free_for_a_diagnosis() -> 
     data, report = report_on(0.05)
     c = report.parameters["c"]
     assert c.verdict == "not-judged" and report.not_judged == ("c",)
-    times = np.sqrt(report.pilot["chi2_per_dof"])
+    times = np.sqrt(report.pilot.chi2_per_dof)
     assert f"misses these records by {times_text(times)} the noise; diagnose first" in c.reason
     # the half-width of white noise, from the normal equations
     columns = np.column_stack([np.ones_like(T), T, T**2 / 20])
@@ -64,8 +64,8 @@ def test_what_only_the_misfit_hides_is_not_judged_and_free_for_a_diagnosis() -> 
     assert report.parameters["d"].verdict == "insensitive", "which noise alone would hide too"
     told = report.to_dict()
     assert told["not_judged"] == ["c"] and told["parameters"]["c"]["verdict"] == "not-judged"
-    assert gate(told).fitted == ("a", "b") and gate(told, diagnosis=True).fitted == ("a", "b", "c")
-    found = gated_fit(Problem(PLANT, (data,), FREE), told, partial(fit, starts=1))
+    assert gate(report).fitted == ("a", "b") and gate(report, diagnosis=True).fitted == ("a", "b", "c")
+    found = gated_fit(Problem(PLANT, (data,), FREE), report, partial(fit, starts=1))
     assert found.fitted == ("a", "b") and "not-judged, held at 0" in found.held["c"]
 
 
@@ -124,7 +124,7 @@ def test_a_damping_that_the_misfit_hides_is_right_beside_the_effect_that_is_name
     free = [FitParameter("H", 5.0, 0.5, 20), FitParameter("D", 2.0, 0.1, 3), FitParameter("R", 0.06, 0.005, 0.5)]
     report = identifiability(MACHINE, data, free, starts=2)
     assert "D" in report.not_judged
-    found = diagnose(MACHINE, data, free, effects=["deadband", "gain", "coupling"], report=report.to_dict())
+    found = diagnose(MACHINE, data, free, effects=["deadband", "gain", "coupling"], report=report)
     assert found.verdict == "named"
     (effect,) = found.effects
     assert effect.effect == "deadband" and effect.at == ("e",)

@@ -54,7 +54,7 @@ def test_two_lags_of_which_only_the_end_is_seen_are_known_but_not_which_is_which
     told = report.to_dict()
     assert told["optima"][0]["values"]["T1"] == pytest.approx(SECOND, abs=0.01)
     assert told["parameters"]["T1"]["optima"] == list(report.parameters["T1"].optima)
-    found = gated_fit(Problem(ModelSimulator(LAGS), (data,), FREE), told, partial(fit, starts=2))
+    found = gated_fit(Problem(ModelSimulator(LAGS), (data,), FREE), report, partial(fit, starts=2))
     assert set(found.fitted) == {"T1", "T2", "k"}
     estimate = found.estimates["T1"]
     assert estimate.ci95[0] <= estimate.value <= estimate.ci95[1] and "only other knowledge" in estimate.reason

@@ -104,6 +104,6 @@ def test_a_level_above_all_that_the_records_reach_is_held_and_its_one_sided_limi
         report = judged(model, data, k=(2.0, 0.5, 4.0), top=(given, 1.0, 20.0))
         top = report.parameters["top"]
         assert top.verdict == "practically-unidentifiable" and "from above" in top.reason
-        assert report.identifiable == ("k",) and report.held["top"][0] == given
+        assert report.identifiable == ("k",) and report.held["top"].value == given
         assert top.ci95[0] == pytest.approx(3.0, rel=2e-3)
         assert "with 95 % confidence it is above " in top.reason

@@ -53,7 +53,7 @@ def test_structurally_unidentifiable_by_numbers() -> None:
         "b": "structurally-unidentifiable",
         "c": "identifiable",
     }
-    assert report.identifiable == ("a", "c") and report.held["b"][0] == 3.0
+    assert report.identifiable == ("a", "c") and report.held["b"].value == 3.0
     assert report.parameters["a"].conditional_on == ("b",)
     assert report.combinations[0].seen == ("a*b",)
     assert report.structure.method == "numerical, local"
@@ -90,7 +90,7 @@ def test_what_the_equations_tell_apart_a_short_record_may_not() -> None:
     assert report.structure.status == "decided" and not report.structure.combinations
     (found,) = report.combinations
     assert (found.kind, found.members, found.seen, found.held) == ("practical", ("a", "k"), ("a*k",), ("k",))
-    assert report.identifiable == ("a",) and report.held["k"][0] == 3.0
+    assert report.identifiable == ("a",) and report.held["k"].value == 3.0
     for v in report.parameters.values():
         assert v.verdict == "practically-unidentifiable" and v.reason.startswith("In these experiments only a*k is seen.")
     assert report.parameters["a"].value == pytest.approx(2.0, rel=1e-3)  # a k is 6
@@ -102,7 +102,7 @@ def test_insensitive_is_confirmed_at_both_ends() -> None:
     free = [FitParameter("a", 0, -5, 5), FitParameter("b", 0, -5, 5), FitParameter("c", 1.0, -100, 100)]
     report = identifiability(plant, [measured(plant, {"a": 1, "b": 2}, 0.01)], free, starts=2)
     c = report.parameters["c"]
-    assert c.verdict == "insensitive" and c.value == 1.0 and report.held["c"][0] == 1.0
+    assert c.verdict == "insensitive" and c.value == 1.0 and report.held["c"].value == 1.0
     assert "would be needed" in c.reason and report.identifiable == ("a", "b")
 
 
@@ -115,7 +115,7 @@ def test_practically_unidentifiable_where_the_profile_stays_open() -> None:
     assert k.verdict == "practically-unidentifiable" and "from above" in k.reason and k.ci95[1] is None
     assert report.identifiable == ("a",) and not report.misspecification.flag
     assert k.ci95[0] > 10.0, "its start is excluded: held there, a would answer for it"
-    assert report.held["k"][0] > k.ci95[0] and "at its given value, 10, the records cannot be met" in k.reason
+    assert report.held["k"].value > k.ci95[0] and "at its given value, 10, the records cannot be met" in k.reason
 
 
 def test_practically_unidentifiable_from_a_start_that_the_data_admit_is_held_there() -> None:
@@ -124,7 +124,7 @@ def test_practically_unidentifiable_from_a_start_that_the_data_admit_is_held_the
     free = [FitParameter("a", 1, 0.1, 10), FitParameter("k", 250, 1, 1000)]
     report = identifiability(plant, [measured(plant, {"a": 2, "k": 60}, 0.02, t=t)], free, starts=3)
     assert report.parameters["k"].verdict == "practically-unidentifiable"
-    assert report.identifiable == ("a",) and report.held["k"][0] == 250.0
+    assert report.identifiable == ("a",) and report.held["k"].value == 250.0
 
 
 def test_weak_is_fitted_but_has_no_std() -> None:
@@ -142,7 +142,7 @@ def test_at_bound_has_a_one_sided_limit_and_is_held() -> None:
     report = identifiability(plant, [measured(plant, {"a": 1, "b": -0.05}, 0.05)], free, starts=2)
     b = report.parameters["b"]
     assert b.verdict == "at-bound" and b.value == 0.0 and b.ci95[0] == 0.0 and 0 < b.ci95[1] < 0.1
-    assert "physical bound" in b.reason and report.held["b"][0] == 0.0 and report.identifiable == ("a",)
+    assert "physical bound" in b.reason and report.held["b"].value == 0.0 and report.identifiable == ("a",)
 
 
 def test_the_link_at_its_bound_and_with_a_flat_gain() -> None:
@@ -156,7 +156,7 @@ def test_the_link_at_its_bound_and_with_a_flat_gain() -> None:
         "KPP": "at-bound",
         "KIQ2": "insensitive",
     }
-    assert report.parameters["KPP"].value == 0.0 and report.held["KIQ2"][0] == 20.0
+    assert report.parameters["KPP"].value == 0.0 and report.held["KIQ2"].value == 20.0
     assert report.recommended is not None and "Qref2" in report.recommended.best.design.inputs
     assert report.recommended.half_widths_now["KIQ2"] is None and report.recommended.half_widths["KIQ2"] < 1.0
     assert "KIQ2 would get a 95 % confidence interval" in report.recommended.text

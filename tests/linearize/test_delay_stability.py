@@ -224,7 +224,7 @@ def test_a_neutral_equation_against_its_crossings(gain, k, time):
 
 
 def test_the_limits_of_a_late_integrator_along_its_gain():
-    found = hi.root_locus(integrator(1.0, 0.5), "k", np.linspace(0.5, 18.0, 8))
+    found = hi.linear.root_locus(integrator(1.0, 0.5), "k", np.linspace(0.5, 18.0, 8))
     assert [x.value for x in found.limits] == pytest.approx([np.pi, 5 * np.pi], rel=1e-9)
     assert [abs(x.eigenvalue.imag) for x in found.limits] == pytest.approx([np.pi, 5 * np.pi], rel=1e-9)
     assert [x.direction for x in found.limits] == ["lost", "lost"]

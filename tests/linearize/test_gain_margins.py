@@ -119,7 +119,7 @@ def late(signals, states, time, parameters=None):
 @pytest.mark.parametrize(("k", "time"), [(1.0, 1.0), (0.2, 3.0), (40.0, 0.01)])
 def test_a_late_integrator(k, time):
     """k exp(-s T)/s: gain up to pi/2/(k T), phase 90 degrees less k T, delay pi/2/k less T."""
-    found = margins(hi.loop(late({"y": "x"}, {"x": f"{k}*e"}, time), "e"))
+    found = margins(hi.linear.loop(late({"y": "x"}, {"x": f"{k}*e"}, time), "e"))
     assert found.gain_margin.value == pytest.approx(np.pi / 2 / (k * time), rel=1e-9)
     assert found.gain_margin.omega == pytest.approx(np.pi / 2 / time, rel=1e-9)
     assert found.lower_gain_margin.value == 0.0
@@ -129,7 +129,7 @@ def test_a_late_integrator(k, time):
 
 def test_a_late_unstable_plant():
     """1.5 exp(-0.3 s)/(s - 1): closed for k between 1 (at 0 rad/s) and w sin(0.3 w) + cos(0.3 w) with w = tan(0.3 w)."""
-    found = margins(hi.loop(late({"y": "x"}, {"x": "x + 1.5*e"}, 0.3), "e"))
+    found = margins(hi.linear.loop(late({"y": "x"}, {"x": "x + 1.5*e"}, 0.3), "e"))
     assert found.lower_gain_margin.value == pytest.approx(1 / 1.5, rel=1e-9) and found.lower_gain_margin.omega == 0.0
     w = 4.0
     for _ in range(50):
@@ -140,13 +140,13 @@ def test_a_late_unstable_plant():
 
 def test_a_late_gain():
     """0.4 exp(-s T): the ring has a gain below 1 up to a factor of 2.5, at frequencies without end."""
-    found = margins(hi.loop(late({"y": "0.4*e + 0*x"}, {"x": "r - x"}, 0.2), "e"))
+    found = margins(hi.linear.loop(late({"y": "0.4*e + 0*x"}, {"x": "r - x"}, 0.2), "e"))
     assert found.stable and found.gain_margin.value == pytest.approx(2.5, rel=1e-9)
     assert found.lower_gain_margin.value == 0.0
 
 
 def test_a_late_gain_of_1_is_not_judged():
-    found = margins(hi.loop(late({"y": "1.0*e + 0*x"}, {"x": "r - x"}, 0.2), "e"))
+    found = margins(hi.linear.loop(late({"y": "1.0*e + 0*x"}, {"x": "r - x"}, 0.2), "e"))
     assert found.stable is None and np.isnan(found.gain_margin.value)
     assert "cannot be told" in str(found)
 
@@ -163,7 +163,7 @@ def test_loops_of_one_plant_have_their_lower_limits():
 def test_margins_stand_on_the_exact_stability(time, stable):
     """A Pade approximant of order 5 says the opposite in both cases: see `test_delay_stability`."""
     model = late({"y": "0.02*v"}, {"x": "v", "v": "49*(e - x) - 0.14*v"}, time)
-    found = margins(hi.loop(model, "e"))
+    found = margins(hi.linear.loop(model, "e"))
     assert found.stable == stable == hi.find_operating_point(model).stable
     assert np.isfinite(found.gain_margin.value) == np.isfinite(found.phase_margin.value) == stable
     if stable:
@@ -185,7 +185,7 @@ def test_a_sampled_integrator(compute):
         sampled={"h": {"value": "x", "period": "1.0", "compute": str(compute)}},
         outputs={"x": "x"},
     )
-    found = margins(hi.loop(model, "e"))
+    found = margins(hi.linear.loop(model, "e"))
     k, q, r = 0.3 * found.gain_margin.value, int(compute), compute - int(compute)
 
     def largest(k):

@@ -108,7 +108,7 @@ def _fit(rmse: dict[str, Any]) -> dict[str, Any]:
         "verdict": "does-not-fit",
         "chi2_per_dof": 28.0,
         "text": "the residual of Ir1 is 9 times the noise",
-        "next": "diagnose",
+        "next": [{"kind": "diagnose", "text": ""}],
     }
     return {
         **_about(),
@@ -131,7 +131,9 @@ def _fit(rmse: dict[str, Any]) -> dict[str, Any]:
 def _identifiability() -> dict[str, Any]:
     parameters = {
         n: {
+            "name": n,
             "verdict": "identifiable",
+            "reason": "It is known.",
             "value": f,
             "ci95": [0.99 * f, 1.01 * f],
             "unit": "pu/s",

@@ -96,7 +96,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.exit_code == 0, done.output
     fit = json.loads((results / "fit.json").read_text("utf-8"))
     heading = {k: fit[k] for k in ("schema", "study", "model", "software", "seed", "sources")}
-    candidate = {"effect": "lag", "at": ["P2_m"], "score": 9e4, "p": 0.005, "delta_bic": 8e4, "holdout_rmse": 1.1}
+    candidate = {"effect": "lag", "at": ["P2_m"], "score": 9e4, "p": 0.005, "delta_bic": 8e4}
+    candidate |= {"holdout_rmse": 1.1, "status": "refitted"}
     found = diagnosis(**heading, candidates=[candidate], notes=["a note"])
     found["gap"]["pooled"] = {
         m: {"fit": v, "holdout": 1.1 * v} for m, v in (("nominal", 20.0), ("refitted", 4.0), ("augmented", 1.0))

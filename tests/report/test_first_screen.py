@@ -157,7 +157,8 @@ def test_a_value_that_depends_on_the_place_has_no_single_value(like_the_demo: Pa
     for file in like_the_demo.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     found = json.loads((tmp_path / "discrepancy.json").read_text("utf-8"))
-    values = [{"value": v, "unit": "pu/s", "effect": "lag", "at": [at]} for at, v in (("P1", 728.3), ("P1_m", 802.0))]
+    line = {"ci95": None, "unit": "pu/s", "effect": "lag"}
+    values = [{**line, "value": v, "at": [at]} for at, v in (("P1", 728.3), ("P1_m", 802.0))]
     found["values_by_place"] = {"KIVDC": values}
     found["findings"][0]["text"] = "P1 lags, where KIVDC is 728 pu/s; or P1_m, where KIVDC is 802 pu/s."
     (tmp_path / "discrepancy.json").write_text(json.dumps(found))

@@ -111,7 +111,7 @@ def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
 
 def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp_path: Path) -> None:
     rivals = [{"effect": n, "at": ["P2_m"], "delta_bic": d} for n, d in (("delay", 0.0), ("lag", 2.0))]
-    found = diagnosis(ambiguity=[rivals], remaining={"adequate": False})
+    found = diagnosis(ambiguity=[rivals], remaining={"adequate": False}, beyond_noise=True)
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, found))).sentences
     assert "cannot tell it from: delay at P2_m. It is not all that is missing" in consistent
     alone = diagnosis(ambiguity=[rivals[1:]], remaining={"adequate": True})
@@ -121,7 +121,11 @@ def test_what_was_put_in_is_no_rival_of_itself_wherever_it_stands_in_the_set(tmp
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, doubted))).sentences
     assert "none of those tried is: the first rows are loud." in consistent and "No other effect" not in consistent
     several = diagnosis(
-        ambiguity=[], remaining={"adequate": False}, effects=2 * diagnosis()["effects"], doubt="it hums"
+        ambiguity=[],
+        remaining={"adequate": False},
+        effects=2 * diagnosis()["effects"],
+        doubt="it hums",
+        beyond_noise=True,
     )
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, several))).sentences
     assert consistent.endswith("none of those tried is: it hums. It is not all that is missing.")
@@ -138,7 +142,7 @@ def test_a_rival_outside_the_catalogue_is_told_with_its_formula(tmp_path: Path) 
 
 def test_what_the_members_of_a_set_have_in_common_is_said(tmp_path: Path) -> None:
     rivals = [
-        {"effect": n, "at": ["P2_m"], "delta_bic": 0.0, "late": late}
+        {"effect": n, "at": ["P2_m"], "delta_bic": 0.0, "parameters": {"T": late}}
         for n, late in (("lag", 0.0016), ("delay", 0.0014))
     ]
     _, consistent, *_ = letter_of(Results(folder_with(tmp_path, diagnosis(ambiguity=[rivals])))).sentences
@@ -258,6 +262,7 @@ def test_a_value_that_depends_on_the_place_is_told_by_place_and_blames_nobody(tm
 
 def test_where_an_effect_does_what_a_value_does_the_value_is_not_blamed(tmp_path: Path) -> None:
     other = {"effect": "gain", "at": ["P2"], "text": "P2 is 1.05 times what the model has", "values": {"KIP": 30.0}}
+    other |= {"delta_bic": 0.0, "parameters": {}}
     kip = {"value": 31.5, "ci95": None, "unit": ""}
     finding = {"effect": "parameter", "probability": 1.0, "parameters": {"KIP": kip}, "places": []}
     found = diagnosis(

@@ -19,7 +19,6 @@ from hvdc_ident.report.page import page
 from hvdc_ident.report.sections.output_errors import SECTION as ERRORS
 from hvdc_ident.summary import Results, summarise
 from hvdc_ident.summary.screen import lines_of
-from hvdc_ident.summary.summarise import beyond_noise
 from hvdc_ident.summary.tables import values_table
 from hvdc_ident.text import figures, interval_text, span, times_text
 from tests.report.judgements import judgement
@@ -260,7 +259,7 @@ def test_intervals_of_a_model_that_leaves_more_than_noise_claim_no_chance(tmp_pa
 def test_tile_and_letter_say_together_whether_it_is_all(tmp_path: Path, changes: dict[str, Any], left: bool) -> None:
     found = {k: v for k, v in lagging(**changes).items() if v is not None}
     results = hydro(tmp_path, discrepancy=found)
-    assert beyond_noise(found) is left
+    assert results.summary.remainder.more_than_noise is left
     assert ("Not all of it" in tile(first_screen(results), "missing")) is left
     assert ("It is not all that is missing" in told(results)) is left
     assert ("hold only if nothing else" in first_screen(results)) is left

@@ -177,7 +177,7 @@ def test_what_does_not_fit_is_said_before_anything_runs(arguments, named, kind):
 
 def test_json_of_rows_made_one_by_one_is_json():
     found = sweep(MODEL, [RECORDED], listed("k", [1, 0]))
-    data = {**found.summary(), "points": Rows(found.rows, len(found)), "none": Rows(list, 0)}
+    data = {**found.heading, "points": Rows(found.rows, len(found)), "none": Rows(list, 0)}
     read = json.loads(json_text(data))
     assert read.pop("none") == [] and read == json.loads(json_text(found.to_dict()))
 

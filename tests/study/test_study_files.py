@@ -14,6 +14,7 @@ import pytest
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import csv_text, json_text, write_text
+from hvdc_ident.fit import Estimate
 from hvdc_ident.study.examples import write_demo
 from hvdc_ident.study.export import SSV, ssv
 from hvdc_ident.study.study import load_study
@@ -51,7 +52,7 @@ def test_ssv_is_xml_with_every_digit() -> None:
 
 def test_tables_quote_names_and_leave_nothing_for_none() -> None:
     assert csv_text(["a,b", "c"], [[0.1 + 0.2, None]]) == '"a,b",c\n0.30000000000000004,\n'
-    text = values_csv({"K": 2.0}, {"K": "pu"}, {"K": {"std": 0.5, "ci95": [1.0, None]}}, {})
+    text = values_csv({"K": 2.0}, {"K": "pu"}, {"K": Estimate(2.0, 0.5, (1.0, None))}, {})
     assert text.splitlines()[1] == "K,2.0,pu,0.5,1.0,,,fit"
 
 

@@ -8,6 +8,7 @@ import io
 import numpy as np
 
 from hvdc_ident.files import csv_text
+from hvdc_ident.fit import Estimate
 from hvdc_ident.study.value_files import values_csv
 from hvdc_ident.summary import Results
 
@@ -16,7 +17,7 @@ def test_no_cell_of_the_fitted_values_is_a_formula():
     text = values_csv(
         {"k": -2.5, "=k": 1.0},
         {"k": "=HYPERLINK(1)", "=k": "@SUM(A1)"},
-        {"k": {"std": 0.5, "ci95": (-3.5, -1.5)}},
+        {"k": Estimate(-2.5, 0.5, (-3.5, -1.5))},
         {"=k": "-1 is\nheld"},
     )
     rows = list(csv.reader(io.StringIO(text)))

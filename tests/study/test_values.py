@@ -182,7 +182,8 @@ def test_the_command_that_is_offered_next_works_where_it_is_pasted(
         assert typed[1:3] == ["diagnose", "my studies/s.toml"] and typed[3:5] == ["--out", "other results"]
         assert load_study(typed[2]).path.resolve() == path.resolve()
     for file in ("fit", "identifiability"):
-        assert "hvdc-ident diagnose STUDY" in (tmp_path / "other results" / f"{file}.json").read_text()
+        told = (tmp_path / "other results" / f"{file}.json").read_text()
+        assert '"kind": "diagnose"' in told and "hvdc-ident diagnose" not in told
 
 
 # What is given.

@@ -38,7 +38,8 @@ def kinds(**stages: dict[str, Any]) -> list[str]:
 def test_a_recording_is_advised_where_a_value_is_not_known_closely() -> None:
     assert kinds(fit=fit(0.05), identifiability=ADVICE) == ["narrow"]
     assert kinds(fit=fit(0.03), identifiability=ADVICE) == ["export"]
-    known = {"parameters": {"k": {"value": 2.0, "ci95": [1.99, 2.01]}}, "candidates": {"k": {"given": 1.0}}, **ADVICE}
+    verdict = {"name": "k", "verdict": "identifiable", "reason": "", "value": 2.0, "ci95": [1.99, 2.01]}
+    known = {"parameters": {"k": verdict}, "candidates": {"k": {"given": 1.0}}, **ADVICE}
     assert kinds(identifiability=known) == []
 
 

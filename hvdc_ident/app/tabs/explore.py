@@ -361,7 +361,7 @@ class Explorer:
             low, high = span_of(setting.model, name, self._desk.spans)
             fixed = {n: v for n, v in setting.values.items() if n != name}
             try:
-                locus = hi.root_locus(model, name, np.linspace(low, high, LOCUS), fixed)
+                locus = hi.linear.root_locus(model, name, np.linspace(low, high, LOCUS), fixed)
             except HvdcIdentError as error:
                 return f"{text} No locus of {name}: {error}", NONE
             return text, near(locus.eigenvalues.ravel())

@@ -24,7 +24,7 @@ from hvdc_ident.app.runs import (
 )
 from hvdc_ident.app.server import Tab
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.summary.phrases import next_sentence
+from hvdc_ident.next_step import next_sentence
 from hvdc_ident.text import percentage
 
 LOOK = 0.3

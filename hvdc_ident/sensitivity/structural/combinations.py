@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import combinations, combinations_with_replacement
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -40,22 +40,12 @@ class Combination:
     relative: bool = False
     kind: Literal["structural", "practical"] = "structural"
     held: tuple[str, ...] = ()
+    stored_properties: ClassVar[tuple[str, ...]] = ("direction",)
 
     @property
     def direction(self) -> FrozenMap[float]:
         """One change of the members that leaves the outputs alone; empty where none is known."""
         return FrozenMap(zip(self.members, self.directions[0], strict=True) if self.directions else ())
-
-    def to_dict(self) -> dict[str, Any]:
-        """The combination as plain values."""
-        return {
-            "members": list(self.members),
-            "seen": list(self.seen),
-            "words": self.words,
-            "free": self.free,
-            "directions": [list(d) for d in self.directions],
-            "relative": self.relative,
-        }
 
 
 def only_seen(members: Sequence[str], seen: Sequence[str]) -> str:

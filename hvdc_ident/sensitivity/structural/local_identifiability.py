@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hvdc_ident.codec import plain
 from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
@@ -121,7 +122,7 @@ class StructuralResult:
             "method": self.method,
             "identifiable": list(self.identifiable),
             "unidentifiable": list(self.unidentifiable),
-            "combinations": [c.to_dict() for c in self.combinations],
+            "combinations": [plain(c) for c in self.combinations],
             "rank": self.rank,
         }
 

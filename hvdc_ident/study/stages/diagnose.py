@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.errors import ComputationError, unknown_name
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy import Diagnosis
     from hvdc_ident.executor import Executor, Progress
+    from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.model import AnyModel
     from hvdc_ident.study.study import Study
 
@@ -24,17 +26,17 @@ class NothingIdentified(ComputationError):
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
-    from hvdc_ident.identifiability import gate
+    from hvdc_ident.identifiability import IdentifiabilityReport, gate
     from hvdc_ident.model import Model
     from hvdc_ident.study.augmented import compared
     from hvdc_ident.study.pipeline import executor_of
     from hvdc_ident.study.size_curves import size_curves
 
     _need(study)
-    report = earlier["identify"]
-    if "parameters" not in report:
-        why = f"nothing can be diagnosed before the stage identify has run: {report.get('message', 'it failed')}"
+    if "parameters" not in earlier["identify"]:
+        why = f"nothing can be diagnosed before the stage identify has run: {earlier['identify'].get('message', 'it failed')}"
         return StageResult({"status": "failed", "message": why}, failed=why)
+    report = IdentifiabilityReport.from_dict(earlier["identify"])
     with executor_of(study, options, "diagnose") as executor:
         try:
             found = diagnosed(
@@ -58,14 +60,14 @@ def _need(study: Study) -> None:
 
 def diagnosed(
     study: Study,
-    report: Mapping[str, Any],
+    report: IdentifiabilityReport,
     *,
     seed: int = 0,
     budget: float | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """Return the diagnosis of the study's model. report: on its candidates, as its `to_dict`. budget: seconds, instead of the study's.
+    """Return the diagnosis of the study's model. report: on its candidates. budget: seconds, instead of the study's.
 
     Raises StudyError where it lacks data or candidates, NothingIdentified where the report leaves no parameter to be fitted.
     """
@@ -78,7 +80,7 @@ def diagnosed(
     if not gate(report, diagnosis=True).fitted:
         raise NothingIdentified(
             "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own",
-            hint="`hvdc-ident identify STUDY` says why of each, and what to measure next",
+            next=(NextStep("identify"),),
         )
     found = diagnose(
         study.model,

@@ -11,21 +11,23 @@ from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_gro
 
 if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
-    from hvdc_ident.fit.residual import Curve
+    from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
 
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the estimates with their intervals, RMSE before and after, and the values in the forms other tools read."""
+    from hvdc_ident.identifiability import IdentifiabilityReport
+    from hvdc_ident.next_step import next_phrases
     from hvdc_ident.study import fitting
     from hvdc_ident.study.measured_responses import compared
     from hvdc_ident.study.pipeline import executor_of
 
     fitting.need(study, "fit")
-    report = earlier["identify"]
-    if "parameters" not in report:
-        why = f"nothing can be fitted before the stage identify has run: {report.get('message', 'it failed')}"
+    if "parameters" not in earlier["identify"]:
+        why = f"nothing can be fitted before the stage identify has run: {earlier['identify'].get('message', 'it failed')}"
         return StageResult({"status": "failed", "message": why}, failed=why)
+    report = IdentifiabilityReport.from_dict(earlier["identify"])
     with executor_of(study, options, "fit") as executor:
         result = fitting.estimated(
             study, report, force=options.force, seed=options.seed, executor=executor, progress=options.progress
@@ -33,24 +35,25 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     problem = fitting.problem_of(study)
     data = {**result.to_dict(), **_context(study, problem, options, report, result)}
     if result.status == "failed":
-        return StageResult(data, failed=result.message)
+        tried = f". Try: {next_phrases(result.next)}" if result.next else ""
+        return StageResult(data, failed=f"{result.message}{tried}")
     sets = {"given": fitting.curves_at_given(study), "fitted": result.curves}
     data["judgement"] = fitting.judgement_of(study, sets, result)
     data["derived"] = fitting.derived(study, result)
     if study.responses:
         data["responses"] = compared(study, {"given": study.given, "fitted": result.values})
-    files = _files(study, data, result.curves)
+    files = _files(study, result, data["derived"])
     return StageResult(data, files, failed=result.message if result.status == "not-converged" else "")
 
 
 def _context(
-    study: Study, problem: Problem, options: StageOptions, report: Mapping[str, Any], result: FitResult
+    study: Study, problem: Problem, options: StageOptions, report: IdentifiabilityReport, result: FitResult
 ) -> dict[str, Any]:
     """Return what a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
     from hvdc_ident.study.study import candidate_lines
 
     return {
-        "forced": [n for n in options.force if n in result.fitted and n not in report["identifiable"]],
+        "forced": [n for n in options.force if n in result.fitted and n not in report.identifiable],
         "candidates": candidate_lines(study),
         "units": {o: e.measured.unit(o) for e in problem.experiments if e.measured is not None for o in e.outputs},
         "experiments": {
@@ -62,13 +65,14 @@ def _context(
     }
 
 
-def _files(study: Study, data: Mapping[str, Any], curves: Mapping[str, Mapping[str, Curve]]) -> dict[str, str]:
+def _files(study: Study, result: FitResult, derived: Mapping[str, Any]) -> dict[str, str]:
     """The values to paste, and the waveforms at the estimates; of an experiment that fails there is none."""
     from hvdc_ident.study.fitting import curves_csv
     from hvdc_ident.study.value_files import value_files
 
+    curves = result.curves
     waveforms = {f"fit.{e.name}.csv": curves_csv(e, curves[e.name]) for e in study.experiments if e.name in curves}
-    return {**value_files(study, data), **waveforms}
+    return {**value_files(study, result, derived), **waveforms}
 
 
 def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:

@@ -95,17 +95,16 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
 
     A misfit comes first and its size stands beside every interval: what is read alone is to be believed alone.
     """
+    from hvdc_ident.next_step import NextStep, next_sentence
     from hvdc_ident.summary import summarise
-    from hvdc_ident.summary.phrases import next_sentence
 
     width = max(map(len, data["parameters"]), default=0)
     doubt = (data.get("pilot") or {}).get("search_doubt")
     lines = [f"{doubt[:1].upper()}{doubt[1:]}."] if doubt else []
     beside = ""
     if data["misspecified"]:
-        signs = data["misspecification"]
-        what_next = signs["next"][:1].upper() + signs["next"][1:]
-        lines.append(f"The model does not explain these data: {'; '.join(signs['signs'])}. {what_next}.")
+        signs = "; ".join(data["misspecification"]["signs"])
+        lines.append(f"The model does not explain these data: {signs}. {next_sentence(NextStep('diagnose'))}")
         ratio = (data.get("pilot") or {}).get("chi2_per_dof")
         beside = "" if ratio is None else f" (chi2/dof {ratio:.3g})"
     for name, v in data["parameters"].items():

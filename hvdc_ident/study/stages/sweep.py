@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """A row for each point, as JSON and as CSV; finished points are kept in the folder and not run again."""
+    from hvdc_ident.codec import Rows
     from hvdc_ident.errors import StudyError
-    from hvdc_ident.files import Rows
     from hvdc_ident.sensitivity import sweep
     from hvdc_ident.study.checks import need_experiments
     from hvdc_ident.study.pipeline import workers_of
@@ -45,7 +45,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             executor=pool if store is None else CachingExecutor(store.job("sweep"), pool, by_item=True),
             progress=options.progress,
         )
-    data = {**result.summary(), "points": Rows(result.rows, len(result))}
+    data = {**result.heading, "points": Rows(result.rows, len(result))}
     reason = f"every point failed; the first: {result.failed[0]}" if len(result.failed) == len(result) else ""
     return StageResult(data, {"sweep.csv": result.to_csv()}, failed=reason)
 

@@ -1,0 +1,118 @@
+"""The results of the stages of a study as objects, read from their JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from hvdc_ident.codec import Coded, stored_as
+from hvdc_ident.discrepancy import Diagnosis
+from hvdc_ident.errors import located
+from hvdc_ident.fit.judgement import Judgements
+from hvdc_ident.fit.result import Estimate, FitResult
+from hvdc_ident.identifiability import IdentifiabilityReport
+
+Json = Mapping[str, Any]
+NO_ESTIMATES = ("failed", "not-converged")
+"""Ends of a fit whose numbers are no estimates."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A line of a study's [parameters]. searched: the range that starts are drawn from. None: not stated, or without an end."""
+
+    given: float | None = None
+    start: float | None = None
+    min: float | None = None
+    max: float | None = None
+    searched: tuple[float | None, float | None] | None = None
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to record next. text: in words."""
+
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Context(Coded):
+    """What the JSON of a simulation, an identifiability analysis or a fit has beside its result, as far as a summary is made of it.
+
+    candidates: by name. units: of the outputs. experiments: role, event, window, recording and status by name. judgement: of the
+    model with each set of values. derived: what follows from the estimates of a fit. advice: what to record next.
+    """
+
+    candidates: Mapping[str, Candidate] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    experiments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    judgement: Judgements = field(default_factory=Judgements)
+    derived: Mapping[str, Any] = field(default_factory=dict)
+    advice: Advice | None = field(default=None, metadata=stored_as("recommended_experiment"))
+
+
+@dataclass(frozen=True)
+class DiagnosisContext(Coded):
+    """What the JSON of a diagnosis has beside it. judgement: of the model with each set of values. estimates_after: with what it put in."""
+
+    judgement: Judgements = field(default_factory=Judgements)
+    estimates_after: Mapping[str, Estimate] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class StageResults:
+    """The results of the stages: each with its context, that of a stage that has not run empty.
+
+    fit: None where none has run. diagnosis: None where none has come to a verdict. identified: empty where it has not run.
+    """
+
+    fit: FitResult | None
+    identified: IdentifiabilityReport
+    diagnosis: Diagnosis | None
+    simulated: Context
+    of_fit: Context
+    of_identified: Context
+    of_diagnosis: DiagnosisContext
+
+    @classmethod
+    def read(cls, stages: Mapping[str, Json]) -> StageResults:
+        """Return the results of the JSON of stages by the name of their file. Raises InputError for what is none of a stage."""
+        fit, diagnosis, identified = (stages.get(n) or {} for n in ("fit", "discrepancy", "identifiability"))
+        contexts = []
+        for name in ("simulation", "fit", "identifiability"):
+            with located(f"{name}.json"):
+                contexts.append(Context.from_dict(stages.get(name) or {}))
+        simulated, of_fit, of_identified = contexts
+        with located("discrepancy.json"):
+            beside = DiagnosisContext.from_dict(diagnosis)
+        return cls(fit_of(fit), identified_of(identified), diagnosis_of(diagnosis), simulated, of_fit, of_identified, beside)
+
+    @property
+    def estimates(self) -> dict[str, Estimate]:
+        """The estimates of the fit, by parameter."""
+        return dict(self.fit.estimates) if self.fit is not None else {}
+
+    @property
+    def fitted(self) -> tuple[str, ...]:
+        """The parameters that the fit estimated; none where it failed."""
+        return () if self.fit is None or self.fit.status in NO_ESTIMATES else self.fit.fitted
+
+
+def fit_of(data: Json) -> FitResult | None:
+    """Return the fit of a `fit.json`; None where none has run. Raises InputError for what is none."""
+    with located("fit.json"):
+        return FitResult.from_dict(data) if data.get("status") else None
+
+
+def diagnosis_of(data: Json) -> Diagnosis | None:
+    """Return the diagnosis of a `discrepancy.json`; None where none has come to a verdict. Raises InputError for what is none."""
+    with located("discrepancy.json"):
+        return Diagnosis.from_dict(data) if data.get("verdict") else None
+
+
+def identified_of(data: Json) -> IdentifiabilityReport:
+    """Return the report of an `identifiability.json`, empty where none has run. Raises InputError for what is none."""
+    with located("identifiability.json"):
+        return IdentifiabilityReport.from_dict(data)
