@@ -41,6 +41,8 @@ AT_BOUND = "at its bound"
 Door = Literal["shell", "python", "page"]
 """Places where a sentence is read: each has its own name for a thing to do."""
 TO_DO: dict[str, dict[Door, str]] = {
+    "identify": {"shell": "`hvdc-ident identify STUDY`", "python": "`hi.identify(...)`", "page": "the stage identify"},
+    "fit": {"shell": "`hvdc-ident fit STUDY`", "python": "`hi.fit(...)`", "page": "the stage fit"},
     "diagnose": {"shell": "`hvdc-ident diagnose STUDY`", "python": "`hi.diagnose(...)`", "page": "the stage diagnose"},
     "letter": {"shell": "`hvdc-ident letter STUDY`", "python": "`hvdc-ident letter`", "page": "the button Letter"},
     "export": {
@@ -138,6 +140,13 @@ def size_text(q: Quantity) -> str:
 def sizes_text(sizes: Mapping[str, Quantity]) -> str:
     """Return quantities by their names, without the digits of an interval: "T = 350 ms and k = 2"."""
     return listed(f"{n} = {quantity(q.value, q.unit)}" for n, q in sizes.items())
+
+
+def values_line(s: RunSummary) -> str:
+    """Return the values that count in one line: "k = 5.02 1/s, T = 31 ms"; empty where nothing was fitted."""
+    known = [(p.name, Quantity(p.value, p.unit, p.interval)) for p in s.parameters if s.counting.name and p.value is not None]
+    placed = [f"{p.name} by place" for p in s.parameters if p.by_place]
+    return ", ".join([*(f"{n} = {size_text(q)}" for n, q in known), *placed])
 
 
 def interval_name(s: RunSummary, name: str) -> str:
