@@ -71,12 +71,12 @@ def write_slider_values(file: Path, asked: SliderValues) -> str:
     for name, keys in asked.parameters.items():
         line = {k: getattr(now[name], k) for k in ("start", "min", "max")} if name in now else {}
         line.update(keys or {})
-        start, ends = line.get("start"), [v for v in (line.get("min"), line.get("max")) if v is not None]
-        if keys and start is not None and sorted([*ends[:1], start, *ends[1:]]) != [*ends[:1], start, *ends[1:]]:
+        start, low, high = (line.get(k) for k in ("start", "min", "max"))
+        if keys and start is not None and ((low is not None and start < low) or (high is not None and start > high)):
             raise StudyError(
                 f"the value of '{name}' lies outside its bounds; nothing was written",
                 where=file.name,
-                expected=" to ".join(f"{v:g}" for v in ends),
+                expected=" and ".join(f"{word} {v:g}" for word, v in (("at least", low), ("at most", high)) if v is not None),
                 got=f"{start:g}",
                 hint="move the slider, or type another bound beside it",
             )

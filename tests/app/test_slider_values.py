@@ -48,6 +48,16 @@ def test_what_cannot_hold_is_not_written(small_study: hi.Study, value: float | N
     assert small_study.path.read_text() == before
 
 
+def test_a_study_that_states_one_bound_has_no_other(small_study: hi.Study) -> None:
+    file = small_study.path
+    file.write_text(file.read_text().replace("k = {min = 0.5, max = 20}", "k = {max = 20}"))
+    study = hi.load_study(file)
+    write_slider_values(file, slider_values(study, setting_of(study).with_value("k", 7.0), {"k"}, {}))
+    assert hi.load_study(file).start["k"] == 7.0
+    with pytest.raises(StudyError, match="at most 20"):
+        write_slider_values(file, slider_values(study, setting_of(study).with_value("k", 21.0), {"k"}, {}))
+
+
 def test_values_of_a_model_that_is_not_the_studys_are_left_out_and_said(small_study: hi.Study) -> None:
     found = hi.apply_effects(small_study.model, [LAG])
     setting = Setting.of(found, small_study.experiments[0]).with_value("k", 5.0).with_value("lag_u_T", 0.03)
