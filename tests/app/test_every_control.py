@@ -21,6 +21,7 @@ from hvdc_ident.app.runs import StudyRun
 sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install playwright")
 
 SECONDS = 60_000  # ms that something may take on a busy machine before a test gives up
+WAIT = 15_000  # ms within which a control that is in sight can be used
 REST = 150  # ms for the page to answer one control before the next
 CONTROLS = "button, input, summary, [role=tab], [role=combobox], [role=slider], .q-expansion-item .q-item, .q-uploader"
 FAILED = "The workbench failed"
@@ -39,13 +40,17 @@ LISTED = """(controls) => {
   const seen = {}, found = [];
   for (const e of document.querySelectorAll(controls)) {
     if (!e.checkVisibility() || e.disabled || e.getAttribute("aria-disabled") === "true" || e.closest(".q-notification, .q-menu")) continue;
+    if (e.parentElement.closest(".q-expansion-item__container > .q-item")) continue;  // the arrow, which does what its line does
     const box = e.getBoundingClientRect();
     if (!box.width || !box.height) continue;
     const field = e.closest(".q-field"), label = e.getAttribute("aria-label") || field?.querySelector(".q-field__label")?.textContent;
-    const kind = e.tagName === "INPUT" ? (e.getAttribute("role") || e.type || "text") : (e.getAttribute("role") || e.tagName.toLowerCase());
+    const part = e.closest(".q-expansion-item"), role = e.getAttribute("role");
+    const opens = part && e.matches(".q-item") && e.closest(".q-expansion-item__container > *") === e;
+    const own = role || (e.tagName === "INPUT" ? e.type || "text" : e.tagName.toLowerCase());
+    const kind = !opens ? own : part.classList.contains("q-expansion-item--expanded") ? "close" : "open";
     const tab = document.querySelector("header [role=tab][aria-selected=true]")?.textContent ?? "";
     const words = (label || e.textContent || e.placeholder || "").replace(/[\\s"\\\\]+/g, " ").trim().slice(0, 60);
-    const name = `${tab} | ${kind} | ${words}`, number = (seen[name] = (seen[name] ?? 0) + 1);
+    const name = `${tab} | ${opens ? "part" : kind} | ${words}`, number = (seen[name] = (seen[name] ?? 0) + 1);
     e.dataset.control = `${name} | ${number}`;
     found.push([e.dataset.control, kind]);
   }
@@ -94,7 +99,7 @@ def use(page: Any, name: str, kind: str) -> None:
     """Use one control as a hand would: press it, choose another entry, move it, type into it."""
     control = page.locator(f'[data-control="{name}"]').first
     if not control.is_visible() or not control.is_enabled():
-        return  # another one has taken it away
+        return  # it has been taken away since it was listed
     if kind == "combobox":
         control.click()
         entry = page.locator(".q-menu .q-item").last
@@ -118,20 +123,25 @@ def use(page: Any, name: str, kind: str) -> None:
 
 
 def use_all(page: Any) -> set[str]:
-    """Use every control once, those that others bring along too, and return their names; the tabs of the page last of all."""
+    """Use every control once, those that others bring along too, and return their names; parts are opened first, and closed last."""
     done: set[str] = set()
+    tries: dict[str, int] = {}
+    page.set_default_timeout(WAIT)
     while True:
         listed = page.evaluate(LISTED, CONTROLS)
         rest = [(name, kind) for name, kind in listed if name not in done]
-        rest.sort(key=lambda c: (c[1] == "tab", "Cancel" in c[0]))
+        rest.sort(key=lambda c: ("open", "", "close", "tab").index(c[1] if c[1] in ("open", "close", "tab") else ""))
         if not rest:
             return done
         name, kind = rest[0]
         done.add(name)
         try:
             use(page, name, kind)
-        except sync_api.Error as error:
-            raise AssertionError(f"control {name!r} cannot be used: {error}") from None
+        except sync_api.TimeoutError as error:
+            tries[name] = tries.get(name, 0) + 1
+            if page.locator(f'[data-control="{name}"]').count() or tries[name] > 3:
+                raise AssertionError(f"control {name!r} cannot be used: {error}") from None
+            done.discard(name)  # its part of the page was built anew meanwhile, and is listed again
         page.wait_for_timeout(REST)
         told = [t for t in page.locator(".q-notification").all_inner_texts() if FAILED in t]
         assert not told, f"after {name!r}: {told}"
