@@ -9,6 +9,7 @@ from pathlib import Path
 from nicegui import run, ui
 
 import hvdc_ident as hi
+from hvdc_ident.app.study_folder import safe_name
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.report.page import write_report
 from hvdc_ident.study.export import write
@@ -32,8 +33,8 @@ class ExportButtons:
 
     def build(self) -> None:
         """Build the buttons."""
-        ui.label("Take away").classes("text-caption text-grey")
-        with ui.row().classes("w-full gap-1"):
+        ui.label("Take away").classes("small")
+        with ui.element("div").classes("line"):
             ui.button("Report", on_click=self._report).props("outline dense no-caps").classes("q-px-sm")
             letter = ui.button("Letter", on_click=self._letter).props("outline dense no-caps").classes("q-px-sm")
             letter.tooltip(
@@ -65,10 +66,11 @@ class ExportButtons:
 
     async def _export(self, ending: str) -> None:
         study, folder = self._of()
+        name = safe_name(f"{study.model.name}{ending}")  # the model's own: that of the study is another file's beside it
 
         def made() -> tuple[bytes, str]:
             with tempfile.TemporaryDirectory() as place:
-                written = write(study, Path(place) / f"{study.path.stem}{ending}", folder=folder)
+                written = write(study, Path(place) / name, folder=folder)
                 return written.path.read_bytes(), written.note
 
         try:
@@ -78,5 +80,5 @@ class ExportButtons:
             return
         if found is not None:
             content, note = found
-            ui.download.content(content, f"{study.path.stem}{ending}")
-            ui.notify(f"{study.path.stem}{ending}: {note}", type="info", multi_line=True)
+            ui.download.content(content, name)
+            ui.notify(f"{name}: {note}", type="info", multi_line=True)

@@ -1,27 +1,23 @@
-"""A slider of one parameter, with its value in words beside it."""
+"""One parameter on the page: its slider, its value and the ends of its span to be typed, and whether it is fitted."""
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable
 from typing import Any
 
 from nicegui import ui
 
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.text import quantity
 
 THROTTLE = 0.025
 """Least time between two values that a slider sends, s: a frame of a screen at 40 Hz."""
-STEPS = 500
-"""Positions of a slider."""
 
 
-class Knob:
-    """A slider between the ends of a span, in the parameter's unit, logarithmic where asked; `moved` takes each value.
+class Knob(ui.element, component="knob.js"):  # type: ignore[call-arg]
+    """A slider between the ends of a span, in the parameter's unit, logarithmic where that is above 0 and wide.
 
-    label: what stands before it (default: the name). began: called when it is seized with the mouse.
+    moved: takes each value; began: called when a change by hand begins; spanned: takes another span. fitted: whether the parameter is
+    one of those to estimate, which `chosen` takes when it changes; None offers no choice.
     """
 
     def __init__(
@@ -32,37 +28,28 @@ class Knob:
         value: float,
         moved: Callable[[float], None],
         *,
-        log: bool,
-        label: str = "",
-        began: Callable[[], None] | None = None,
+        began: Callable[[], None],
+        spanned: Callable[[tuple[float, float]], None],
+        fitted: bool | None = None,
+        chosen: Callable[[bool], None] | None = None,
     ) -> None:
-        self._unit = parameter.unit
-        self._to: Callable[[float], float] = math.log if log else float
-        back: Callable[[float], float] = math.exp if log else float
-        low, high = map(self._to, span)
-        with ui.row().classes("w-full items-center no-wrap gap-2"):
-            ui.label(label or name).classes("col-4 ellipsis").tooltip(parameter.description or name)
-            self._slider = ui.slider(min=low, max=high, step=(high - low) / STEPS, value=self._to(value)).classes("col")
-            self._slider.props(f'aria-label="{name}" dense')
-            self._shown = ui.label(quantity(value, self._unit)).classes("col-3 text-right text-caption")
+        super().__init__()
+        self._value = value
+        self._props.update(name=name, title=parameter.description or name, unit=parameter.unit, low=span[0], high=span[1])
+        self._props.update(value=value, fit=fitted)
 
         def changed(event: Any) -> None:
-            moved(back(float(event.args)))
+            self._value = float(event.args)
+            moved(self._value)
 
-        def seized(event: Any) -> None:
-            if began is not None and event.args == "start":
-                began()
-
-        self._slider.on("update:model-value", changed, throttle=THROTTLE)
-        self._slider.on("pan", seized)
-
-    def tell(self, value: float) -> None:
-        """Show the value where the slider stands: without a change of an element, which would draw the whole page anew."""
-        text = json.dumps(quantity(value, self._unit))
-        self._shown.client.run_javascript(f"getHtmlElement({self._shown.id}).textContent = {text}")
+        self.on("moved", changed, throttle=THROTTLE)
+        self.on("began", began)
+        self.on("spanned", lambda event: spanned((float(event.args[0]), float(event.args[1]))))
+        if chosen is not None:
+            self.on("chosen", lambda event: chosen(bool(event.args)))
 
     def put(self, value: float) -> None:
-        """Set the slider to a value, and show it."""
-        self._shown.text = quantity(value, self._unit)
-        if not math.isclose(self._slider.value, self._to(value), rel_tol=1e-9, abs_tol=1e-12):
-            self._slider.value = self._to(value)
+        """Set the slider to a value, and show it; what a user has set stands there already."""
+        if value != self._value:
+            self._value = self._props["value"] = value
+            self.run_method("put", value)

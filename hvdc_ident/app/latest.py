@@ -25,6 +25,7 @@ class Latest:
         rested: Callable[[], Awaitable[None]] | None = None,
     ) -> None:
         self._work, self._show, self._rested = work, show, rested
+        self._client = context.client  # that of the page, which outlasts the element whose handler asks
         self._asked: list[Any] = []
         self._number = 0
         self._busy = False
@@ -35,7 +36,7 @@ class Latest:
         self._number += 1
         if not self._busy:
             self._busy = True
-            background_tasks.create(self._catch_up(), context=context.client)  # which shows what it raises
+            background_tasks.create(self._catch_up(), context=self._client)  # which shows what it raises
 
     async def _catch_up(self) -> None:
         try:

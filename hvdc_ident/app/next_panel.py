@@ -12,11 +12,13 @@ from nicegui import run, ui
 import hvdc_ident as hi
 from hvdc_ident.app.plot import GIVEN, NOW, Grid, Plot, Trace, thinned
 from hvdc_ident.app.supposed import PlannedExperiment, Supposition, planned_experiments, refitted
+from hvdc_ident.colours import SERIES
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.summary.phrases import WORDS
 from hvdc_ident.text import with_unit
 
-COLORS = ("#2a9d5c", "#b0569f", "#c2452d", "#8a6d1f", "#3a8f98")
+COLORS = SERIES[1:6]
 """Colours of the rivals."""
 MOST = len(COLORS)
 TALL = 150
@@ -54,30 +56,28 @@ def planned_run(
 class NextExperiment:
     """The experiments that the analysis recommends, or that could be made, and a button that simulates the chosen one.
 
-    fitted: values of the study's model. rivals: models with what a diagnosis found.
+    fitted: the model with its fitted values. rivals: models with what a diagnosis found.
     """
 
     def __init__(
         self,
         study: hi.Study,
         identified: Mapping[str, Any],
-        fitted: Mapping[str, float],
+        fitted: Supposition | None,
         rivals: tuple[Supposition, ...],
     ) -> None:
         self._study = study
         self._planned = planned_experiments(study, identified)
-        own = {n: v for n, v in fitted.items() if n in study.model.parameters}
-        best = Supposition("fitted" if own else "given values", study.model.with_values(own))
-        self._models = (best, *rivals[:MOST])
+        self._models = (fitted or Supposition(WORDS["given"], study.model), *rivals[:MOST])
 
     def build(self) -> None:
         """Build the choice and the button; nothing where no input can be moved."""
         if not self._planned:
             return
-        with ui.row().classes("w-full items-center gap-3"):
+        with ui.element("div").classes("line"):
             words = {k: p.words for k, p in enumerate(self._planned)}
             self._which = ui.select(words, value=0, label="experiment", on_change=self._choose)
-            self._which.props("dense options-dense").style("min-width: 26rem; max-width: 40rem")
+            self._which.props("dense options-dense").style("min-width: min(26rem, 80vw); max-width: 40rem")
             signals = self._signals()
             first = [s for s in self._planned[0].record if s in signals]
             self._record = ui.select(signals, value=first or signals[:1], label="signals", multiple=True)
@@ -85,8 +85,8 @@ class NextExperiment:
             self._button = ui.button("Simulate it", on_click=self._simulate).props("dense no-caps").classes("q-px-md")
         if len(self._models) > 1:
             told = "Drawn for the fitted model and for what may be missing, each at its best fit: where curves part, a record tells."
-            ui.label(told).classes("text-caption")
-        self._trouble = ui.label("").classes("text-negative").props('role="alert"')
+            ui.label(told).classes("small")
+        self._trouble = ui.label("").classes("alert").props('role="alert"')
         self._place = ui.column().classes("w-full gap-0")
 
     def _signals(self) -> list[str]:

@@ -13,7 +13,7 @@ def show_errors() -> None:
 
 
 def _shown(error: Exception) -> None:
-    ui.notify(words_of(error), type="negative", timeout=0, close_button="Close", multi_line=True, position="top")
+    ui.notify(words_of(error), type="negative", timeout=0, close_button="Close", multi_line=True, position="bottom")
 
 
 def words_of(error: Exception) -> str:

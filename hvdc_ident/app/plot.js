@@ -1,18 +1,35 @@
 // Curves on canvas, drawn by uPlot: grids one above the other with one abscissa and one cursor, or a plane of points.
 // put(grid, column, values) replaces one column of one grid's data; whole(grid, columns) replaces all of them, and
 // refine(grid, columns) does so while the same part of the abscissa stays in view. mark(key, at) moves a marker.
-const INK = "#7a8089", FAINT = "rgba(122,128,137,0.22)", FONT = "12px system-ui, sans-serif";
+// Of a plane it draws what lies on it: the axis of the imaginary numbers, and at each pole its frequency and damping.
+const FONT = "12px system-ui, sans-serif", WIDE = 62;
+const ink = () => paint("var(--soft)"), faint = () => paint("var(--grid)");
 const axis = (label, side) => ({
-  label, side, stroke: INK, font: FONT, labelFont: FONT, labelSize: 16, size: side === 2 ? 26 : 58, gap: 3,
-  ...(side === 3 ? { values: (u, at) => at.map((v) => (v == null ? "" : String(+v.toPrecision(6)))) } : {}),
-  grid: { stroke: FAINT, width: 1 }, ticks: { stroke: FAINT, width: 1 },
+  label, side, stroke: ink, font: FONT, labelFont: FONT, labelSize: 16, size: side === 2 ? 26 : WIDE, gap: 3, space: side === 2 ? 60 : 18,
+  grid: { stroke: faint, width: 1 }, ticks: { stroke: faint, width: 1 },
 });
 
 // Numbers along an axis with as many decimals as tell them apart.
-const told = (u, splits, axis, space, step) => {
+const digits = (u, splits, axis, space, step) => {
+  const far = Math.max(...splits.map((v) => Math.abs(v ?? 0)));
+  if (far >= 1e5 || (far > 0 && far < 1e-2)) return splits.map((v) => (v == null ? "" : v ? (+v.toPrecision(3)).toExponential() : "0"));
   let places = 0;
   while (places < 12 && Math.abs(step * 10 ** places - Math.round(step * 10 ** places)) > 1e-6) places += 1;
   return splits.map((v) => (v == null ? "" : v.toFixed(places)));
+};
+
+// Along a logarithmic axis the decades alone: 1, 10, 100, 1k, 10k.
+const decades = (u, splits) => splits.map((v) => {
+  if (v == null || Math.abs(Math.log10(v) - Math.round(Math.log10(v))) > 1e-9) return "";
+  return v >= 1e6 ? `${v / 1e6}M` : v >= 1e3 ? `${v / 1e3}k` : String(+v.toPrecision(1));
+});
+
+// A plane's ends: around 0 and beyond all points, so that none stands on an edge; of a part that is looked at, its own.
+const around = (u, low, high, key) => {
+  const all = (key === "x" ? u.data[0] : u.data.slice(1).flatMap((c) => [...c])).filter((v) => v != null);
+  if (low > Math.min(...all) || high < Math.max(...all)) return [low, high];
+  const [a, b] = [Math.min(low ?? 0, 0), Math.max(high ?? 0, 0)], pad = 0.12 * (b - a || 1);
+  return [a - pad, b + pad];
 };
 
 // The ordinate's ends: a tenth beyond the curves, and of one that stands still a little about its level.
@@ -39,8 +56,48 @@ const crosses = (color) => (u, k) => {
     ctx.moveTo(a - r, b - r); ctx.lineTo(a + r, b + r); ctx.moveTo(a - r, b + r); ctx.lineTo(a + r, b - r);
   });
   ctx.stroke();
+  label(u, k, ctx);
   ctx.restore();
   return false;
+};
+
+// What a pole is, beside its cross: of a pair its frequency and damping, else its time constant; where there is room for it.
+const named = (x, y) => {
+  const size = Math.hypot(x, y), text = (v) => String(+v.toPrecision(3));
+  if (y) return `${text(Math.abs(y) / (2 * Math.PI))} Hz, ζ ${text(-x / size)}`;
+  if (!x) return "0";
+  const time = 1 / Math.abs(x), [scale, unit] = time < 1e-3 ? [1e6, "µs"] : time < 1 ? [1e3, "ms"] : [1, "s"];
+  return `${text(time * scale)} ${unit}${x > 0 ? ", unstable" : ""}`;
+};
+const label = (u, k, ctx) => {
+  const taken = [], tall = 14 * devicePixelRatio;
+  ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+  ctx.fillStyle = paint("var(--ink)");
+  ctx.textAlign = "left";
+  ctx.textBaseline = "alphabetic";
+  u.data[0].forEach((x, n) => {
+    const y = u.data[k][n];
+    if (y == null || y < 0) return;  // the other of a pair says the same
+    const words = named(x, y), wide = ctx.measureText(words).width, a = u.valToPos(x, "x", true), b = u.valToPos(y, "y", true);
+    const edge = u.bbox.left + u.bbox.width, left = a + 9 * devicePixelRatio + wide > edge ? a - wide - 9 * devicePixelRatio : a + 9 * devicePixelRatio;
+    const box = [left, b - tall, left + wide, b];
+    if (taken.some((o) => box[0] < o[2] && box[2] > o[0] && box[1] < o[3] && box[3] > o[1])) return;
+    taken.push(box);
+    ctx.fillText(words, left, b - 3 * devicePixelRatio);
+  });
+};
+
+// The line between the stable and the unstable half of a plane.
+const upright = (u) => {
+  const x = u.valToPos(0, "x", true), { ctx, bbox } = u;
+  if (x < bbox.left || x > bbox.left + bbox.width) return;
+  ctx.save();
+  ctx.strokeStyle = ink();
+  ctx.lineWidth = devicePixelRatio;
+  ctx.beginPath();
+  ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height);
+  ctx.stroke();
+  ctx.restore();
 };
 
 export default {
@@ -71,12 +128,12 @@ export default {
         const series = [{ label: this.xtitle, value: (u, v) => (v == null ? "–" : v.toPrecision(5)) }];
         grid.curves.forEach((c) => series.push(this.curve(c)));
         const options = {
-          width: this.$el.clientWidth || 300, height: this.tall(g), series, padding: [8, 12, 0, 0],
-          scales: { x: { time: false, distr: this.log ? 3 : 1 }, y: { range: spread } },
-          axes: [{ ...axis(g === last ? this.xtitle : "", 2), size: g === last ? 34 : 8, values: g < last ? () => [] : this.log ? undefined : told }, { ...axis(grid.title, 3), values: told }],
+          width: this.$el.clientWidth || 300, height: this.tall(g), series, padding: [8, 20, 0, 0],
+          scales: { x: { time: false, distr: this.log ? 3 : 1, ...this.ends() }, y: { range: this.plane ? around : spread } },
+          axes: [{ ...axis(g === last ? this.xtitle : "", 2), size: g === last ? 34 : 8, values: g < last ? () => [] : this.log ? decades : digits }, { ...axis(grid.title, 3), values: digits }],
           cursor: { sync: { key: this.sync.key }, drag: { x: true, y: this.plane } },
           legend: { show: true, live: !this.plane }, focus: { alpha: 1 },
-          hooks: this.markers?.length ? this.marking(g) : {},
+          hooks: this.plane ? { drawAxes: [upright] } : this.markers?.length ? this.marking(g) : {},
         };
         const empty = [[], ...grid.curves.map(() => [])];
         const plot = new uPlot(options, this.data?.[g] ?? empty, this.$el);
@@ -129,6 +186,10 @@ export default {
           this.later = setTimeout(() => this.$emit("viewed", { from: u.scales.x.min, to: u.scales.x.max }), 120);
         }],
       };
+    },
+    // The ends of the abscissa: of a plane around 0, of decades the data's own; else the plot's.
+    ends() {
+      return this.plane ? { range: around } : this.log ? { range: (u, low, high) => [low ?? 1, high ?? 10] } : {};
     },
     span() {
       const x = this.plots[0].data[0];

@@ -15,25 +15,18 @@ import numpy as np
 from nicegui import ui
 from numpy.typing import NDArray
 
-from hvdc_ident.colours import DARK, LIGHT, style, variable
+from hvdc_ident.colours import variable
 from hvdc_ident.data import Array
+from hvdc_ident.report.drawing import base_style
 
 RECORDED, GIVEN, NOW, EFFECT = (variable(name) for name in ("measured", "given", "fitted", "effect"))
 """Colours, as the page's style sheet names them; `NOW` is that of the values at hand."""
 MOST = 4000
 """Rows that are drawn as they are: a screen has fewer columns than half of them."""
 ASSETS = Path(__file__).parent / "static" / "uplot"
-HEAD = f"<style>:root {{ {style(LIGHT)} }} .body--dark {{ {style(DARK)} }}</style>"
-HEAD += """<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/assets/uPlot.iife.min.js"></script>
-<style>.plot .u-legend { font: 11px system-ui, sans-serif; margin: 0; text-align: left; padding-left: 58px; }
-.plot .u-legend th { font-weight: 400; } .plot .u-legend .u-marker { border-width: 2px; width: .8em; height: .8em; }
-.plot .u-legend .u-series > * { padding: 0 2px; } .plot .u-value { min-width: 5.5em; }
-.plot .marker { position: absolute; top: 0; bottom: 0; width: 13px; margin-left: -6px; cursor: ew-resize; z-index: 101; }
-.plot .marker > i { position: absolute; left: 6px; top: 0; bottom: 0; border-left: 1.5px solid; }
-.plot .marker > b { position: absolute; left: 9px; top: 0; font: 600 11px system-ui, sans-serif; white-space: nowrap; }
-.plot .marker:focus-visible { outline: 2px solid; }
-.body--dark .text-primary { --q-primary: #6fb0f0; }</style>"""
-"""Head of a page with plots; the server offers the folder `ASSETS` as /assets."""
+HEAD = f"""<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/assets/uPlot.iife.min.js"></script>
+<style>{base_style()}{(Path(__file__).parent / "page.css").read_text("utf-8")}</style>"""
+"""Head of the page: the report's type and colours, the page's own; the server offers the folder `ASSETS` as /assets."""
 
 
 @dataclass(frozen=True)

@@ -4,27 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 from nicegui import ui
 
-import hvdc_ident as hi
 from hvdc_ident.app.next_panel import NextExperiment
+from hvdc_ident.app.page import Page
 from hvdc_ident.app.plot import EFFECT, GIVEN, NOW, RECORDED, Grid, Plot, Trace, thinned
-from hvdc_ident.app.result_tables import (
-    overlay_columns,
-    profile_columns,
-)
-from hvdc_ident.app.supposed import suppositions
-from hvdc_ident.app.what_if import WhatIf
+from hvdc_ident.app.results import FoundResults
+from hvdc_ident.axes import joined
+from hvdc_ident.data import Array
 from hvdc_ident.display import Table
-from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.report.overlay import overlay_of
-from hvdc_ident.study.stages import stage
-from hvdc_ident.summary import Results, RunSummary, summarise
-from hvdc_ident.summary.phrases import WORDS, advice, verdict_sentence
+from hvdc_ident.report.html import table_of
+from hvdc_ident.report.overlay import Overlay, overlay_of
+from hvdc_ident.summary import Results
+from hvdc_ident.summary.phrases import WORDS, advice
 from hvdc_ident.summary.tables import findings_table, sets_table, values_table, verdicts_table
 from hvdc_ident.text import with_unit
 
@@ -37,89 +32,51 @@ KINDS = ("signals", "errors")
 
 
 @dataclass(frozen=True)
-class FoundResults:
-    """The results of a study in a folder: the JSON by stage of those that ran to their end."""
-
-    study: hi.Study
-    folder: Path
-    data: Mapping[str, Mapping[str, Any]]
-
-    def of(self, stage: str) -> Mapping[str, Any]:
-        """Return the JSON of a stage; empty where it has not run."""
-        return self.data.get(stage, {})
-
-    @cached_property
-    def summary(self) -> RunSummary:
-        """Summary of the results."""
-        return summarise({Path(stage(n).file).stem: data for n, data in self.data.items()})
-
-
-@dataclass(frozen=True)
 class Panel:
     """A panel of results. uses: the stages it shows, the first of which it needs. build: builds its elements on the page."""
 
     title: str
     uses: tuple[str, ...]
-    build: Callable[[FoundResults], None]
+    build: Callable[[FoundResults, Page], None]
 
     def key(self, found: FoundResults) -> tuple[Any, ...]:
         """Return what changes whenever the panel has something else to show."""
         marks = tuple(found.of(n).get("fingerprint") for n in self.uses)
         return found.folder, tuple(found.study.sources.items()), marks
 
-    def show(self, found: FoundResults, place: Any) -> None:
-        """Show the results in an element of the page, in place of what it holds."""
-        place.clear()
-        with place:
-            if found.of(self.uses[0]):
-                self.build(found)
-            else:
-                ui.label(f"Not there yet: run the stage {self.uses[0]}, or all.").classes("text-grey")
+
+def show_table(table: Table) -> None:
+    """Show a table as the report does; nothing without rows."""
+    if table.rows:
+        ui.html(table_of(table), sanitize=False).classes("w-full")
 
 
-def show_table(table: Table) -> Any:
-    """Show a table of text, one line of the page for a row."""
-    columns = []
-    for k, name in enumerate(table.header):
-        numbers = all(isinstance(row[k], int | float | None) for row in table.rows)
-        columns.append({"name": str(k), "label": name, "field": str(k), "align": "right" if numbers else "left"})
-    rows = [
-        {str(k): "" if v is None else f"{v:.12g}" if isinstance(v, float) else v for k, v in enumerate(row)}
-        for row in table.rows
-    ]
-    shown = ui.table(columns=columns, rows=rows, row_key="0", pagination=0).props(
-        "dense flat wrap-cells hide-pagination"
-    )
-    return shown.classes("w-full")
-
-
-def _identifiability(found: FoundResults) -> None:
-    """Build the verdicts, and the profile of the parameter that is opened."""
+def _identifiability(found: FoundResults, page: Page) -> None:
+    """Build the verdicts, and the profile of the parameter that is chosen."""
     data = found.of("identify")
     if data.get("misspecified"):
         signs = data["misspecification"]
         ui.label(f"The model does not explain these data: {'; '.join(signs['signs'])}.")
+    show_table(verdicts_table(data))
     profiles = {n: p for n, p in (data.get("profiles") or {}).items() if len(p.get("values") or ()) > 1}
-    table = show_table(verdicts_table(data))
-    table.add_slot(
-        "body-cell-0",
-        '<q-td :props="props"><q-btn flat dense no-caps no-wrap color="primary" icon-right="show_chart" :label="props.value"'
-        " :aria-label=\"'Profile of ' + props.value\" @click=\"$parent.$emit('open', props.value)\" /></q-td>",
-    )
-    place = ui.column().classes("w-full gap-0")
-    table.on("open", lambda event: _open(data, profiles, str(event.args), place))
-    if profiles:
-        _open(data, profiles, next(iter(profiles)), place)
+    if not profiles:
+        return
+    first = next(iter(profiles))
+    which = ui.toggle(list(profiles), value=first).props("dense no-caps unelevated").classes("q-mt-sm")
+    place = ui.element("div").classes("w-full")
+
+    def draw() -> None:
+        _draw_profile(data, profiles[which.value], which.value, place)
+
+    which.on_value_change(draw)
+    draw()
 
 
-def _open(data: Mapping[str, Any], profiles: Mapping[str, Any], name: str, place: Any) -> None:
+def _draw_profile(data: Mapping[str, Any], profile: Mapping[str, Any], name: str, place: Any) -> None:
     place.clear()
     with place:
-        if name not in profiles:
-            ui.label(f"No profile of {name}: it was not fitted, or its cost was not followed.").classes("text-grey")
-            return
         unit = data["parameters"].get(name, {}).get("unit", "")
-        ui.label(f"Profile of {name}: the least cost over all other parameters").classes("text-subtitle2")
+        ui.label(f"Profile of {name}: the least cost over all other parameters").classes("small")
         curves = (
             Trace("rise of the cost", NOW),
             Trace("computed", NOW, mark="dot", size=6),
@@ -128,27 +85,40 @@ def _open(data: Mapping[str, Any], profiles: Mapping[str, Any], name: str, place
         )
         grid = Grid("rise of the cost / 95 % level", curves)
         plot = Plot([grid], with_unit(name, unit), 330, f"Profile of {name}").classes("w-full")
-        plot.whole(0, profile_columns(profiles[name]))
+        plot.whole(0, profile_columns(profile))
 
 
-def _fitted(found: FoundResults) -> None:
+def profile_columns(profile: Mapping[str, Any]) -> list[Array]:
+    """Return the columns of a profile's picture, (n,) each: the values, the rise of the cost between what was computed, the
+    rise computed, the 95 % level, and the ends of the interval; the rise in units of that level, nan where there is none.
+    """
+    x = np.array(profile["values"], dtype=float)
+    rise = np.array(profile["rises"], dtype=float) / profile["threshold"]
+    ends = [end for side in ("lower", "upper") if (end := profile[side]["limit"]) is not None]
+    dense, between = joined(x, rise)
+    at = np.unique(np.concatenate([dense, x, ends]))
+
+    def only(places: Any, values: Any) -> Array:
+        column = np.full(at.size, np.nan)
+        column[np.searchsorted(at, places)] = values
+        return column
+
+    return [at, np.interp(at, dense, between), only(x, rise), np.ones(at.size), only(ends, 1.0)]
+
+
+def _fitted(found: FoundResults, page: Page) -> None:
     """Build the values, and recorded, given and fitted waveforms of an experiment."""
-    ui.label(verdict_sentence(found.summary))
     show_table(values_table(found.summary))
     results = Results(found.folder)
-    try:
-        names = [n for n in results.experiments if results.table(f"fit.{n}.csv") is not None]
-    except HvdcIdentError as error:
-        ui.label(str(error)).classes("text-negative")
-        return
+    names = [n for n in results.experiments if results.table(f"fit.{n}.csv") is not None]
     if not names:
         return
     roles = {n: "held out" if results.experiments[n].get("role") == "holdout" else "fitted" for n in names}
-    with ui.row().classes("w-full items-center gap-3"):
+    with ui.element("div").classes("line"):
         which = ui.select({n: f"{n} ({roles[n]})" for n in names}, value=names[0], label="experiment")
         which.props("dense options-dense").style("min-width: 14rem")
-        kind = ui.toggle(list(KINDS), value=KINDS[0]).props("dense no-caps")
-    place = ui.column().classes("w-full gap-0")
+        kind = ui.toggle(list(KINDS), value=KINDS[0]).props("dense no-caps unelevated")
+    place = ui.element("div").classes("w-full")
 
     def draw() -> None:
         _overlay(results, which.value, place, errors=kind.value == KINDS[1])
@@ -170,38 +140,47 @@ def _overlay(results: Results, experiment: str, place: Any, *, errors: bool) -> 
             plot.whole(k, thinned(*overlay_columns(overlay, sets, errors=errors)))
 
 
-def _diagnosed(found: FoundResults) -> None:
-    """Build findings, gaps, and the records with what was found at a size that a slider sets."""
+def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = False) -> list[Array]:
+    """Return the columns of an output's picture, (n,) each: time, recorded, and the runs by set of values; nan where one is not.
+
+    errors: recorded less simulated in place of the runs, and none in place of the recorded signal.
+    """
+    record = overlay.record
+    missing = np.full(record.time.size, np.nan)
+    columns = [record.time, missing if errors else record[f"{overlay.output}.measured"]]
+    for name in sets:
+        run = overlay.runs.get(name)
+        if run is None or run.time.size != record.time.size:
+            columns.append(missing)
+        else:
+            columns.append(overlay.error(name) if errors else run[overlay.output])
+    return columns
+
+
+def _diagnosed(found: FoundResults, page: Page) -> None:
+    """Build what the diagnosis says, its findings, and the errors with each set of values."""
     data = found.of("diagnose")
-    ui.label(str(data.get("text") or data.get("verdict", ""))).classes("text-body2")
-    findings, errors = findings_table(found.summary), sets_table(found.summary)
-    if findings.rows:
-        show_table(findings)
-    if errors.rows:
-        with ui.row().style("max-width: 40rem"):
-            show_table(errors)
-    try:
-        models = suppositions(found.study, data, found.folder)
-    except HvdcIdentError as error:
-        ui.label(str(error)).classes("text-negative")
-        return
-    if models and found.study.experiments:
-        before = data.get("parameters_refitted") or data.get("parameters_before") or {}
-        told = str((data.get("sizes") or {}).get("experiment", ""))
-        WhatIf(found.study, models, before, told).build()
+    ui.label(str(data.get("text") or data.get("verdict", "")))
+    show_table(findings_table(found.summary))
+    show_table(sets_table(found.summary))
+    models, trouble = found.supposed
+    ui.label(trouble).classes("alert")
+    if models:
+        button = ui.button("Explore it with sliders", on_click=lambda: page.explore(models[0].name))
+        button.props("outline dense").classes("q-px-sm self-start")
+        button.tooltip("Opens the model with what was found on the tab Explore; its rivals stand there under “model with”.")
+    results = Results(found.folder)
+    told = str((data.get("sizes") or {}).get("experiment", "")) or next(iter(results.experiments), "")
+    ui.label(f"Recorded less simulated in {told}, without and with what was found").classes("small q-mt-sm")
+    _overlay(results, told, ui.element("div").classes("w-full"), errors=True)
 
 
-def _next(found: FoundResults) -> None:
+def _next(found: FoundResults, page: Page) -> None:
     """Build what to record next, simulated before it is made."""
-    identified, diagnosis = found.of("identify"), found.of("diagnose")
-    ui.label(advice(found.summary) or found.summary.unadvised or "The results ask for no further record.").classes("text-body2")
-    try:
-        rivals = suppositions(found.study, diagnosis, found.folder)
-    except HvdcIdentError as error:
-        ui.label(str(error)).classes("text-negative")
-        return
-    fitted = {n: v for n, v in (found.of("fit").get("values") or {}).items() if v is not None}
-    NextExperiment(found.study, identified, fitted, rivals).build()
+    ui.label(advice(found.summary) or found.summary.unadvised or "The results ask for no further record.")
+    models, trouble = found.supposed
+    ui.label(trouble).classes("alert")
+    NextExperiment(found.study, found.of("identify"), found.fitted, models).build()
 
 
 PANELS = (

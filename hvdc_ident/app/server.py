@@ -10,30 +10,19 @@ import socket
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import cache
+from typing import TYPE_CHECKING
 
-from hvdc_ident.app.desk import Desk, opened
+from hvdc_ident.app.desk import opened
 from hvdc_ident.app.guard import LOOPBACK, Guard
 from hvdc_ident.app.study_folder import MOST_BYTES
-from hvdc_ident.colours import FITTED
 from hvdc_ident.errors import InputError
+
+if TYPE_CHECKING:
+    from hvdc_ident.app.page import Tab
 
 RECONNECT = 120.0
 """Seconds for which a page that lost its connection keeps what it shows: a busy machine and a closed lid are no reason to forget."""
-
-
-@dataclass(frozen=True)
-class Tab:
-    """A tab of the page: its place in the order, its title, and a function that builds it for a desk inside NiceGUI's context.
-
-    maps: whether it is the one that a desk with a recording opens at.
-    """
-
-    order: int
-    title: str
-    build: Callable[[Desk], None]
-    maps: bool = False
 
 
 def serve(
@@ -61,6 +50,7 @@ def serve(
             from fastapi.staticfiles import StaticFiles
             from nicegui import ui
 
+            from hvdc_ident.app.page import Page
             from hvdc_ident.app.plot import ASSETS
 
             tabs()  # what they import is of the extra, too
@@ -79,7 +69,7 @@ def serve(
 
         def page() -> None:
             lying[0] = lying[0].renewed()
-            _page(lying[0])
+            Page(lying[0]).build(tabs())
 
         ui.run_with(
             outer,
@@ -127,25 +117,3 @@ def tabs() -> tuple[Tab, ...]:
 
     found = [importlib.import_module(f"{folder.__name__}.{m.name}").TAB for m in pkgutil.iter_modules(folder.__path__)]
     return tuple(sorted(found, key=lambda t: t.order))
-
-
-def _page(desk: Desk) -> None:
-    """Build the page for a browser that has come."""
-    from nicegui import ui
-
-    from hvdc_ident.app.page_errors import show_errors
-    from hvdc_ident.app.plot import HEAD
-
-    show_errors()
-    ui.add_head_html(HEAD)
-    ui.colors(primary=FITTED, negative="#d64545")
-    with ui.header().classes("items-center q-py-none"):
-        ui.label(desk.title).classes("text-subtitle1 text-bold")
-        with ui.tabs().props("dense") as bar:
-            for tab in tabs():
-                ui.tab(tab.title)
-    first = next((t for t in tabs() if t.maps and desk.recording), tabs()[0])
-    with ui.tab_panels(bar, value=first.title).classes("w-full"):
-        for tab in tabs():
-            with ui.tab_panel(tab.title).classes("q-pa-sm"):
-                tab.build(desk)

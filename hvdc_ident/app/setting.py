@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -47,13 +47,16 @@ class InputCourse:
 class Setting:
     """A model with values, courses of its inputs and what is looked at, of which the tab Explore shows the answers.
 
-    model: with effects, if any. values: of its parameters, where they differ from the model's, in their units. courses: of
+    base: the model without what is added here; effects: that, as `hvdc_ident.apply_effects` takes it; model: with it. values: of its
+    parameters, where they differ from the model's, in their units. courses: of
     its inputs. end: of the run, s, with so many rows. outputs: whose waveforms are shown. channel: input and output of the
     frequency response. opened: the signal at which the loop is opened for it instead; port: at which an impedance is seen
     instead. record: an experiment of the study in place of the courses.
     """
 
+    base: AnyModel
     model: AnyModel
+    effects: tuple[FrozenMap[Any], ...] = ()
     values: FrozenMap[float] = field(default_factory=FrozenMap)
     courses: FrozenMap[InputCourse] = field(default_factory=FrozenMap)
     end: float = 1.0
@@ -74,7 +77,7 @@ class Setting:
         outputs = tuple(record.outputs if record else model.outputs)
         end = float(record.time[-1]) if record else 1.0
         return cls(
-            model, courses=FrozenMap(inputs), end=end, outputs=outputs[:3], channel=(first, outputs[0]), record=record
+            model, model, courses=FrozenMap(inputs), end=end, outputs=outputs[:3], channel=(first, outputs[0]), record=record
         )
 
     @property
@@ -102,12 +105,12 @@ class Setting:
         return replace(self, courses=self.courses | {name: course})
 
     def run(self, sensitivities: tuple[str, ...] = ()) -> Simulation:
-        """Return the waveforms of the chosen outputs. Raises as `hvdc_ident.simulate`."""
-        own = {n: v for n, v in self.values.items() if n in self.model.parameters}
+        """Return the waveforms of the chosen outputs, and of the recorded ones. Raises as `hvdc_ident.simulate`."""
         if self.record is not None:
-            return hi.simulate(self.model, self.record, own, sensitivities, outputs=self.outputs)
+            outputs = tuple(dict.fromkeys((*self.outputs, *self.record.outputs)))
+            return hi.simulate(self.model, self.record, self.values, sensitivities, outputs=outputs)
         signals = {n: c.signal(self.end) for n, c in self.courses.items()}
-        return hi.simulate(self.model, self.time, own, sensitivities, inputs=signals, outputs=self.outputs)
+        return hi.simulate(self.model, self.time, self.values, sensitivities, inputs=signals, outputs=self.outputs)
 
     def point(self) -> hi.OperatingPoint:
         """Return the operating point of the inputs before any event. Raises as `hvdc_ident.find_operating_point`."""
@@ -137,12 +140,13 @@ class Setting:
     def sensitivities(self) -> dict[str, dict[str, float]]:
         """Return, by parameter and shown output, the RMS of the derivative times the value. Raises as `hvdc_ident.sensitivities`."""
         names = [n for n in self.model.parameters if n in self.parameters]
-        own = {n: v for n, v in self.values.items() if n in self.model.parameters}
         if self.record is not None:
-            found = hi.sensitivities(self.model, self.record, names, values=own)
+            found = hi.sensitivities(self.model, self.record, names, values=self.values)
         else:
             signals = {n: c.signal(self.end) for n, c in self.courses.items()}
-            found = hi.sensitivities(self.model, self.time, names, inputs=signals, outputs=self.outputs, values=own)
+            found = hi.sensitivities(
+                self.model, self.time, names, inputs=signals, outputs=self.outputs, values=self.values
+            )
         assert found.trajectories is not None  # there is an experiment
         rms = found.trajectories.norms["rms"].isel(experiment=0)
         shown = [o for o in self.outputs if o in rms["output"]]
@@ -157,12 +161,36 @@ class Setting:
         return hi.linearize(self.model, point, inputs=self.channel[0], outputs=self.channel[1]).poles()
 
 
-def with_effect(setting: Setting, use: Mapping[str, object]) -> Setting:
-    """Return the setting whose model has one more effect; its sizes are parameters from then on.
+def with_effects(setting: Setting, effects: Iterable[Mapping[str, Any]]) -> Setting:
+    """Return the setting with these effects and no others; their sizes are parameters, which keep the values that they have.
 
-    use: as `hvdc_ident.apply_effects` takes it. Raises ModelError or UnknownNameError for one that does not fit.
+    Raises ModelError or UnknownNameError for one that does not fit.
     """
-    return replace(setting, model=hi.apply_effects(setting.model, [dict(use)]))
+    uses = tuple(FrozenMap(use) for use in effects)
+    return of_model(setting, setting.base, hi.apply_effects(setting.base, uses) if uses else setting.base, uses)
+
+
+def of_model(
+    setting: Setting, base: AnyModel, model: AnyModel | None = None, effects: tuple[FrozenMap[Any], ...] = ()
+) -> Setting:
+    """Return the setting of another model, with the values that are of its parameters."""
+    model = base if model is None else model
+    values = FrozenMap({n: v for n, v in setting.values.items() if n in model.parameters})
+    return replace(setting, base=base, model=model, effects=effects, values=values)
+
+
+def effects_with_sizes(setting: Setting) -> list[dict[str, Any]]:
+    """Return the effects of a setting with its values, as a study's [[model.effect]] states them."""
+    found = []
+    for k, use in enumerate(setting.effects):
+        before = with_effects(setting, setting.effects[:k]).model.parameters
+        now = with_effects(setting, setting.effects[: k + 1]).model.parameters
+        sizes = dict(use["parameters"])
+        for name in (n for n in now if n not in before):
+            key = next(key for key in sizes if name.endswith(f"_{key}"))
+            sizes[key] = setting.parameters[name]
+        found.append({**use, "parameters": sizes})
+    return found
 
 
 def span_of(model: AnyModel, name: str, stated: Mapping[str, tuple[float, float]]) -> tuple[float, float]:

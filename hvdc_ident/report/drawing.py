@@ -239,10 +239,16 @@ def script(body: str) -> tuple[str, str]:
 
 
 @cache
-def style_sheet() -> str:
-    """Return the style sheet of a page, with the colours of its curves."""
+def base_style() -> str:
+    """Return the type, the tiles and the colours, those of curves among them, that report and workbench share."""
     dark = f"@media screen and (prefers-color-scheme: dark) {{ :root {{ {style(DARK)} }} }}"
-    return f":root {{ {style(LIGHT)} }}\n{dark}\n{asset('page.css')}"
+    return f":root {{ {style(LIGHT)} }}\n{dark}\n{asset('base.css')}"
+
+
+@cache
+def style_sheet() -> str:
+    """Return the style sheet of a page."""
+    return base_style() + asset("page.css")
 
 
 @cache

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from hvdc_ident.fit.uncertainty import MOVED
-from hvdc_ident.next_step import next_sentence
+from hvdc_ident.next_step import TO_DO, Door, next_sentence
 from hvdc_ident.report.html import badge, estimate, number, prose, table, table_of, text, typeset
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
@@ -23,10 +25,35 @@ from hvdc_ident.summary.phrases import (
 )
 from hvdc_ident.summary.run_summary import ParameterSummary, Quantity
 from hvdc_ident.summary.tables import PLACES, sets_table
-from hvdc_ident.text import change_text, percentage, probability_text
+from hvdc_ident.text import capital, change_text, percentage, probability_text
 
 ROWS = 9
 """Parameters that are shown; the section has all."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One answer. answer: its sentence; more: what stands below it, both HTML."""
+
+    name: str
+    title: str
+    answer: str
+    more: str = ""
+
+    @property
+    def html(self) -> str:
+        """The tile as HTML."""
+        return _framed(self.name, self.title, f"<p class='answer'>{self.answer}</p>{self.more}")
+
+
+def tiles(s: RunSummary, door: Door = "shell") -> tuple[Tile, Tile, Tile, Tile]:
+    """Return verdict, values, what is missing and what to do next. door: where they are read."""
+    return (
+        Tile("verdict", "Does the model follow the recordings?", *_verdict(s)),
+        Tile("values", "The values", *_values(s, door)),
+        Tile("missing", "What does the model lack?", *_missing(s, door)),
+        Tile("next", "What to record next", _next(s, door)),
+    )
 
 
 def first_screen(results: Results) -> str:
@@ -35,17 +62,12 @@ def first_screen(results: Results) -> str:
     warnings = "".join(f"<p class='warning'>{line}</p>" for line in _warnings(results, s))
     if not s.sets and not s.parameters:
         return warnings
-    side = (
-        f"{_tile('missing', 'What does the model lack?', _missing(s))}{_tile('next', 'What to record next', _next(s))}"
-    )
-    return (
-        f"{warnings}<main class='first'>{_tile('verdict', 'Does the model follow the recordings?', _verdict(s))}"
-        f"{_tile('values', 'The values', _values(s))}"
-        f"{_tile('figure', '', _figure(results, s))}<div class='side'>{side}</div></main>"
-    )
+    verdict, values, missing, step = (tile.html for tile in tiles(s))
+    figure = _framed("figure", "", _figure(results, s))
+    return f"{warnings}<main class='first'>{verdict}{values}{figure}<div class='side'>{missing}{step}</div></main>"
 
 
-def _tile(name: str, title: str, body: str) -> str:
+def _framed(name: str, title: str, body: str) -> str:
     heading = f"<h2>{title}</h2>" if title else ""
     return f"<section class='tile' data-tile='{name}'>{heading}{body}</section>" if body else ""
 
@@ -64,17 +86,17 @@ def _warnings(results: Results, s: RunSummary) -> list[str]:
     return lines
 
 
-def _verdict(s: RunSummary) -> str:
+def _verdict(s: RunSummary) -> tuple[str, str]:
     """The verdict, then the errors of its worst signal with each set of values."""
     signal = s.signal(s.judged.worst) if s.judged is not None else None
     if signal is None:
-        return f"<p class='answer'>{text(verdict_sentence(s))}</p>"
+        return text(verdict_sentence(s)), ""
     passed = {"pass": True, "fail": False}.get(s.verdict)
     answer = f"{badge(passed)} {text(verdict_sentence(s))}" if passed is not None else text(verdict_sentence(s))
     worst = f"Worst signal: <strong>{text(signal.output)}</strong> in <strong>{text(signal.experiment)}</strong>"
     noise = f"{number(signal.noise, 2)} {text(signal.unit)}".strip() if signal.noise else ""
     worst += f", noise {noise}." if noise else ". Its noise is not known."
-    return f"<p class='answer'>{answer}</p><p>{worst}</p>{table_of(sets_table(s))}{_basis(s)}"
+    return answer, f"<p>{worst}</p>{table_of(sets_table(s))}{_basis(s)}"
 
 
 def _basis(s: RunSummary) -> str:
@@ -106,10 +128,10 @@ def _windows(s: RunSummary) -> str:
     return f"Windows: before, during and after the event, without its edges; {name}, {named}."
 
 
-def _values(s: RunSummary) -> str:
-    """One value of each parameter, the one that counts."""
+def _values(s: RunSummary, door: Door) -> tuple[str, str]:
+    """Which values count, then one value of each parameter, the one that counts."""
     if not s.parameters:
-        return "<p class='answer'>No parameter was to be estimated.</p>"
+        return "No parameter was to be estimated.", ""
     rows = [_value_row(p) for p in s.parameters[:ROWS]]
     beyond = len(s.parameters) - ROWS
     more = f"<p class='small'>And {beyond} more, in the section on parameters.</p>" if beyond > 0 else ""
@@ -117,11 +139,11 @@ def _values(s: RunSummary) -> str:
     header = ["parameter, unit", "given", "value", name, "change", ""]
     if not any(p.interval for p in s.parameters):  # none is given where the model lacks something
         header, rows = [header[k] for k in (0, 1, 2, 4, 5)], [[row[k] for k in (0, 1, 2, 4, 5)] for row in rows]
-    not_fitted = "Not fitted: <code>hvdc-ident fit STUDY</code> estimates them."
+    not_fitted = prose(f"Not fitted: {TO_DO['fit'][door]} estimates them.")
     which = " ".join(t for t in (text(which_values(s)) or not_fitted, text(condition(s))) if t)
     placed = [p for p in s.parameters if p.by_place]
     depend = "".join(f"<p>{text(p.name)} depends on the place: it is {text(by_place(p))}.</p>" for p in placed)
-    return f"<p class='answer'>{which}</p>{table(header, rows, words=(0, len(header) - 1))}{depend}{more}{_moved(s)}"
+    return which, f"{table(header, rows, words=(0, len(header) - 1))}{depend}{more}{_moved(s)}"
 
 
 def _value_row(p: ParameterSummary) -> list[str]:
@@ -160,20 +182,18 @@ def _figure(results: Results, s: RunSummary) -> str:
     return overlay.figure(Sheet.new(7.6, 4.35, 0.55), caption + more, overlay.span, "worst signal, ")
 
 
-def _missing(s: RunSummary) -> str:
-    """The findings of the diagnosis, and what is left with them."""
+def _missing(s: RunSummary, door: Door) -> tuple[str, str]:
+    """The likeliest finding of the diagnosis, then the others, and what is left with them."""
     if not s.diagnosis:
-        return _undiagnosed(s)
+        return _undiagnosed(s, door), ""
     if not s.findings:
-        verdict = f"<strong>{text(_verdict_word(s.diagnosis))}.</strong> {prose(s.said.rstrip('.'))}."
-        return f"<p class='answer'>{verdict}</p>"
-    parts = []
+        return f"<strong>{text(_verdict_word(s.diagnosis))}.</strong> {prose(s.said.rstrip('.'))}.", ""
+    parts: list[str] = []
     for f in s.findings:
         name = finding_name(f)
         sure = f", <strong>{text(probability_text(f.probability))}</strong> likely" if f.effect != "parameter" else ""
-        parts.append(
-            f"<p class='answer'><strong>{text(name[:1].upper() + name[1:])}</strong>{sure}. {text(f.text)}.</p>"
-        )
+        told = f"<strong>{text(name[:1].upper() + name[1:])}</strong>{sure}. {text(f.text)}."
+        parts.append(f"<p class='answer'>{told}</p>" if parts else told)
         places = place_texts(f)
         if len(places) > 1:
             shown = "; ".join(f"{text(at)} ({text(probability_text(p))})" for at, p in [*places.items()][:PLACES])
@@ -183,7 +203,7 @@ def _missing(s: RunSummary) -> str:
         parts.append(f"<p><strong>Not all of it:</strong> {text(left)}.</p>")
     elif s.remainder.doubt:
         parts.append(f"<p><strong>In doubt:</strong> {text(s.remainder.doubt)}.</p>")
-    return "".join(parts)
+    return parts[0], "".join(parts[1:])
 
 
 def _verdict_word(verdict: str) -> str:
@@ -194,25 +214,26 @@ def _verdict_word(verdict: str) -> str:
     }.get(verdict, verdict[:1].upper() + verdict[1:])
 
 
-def _undiagnosed(s: RunSummary) -> str:
+def _undiagnosed(s: RunSummary, door: Door) -> str:
     if not s.parameters:
-        return "<p class='answer'>Not asked: a diagnosis needs parameters that may be fitted, in <code>[parameters]</code>.</p>"
+        return "Not asked: a diagnosis needs parameters that may be fitted, in <code>[parameters]</code>."
     if s.verdict == "pass" and s.judged is not None and s.judged.on_noise.verdict:
-        return "<p class='answer'>No sign of anything: what is left is noise.</p>"
-    command = "<code>hvdc-ident diagnose STUDY</code> looks for what is missing."
-    return f"<p class='answer'>Not asked{' yet' if s.verdict == 'fail' else ''}. {command}</p>"
+        return "No sign of anything: what is left is noise."
+    return prose(
+        f"Not asked{' yet' if s.verdict == 'fail' else ''}. {capital(TO_DO['diagnose'][door])} looks for what is missing."
+    )
 
 
-def _next(s: RunSummary) -> str:
+def _next(s: RunSummary, door: Door) -> str:
     """Return what to record next; where nothing is advised, why, and what else to do."""
     if said := advice(s):
-        return f"<p class='answer'>{prose(said)}</p>"
+        return prose(said)
     if not s.parameters:
-        return "<p class='answer'>No advice: there is no parameter to be determined.</p>"
+        return "No advice: there is no parameter to be determined."
     if all(p.determined for p in s.parameters):
         why = f"Nothing for the values: each is known to {percentage(MOVED)} or better."
     elif s.counting.name == "effect":
         why = "No recording is advised."
     else:
-        why = s.unadvised or ("" if s.next else "No advice yet: `hvdc-ident identify STUDY` says which recording would tell more.")
-    return f"<p class='answer'>{prose(' '.join([why, *map(next_sentence, s.next)]).strip())}</p>"
+        why = s.unadvised or ("" if s.next else f"No advice yet: {TO_DO['identify'][door]} says which recording would tell more.")
+    return prose(" ".join([why, *(next_sentence(step, door) for step in s.next)]).strip())

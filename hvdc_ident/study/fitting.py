@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ import sympy as sp
 from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.files import csv_columns
 from hvdc_ident.fit import FitResult, Group, Problem, StartOutcome, fit, fit_each, fit_individually
-from hvdc_ident.fit.judgement import Judgements, judge
+from hvdc_ident.fit.judgement import Judgement, Judgements, judge
 from hvdc_ident.fit.likelihood import loss
 from hvdc_ident.fit.partial_fits import part_of
 from hvdc_ident.fit.residual import Curve, compared_rows
@@ -29,6 +29,8 @@ from hvdc_ident.study.study import priors
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment, Trajectory
     from hvdc_ident.executor import Executor, Progress
+    from hvdc_ident.fit.adequacy import ResidualSize
+    from hvdc_ident.fit.tolerance_profile import ToleranceProfile
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
 
@@ -172,21 +174,49 @@ def judgement_of(
     sets: by name, the curves of every output by experiment and output. result: the fit that gave the curves named "fitted", whose own
     judgement of the residuals then holds.
     """
-    asked, stated = asked_of(study), study.settings.diagnose
-    profile = tolerance(asked.tolerance, study.path.parent)
-    tolerances = {} if stated is None else stated.tolerances
-    named = "tolerance" in asked.model_fields_set
-    units = {n: o.unit for n, o in study.model.outputs.items()}
+    by = Yardsticks.of(study)
     sizes = result.adequacy.signals if result is not None and result.adequacy is not None else {}
-    found = {}
-    for name, runs in sets.items():
-        recorded = {e.name: runs[e.name] for e in study.experiments if e.name in runs}
-        own = sizes if name == "fitted" else {}
-        found[name] = judge(
-            recorded, study.experiments, units, profile, tolerance=tolerances, named=named, sizes=own
+    found = {name: by.judge(runs, sizes if name == "fitted" else None) for name, runs in sets.items()}
+    head = {k: getattr(by.profile, k) for k in ("name", "version", "title", "source", "notes", "unit")}
+    return Judgements(by.tolerances, {**head, "named": by.named}, found)
+
+
+@dataclass(frozen=True)
+class Yardsticks:
+    """What runs of a study's model are judged by, as the study states it.
+
+    profile: of the windows; named: whether the study names it. tolerances: of the RMSE by output, in its unit. units: of the outputs.
+    """
+
+    experiments: tuple[Experiment, ...]
+    units: Mapping[str, str]
+    profile: ToleranceProfile
+    tolerances: Mapping[str, float]
+    named: bool
+
+    @classmethod
+    def of(cls, study: Study) -> Yardsticks:
+        """Return those of a study. Raises InputError where its file of the profile cannot be read."""
+        asked, stated = asked_of(study), study.settings.diagnose
+        return cls(
+            study.experiments,
+            {n: o.unit for n, o in study.model.outputs.items()},
+            tolerance(asked.tolerance, study.path.parent),
+            {} if stated is None else stated.tolerances,
+            "tolerance" in asked.model_fields_set,
         )
-    head = {k: getattr(profile, k) for k in ("name", "version", "title", "source", "notes", "unit")}
-    return Judgements(tolerances, {**head, "named": named}, found)
+
+    def judge(
+        self,
+        runs: Mapping[str, Mapping[str, Curve]],
+        sizes: Mapping[str, Mapping[str, ResidualSize]] | None = None,
+    ) -> Judgement:
+        """Return the judgement of runs, by experiment and output. sizes: of the residuals, where a fit has told them."""
+        recorded = {e.name: runs[e.name] for e in self.experiments if e.name in runs}
+        return judge(
+            recorded, self.experiments, self.units, self.profile,
+            tolerance=self.tolerances, named=self.named, sizes=sizes,
+        )  # fmt: skip
 
 
 def curves_at_given(study: Study) -> dict[str, dict[str, Curve]]:

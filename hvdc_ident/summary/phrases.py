@@ -124,6 +124,13 @@ def sizes_text(sizes: Mapping[str, Quantity]) -> str:
     return listed(f"{n} = {quantity(q.value, q.unit)}" for n, q in sizes.items())
 
 
+def values_line(s: RunSummary) -> str:
+    """Return the values that count in one line: "k = 5.02 1/s, T = 31 ms"; empty where nothing was fitted."""
+    known = [(p.name, Quantity(p.value, p.unit, p.interval)) for p in s.parameters if s.counting.name and p.value is not None]
+    placed = [f"{p.name} by place" for p in s.parameters if p.by_place]
+    return ", ".join([*(f"{n} = {size_text(q)}" for n, q in known), *placed])
+
+
 def interval_name(s: RunSummary, name: str) -> str:
     """Return what the intervals of a set of values are called: of a model that leaves more than noise none has a chance of 95 %."""
     return interval_words(beyond_noise=s.conditional[name])

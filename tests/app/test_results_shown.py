@@ -11,10 +11,7 @@ import numpy as np
 import pytest
 
 import hvdc_ident as hi
-from hvdc_ident.app.result_tables import (
-    overlay_columns,
-    profile_columns,
-)
+from hvdc_ident.app.result_panels import overlay_columns, profile_columns
 from hvdc_ident.app.runs import StudyRun
 from hvdc_ident.app.supposed import planned_experiments, refitted, suppositions
 from hvdc_ident.data import trajectory

@@ -10,7 +10,7 @@ import pytest
 
 import hvdc_ident as hi
 from hvdc_ident.app.desk import opened
-from hvdc_ident.app.setting import InputCourse, Setting, near, span_of, with_effect
+from hvdc_ident.app.setting import InputCourse, Setting, effects_with_sizes, near, span_of, with_effects
 from hvdc_ident.errors import InputError
 
 LINK = hi.load_model("vsc-hvdc-link")
@@ -56,12 +56,28 @@ def test_sensitivities_are_the_derivatives_by_the_parameters() -> None:
     assert found == pytest.approx(float(np.sqrt(np.mean(((up - down) / (2 * h)) ** 2))), rel=1e-4)
 
 
-def test_an_effect_brings_its_size_as_a_parameter() -> None:
-    setting = with_effect(Setting.of(LINK), {"effect": "lag", "at": "Ir1", "parameters": {"T": 0.002}})
+def test_an_effect_brings_its_size_as_a_parameter_and_takes_it_along() -> None:
+    lag = {"effect": "lag", "at": "Ir1", "parameters": {"T": 0.002}}
+    setting = with_effects(Setting.of(LINK).with_value("KIVDC", 900.0), [lag])
     (name,) = set(setting.model.parameters) - set(LINK.parameters)
     slower = setting.with_value(name, 0.05)
-    change = [np.abs(s.run()["Irorder1"] - Setting.of(LINK).run()["Irorder1"]).max() for s in (setting, slower)]
+    change = [
+        np.abs(s.run()["Irorder1"] - Setting.of(LINK).with_value("KIVDC", 900.0).run()["Irorder1"]).max()
+        for s in (setting, slower)
+    ]
     assert 0 < change[0] < change[1]
+    assert effects_with_sizes(slower) == [{**lag, "parameters": {"T": 0.05}}]
+    without = with_effects(slower, [])
+    assert without.model is LINK and dict(without.values) == {"KIVDC": 900.0}
+
+
+def test_one_of_two_effects_is_taken_out_and_the_other_keeps_its_size() -> None:
+    uses = [{"effect": "lag", "at": place, "parameters": {"T": 0.002}} for place in ("Ir1", "Ir2")]
+    both = with_effects(Setting.of(LINK), uses).with_value("lag_Ir1_T", 0.01).with_value("lag_Ir2_T", 0.03)
+    second = with_effects(both, both.effects[1:])
+    assert set(second.model.parameters) - set(LINK.parameters) == {"lag_Ir2_T"} and dict(second.values) == {"lag_Ir2_T": 0.03}
+    alone = with_effects(Setting.of(LINK), [uses[1]]).with_value("lag_Ir2_T", 0.03)
+    np.testing.assert_array_equal(second.run()["Irorder1"], alone.run()["Irorder1"])
 
 
 @pytest.mark.parametrize(

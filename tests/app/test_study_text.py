@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("tomlkit", reason="the workbench needs: pip install 'hvdc_ident[app]'")
 
-from hvdc_ident.app.study_text import with_experiment
+from hvdc_ident.app.study_text import with_experiment, with_parameters
 from hvdc_ident.errors import StudyError
 
 STUDY = """# the study of the spring campaign
@@ -222,3 +222,43 @@ def test_a_layout_that_cannot_be_changed_is_refused() -> None:
             with_experiment(text, "up", keys(), "study.toml")
     with pytest.raises(StudyError, match="not valid TOML"):
         with_experiment("schema = = 1", "up", keys(), "study.toml")
+
+
+def test_values_bounds_and_effects_are_written_and_the_rest_stays_letter_for_letter() -> None:
+    lag = {"effect": "lag", "at": "Ir1", "parameters": {"T": 0.01}}
+    candidates = {"KIVDC": {"start": 800.0, "max": 2e3}, "KIP": {"start": 1.0, "min": 0.5}}
+    new = with_parameters(STUDY, candidates, {"KPQ": 0.5}, [lag], "study.toml")
+    left, right = STUDY.splitlines(), new.splitlines()
+    assert [line for line in left if line not in right] == ["KIVDC = {start = 700} # a comment # with two signs"]
+    assert new.index("[[model.effect]]") < new.index("# what may be estimated") < new.index("KIP =") < new.index("# first recording")
+    found = tomllib.loads(new)
+    assert found["parameters"] == candidates and found["model"] == {
+        "source": "vsc-hvdc-link",
+        "values": {"KPQ": 0.5},
+        "effect": [lag],
+    }
+    assert "# a comment # with two signs" in new
+    twice = tomllib.loads(with_parameters(new, {}, {"KPQ": 0.25}, [lag], "study.toml"))
+    assert twice["model"]["values"] == {"KPQ": 0.25} and twice["model"]["effect"] == [lag, lag]
+
+
+def test_a_parameter_that_is_fitted_no_longer_goes() -> None:
+    new = with_parameters(STUDY, {"KIVDC": None, "KIP": None}, {}, [], "study.toml")
+    assert new == STUDY.replace("KIVDC = {start = 700} # a comment # with two signs\n", "")
+
+
+def test_a_parameter_of_a_component_is_changed_where_it_stands() -> None:
+    text = 'schema = 1\n[model]\nsource = "unit.toml"\n[parameters.gen]\nH = {start = 3} # inertia\n[fit]\nstarts = 2\n'
+    new = with_parameters(text, {"gen.H": {"start": 4.0}, "gen.D": {"min": 0.0}}, {"avr.K": 2.0}, [], "study.toml")
+    found = tomllib.loads(new)
+    assert found["parameters"] == {"gen": {"H": {"start": 4.0}, "D": {"min": 0.0}}} or found["parameters"] == {
+        "gen": {"H": {"start": 4.0}},
+        "gen.D": {"min": 0.0},
+    }
+    assert found["model"]["values"] == {"avr.K": 2.0} and "# inertia" in new
+
+
+def test_a_layout_in_which_values_cannot_be_changed_is_refused() -> None:
+    text = 'schema = 1\nname = """\n[[experiment]]\n"""\n[model]\nsource = "x"\n'
+    with pytest.raises(StudyError, match="as it was"):
+        with_parameters(text, {"k": {"start": 1.0}}, {}, [], "study.toml")

@@ -11,9 +11,13 @@ import urllib.request
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytest.importorskip("nicegui", reason="the workbench needs: pip install 'hvdc_ident[app]'")
+
+import hvdc_ident as hi
+
 sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install playwright")
 DESK = {"width": 1400, "height": 900}
 SECONDS = 60_000  # ms that a page may take on a busy machine before a test gives up
@@ -61,7 +65,7 @@ def test_the_address_keeps_no_token(page: Any) -> None:
 def test_a_slider_moves_the_waveform_and_undo_moves_it_back(page: Any) -> None:
     before = page.evaluate(NOW)
     assert len(before) == 1001
-    page.get_by_role("slider", name="KIVDC").locator("[tabindex]").focus()
+    page.get_by_role("slider", name="KIVDC", exact=True).focus()
     for _ in range(40):
         page.keyboard.press("ArrowRight")
     page.wait_for_function(f"before => JSON.stringify(({NOW})()) !== before", arg=_json(page, before))
@@ -80,11 +84,36 @@ def _choose(page: Any, label: str, option: str) -> None:
     page.get_by_role("option", name=option, exact=True).click()
 
 
-def test_an_effect_becomes_a_slider_of_its_size(page: Any) -> None:
-    page.get_by_text("Add an effect").click()
+def test_an_effect_becomes_a_slider_of_its_size_and_goes_again(page: Any) -> None:
+    before = page.evaluate(NOW)
+    page.get_by_text("Effects", exact=True).click()
     _choose(page, "at", "Ir1")
     page.get_by_role("button", name="Add", exact=True).click()
-    page.wait_for_selector('[aria-label="lag_Ir1_T"]')
+    page.get_by_role("slider", name="lag_Ir1_T", exact=True).wait_for()
+    page.wait_for_function(f"before => JSON.stringify(({NOW})()) !== before", arg=_json(page, before))
+    page.get_by_role("button", name="Remove lag at Ir1").click()
+    page.get_by_role("slider", name="lag_Ir1_T", exact=True).wait_for(state="detached")
+    page.wait_for_function(f"before => JSON.stringify(({NOW})()) === before", arg=_json(page, before))
+
+
+def test_a_value_and_bounds_are_typed(page: Any) -> None:
+    slider, value = page.get_by_role("slider", name="KIVDC", exact=True), page.get_by_label("KIVDC, value")
+    model = hi.load_model("vsc-hvdc-link")
+    steps = {"Vdcref1": hi.step(1.0, 1.02, at=0.1)}
+    output = next(iter(model.outputs))
+    expected = hi.simulate(model, np.linspace(0.0, 1.0, 1001), {"KIVDC": 900.0}, inputs=steps)[output]
+    value.fill("900")
+    value.press("Enter")
+    page.wait_for_function(f"y => Math.abs(({NOW})()[150] - y) < 1e-5", arg=float(expected[150]))
+    page.get_by_label("KIVDC, lower bound").fill("800")
+    page.get_by_label("KIVDC, upper bound").fill("1000")
+    page.get_by_label("KIVDC, upper bound").press("Enter")
+    assert slider.input_value() == "250"  # in the middle of 500 steps
+    slider.press("End")
+    page.wait_for_function("() => document.querySelector('[aria-label=\"KIVDC, value\"]').value === '1000'")
+    value.fill("much")
+    value.press("Enter")
+    assert "wrong" in (value.get_attribute("class") or "") and slider.input_value() == "500"
 
 
 def test_margins_are_those_of_the_loop_that_is_opened(page: Any) -> None:

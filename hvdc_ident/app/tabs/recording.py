@@ -25,8 +25,8 @@ from hvdc_ident.app.mapping import (
     proposed,
     write_mapping,
 )
+from hvdc_ident.app.page import Tab
 from hvdc_ident.app.plot import NOW, RECORDED, Grid, Marker, Plot, Trace, focused, sketch, thinned
-from hvdc_ident.app.server import Tab
 from hvdc_ident.app.study_folder import (
     MOST_BYTES,
     Seen,
@@ -55,8 +55,12 @@ THUMBNAIL = (110, 34)
 """Width and height of a signal's small picture, px."""
 HEIGHT = 470
 """Of the plot, px, where its grids fit in."""
-EVENT_COLOR, DOUBT = "#d64545", "#b26a00"
-"""Colours, each of a contrast of 4 and more on the white and on the dark page."""
+EVENT_COLOR, DOUBT = "var(--fail)", "var(--focus)"
+NOTHING = (
+    "<p><strong>Drop a recording above</strong>, anywhere on this page, or choose one of the study's folder.</p><p>COMTRADE (.cfg and "
+    ".dat together), MATLAB, PSCAD, CSV and other formats are read. Its columns become inputs and outputs of the model, the event and the "
+    "window are dragged on the plot, and all of it becomes a study file.</p>"
+)
 DROP_ANYWHERE = """
 document.addEventListener("dragover", (e) => e.preventDefault());
 document.addEventListener("drop", (e) => {
@@ -73,7 +77,7 @@ class Mapper:
     """The tab in one browser: the study file as it was seen, the recording, its mapping, and the elements that show them."""
 
     def __init__(self, desk: Desk) -> None:
-        self._desk = desk
+        self._desk, self._with_study = desk, desk.study is not None
         self._source = desk.source
         self._seen = Seen(desk.file, None)
         self._stamp = desk.read_at
@@ -99,27 +103,45 @@ class Mapper:
     def build(self) -> None:
         """Build the tab's elements; what is on the desk is read when the tab is looked at for the first time."""
         self._place = ui.element("div")
-        with ui.row().classes("w-full items-center gap-3 no-wrap"):
-            self._build_files()
-        self._banner = ui.row().classes("w-full items-center bg-warning text-black rounded-borders q-px-sm")
-        self._banner.visible = False
-        self._trouble = ui.label("").classes("text-negative whitespace-pre-line").props('role="alert"')
-        with ui.row().classes("w-full no-wrap items-start gap-4"):
-            with ui.column().classes("gap-1").style("width: 36rem; flex: none"):
-                self._search = ui.input(placeholder="search signals", on_change=lambda: self._build_rows())
-                self._search.props('dense clearable aria-label="search signals"').classes("w-full")
-                self._list = ui.column().classes("w-full gap-0 no-wrap").style("max-height: 690px; overflow-y: auto")
-            with ui.column().classes("col gap-1").style("min-width: 0"):
-                with ui.row().classes("w-full items-center gap-3"):
-                    self._build_fields()
-                self._plots = ui.element("div").classes("w-full")
-                ui.label("What hvdc-ident check says").classes("text-caption text-bold")
-                self._said = ui.column().classes("w-full gap-0 text-caption").props('aria-live="polite"')
-        with self._plots:
+        with ui.element("div").classes("stack"):
+            with ui.element("div").classes("tile"):
+                self._build_files()
+            self._banner = ui.element("div").classes("tile line").props('role="status"')
+            self._banner.visible = False
+            self._trouble = ui.label("").classes("alert").props('role="alert"')
+            self._nothing = ui.html(NOTHING, sanitize=False).classes("tile empty")
+            with ui.element("div").classes("bench wide-rail") as self._open:
+                with ui.element("div").classes("tile"):
+                    self._search = ui.input(placeholder="search signals", on_change=lambda: self._build_rows())
+                    self._search.props('dense clearable aria-label="search signals"').classes("w-full")
+                    self._list = ui.element("div").classes("signals")
+                with ui.element("div").classes("stack"):
+                    with ui.element("div").classes("tile"):
+                        with ui.element("div").classes("choices"):
+                            self._build_fields()
+                        self._plots = ui.element("div").classes("w-full")
+                    with ui.element("div").classes("tile"):
+                        ui.html("<h2>What hvdc-ident check says</h2>", sanitize=False)
+                        self._said = ui.column().classes("w-full gap-0 small").props('aria-live="polite"')
+        self._open.visible = False
+        with self._place:
             Plot([], "time, s", 10, "No recording").on("ready", lambda: self._in_background(self._start))
 
     def _build_files(self) -> None:
         """Build the line with the study's experiments, its files, the place for dropped ones, and the button that writes."""
+        with ui.element("div").classes("choices"):
+            self._build_choices()
+        with ui.element("div").classes("line q-mt-xs"):
+            self._write = ui.button("Write the study", on_click=lambda: self._in_background(self._save))
+            self._write.props("dense unelevated").classes("q-px-md")
+            self._reopen = ui.button("Open the study", on_click=ui.navigate.reload).props("outline dense").classes("q-px-md")
+            self._reopen.tooltip("Loads the page anew, with the recording under the curves and the stages to run")
+            self._reopen.visible = False
+            self._status = ui.label("").classes("small").style("overflow-wrap: anywhere")
+            self._busy = ui.spinner(size="1.3em").props('aria-label="at work"')
+            self._busy.visible = False
+
+    def _build_choices(self) -> None:
         self._experiment = ui.select(
             [], label="experiment", on_change=lambda e: self._choose(e.value, self._open_experiment)
         )
@@ -129,7 +151,7 @@ class Mapper:
             multiple=True,
             auto_upload=True,
             max_file_size=MOST_BYTES,
-            label="Drop a recording (COMTRADE: .cfg and .dat)",
+            label="Drop a recording, or choose a file",
             on_multi_upload=self._arrived,
             on_rejected=lambda: self._tell(
                 f"The file is larger than {MOST_BYTES // 1024**2} MiB: put it into the study's folder."
@@ -138,31 +160,24 @@ class Mapper:
         self._upload.on(
             "failed", lambda: self._tell("The upload failed: the file is too large, or the server has ended.")
         )
-        self._upload.style("width: 24rem; max-height: 44px; overflow: hidden")
+        self._upload.classes("upload")
         self._model = ui.select(self._models(), value=self._source, label="model")
         self._model.on_value_change(lambda e: self._choose(e.value, self._choose_model))
-        ui.space()
-        self._busy = ui.spinner(size="1.5em").props('aria-label="at work"')
-        self._busy.visible = False
-        self._status = ui.label("").classes("text-caption ellipsis").style("max-width: 20rem")
-        self._write = ui.button("Write the study", on_click=lambda: self._in_background(self._save))
         for field in (self._experiment, self._files, self._model):
-            field.props("dense options-dense").style("min-width: 11rem; max-width: 17rem")
+            field.props("dense options-dense")
 
     def _build_fields(self) -> None:
-        self._name = (
-            ui.input("name", on_change=lambda e: self._edit(name=e.value or "")).props("dense").style("width: 11rem")
-        )
+        self._name = ui.input("name", on_change=lambda e: self._edit(name=e.value or "")).props("dense")
         self._role = ui.select(
             ["fit", "holdout"], value="fit", label="role", on_change=lambda e: self._edit(role=e.value)
         )
-        self._role.props("dense options-dense").style("width: 6rem")
+        self._role.props("dense options-dense")
         self._event = ui.number("event, s", on_change=lambda e: self._edit(event=e.value))
         self._from = ui.number("window from, s", on_change=lambda e: self._edit_window(e.value, None))
         self._to = ui.number("to, s", on_change=lambda e: self._edit_window(None, e.value))
         self._event.props["aria-label"] = "event, s"
         for field in (self._event, self._from, self._to):
-            field.props("dense clearable stack-label step=any").style("width: 8.5rem")
+            field.props("dense clearable stack-label step=any")
 
     def _models(self) -> list[str]:
         """Return the models that can be chosen: the shipped ones, those beside the recording, and the desk's own."""
@@ -173,7 +188,7 @@ class Mapper:
     # --- what is open ---
 
     async def _start(self) -> None:
-        self._plots.clear()
+        self._place.clear()
         ui.timer(POLL, self._look)
         ui.run_javascript(DROP_ANYWHERE % self._upload.id)
         desk = self._desk
@@ -277,7 +292,8 @@ class Mapper:
         await self._renew(keep=True)
         self._changed = self._edited = False
         self._show_status()
-        ui.notify(f"{self._desk.file} is written. Reload the page to explore the recording.", type="positive")
+        ui.notify(f"{self._desk.file} is written.", type="positive")
+        self._reopen.visible = not self._with_study
 
     async def _renew(self, *, keep: bool) -> None:
         """Read the study file anew. keep: the mapping that is on the page; left out, that of the file."""
@@ -331,7 +347,7 @@ class Mapper:
         with self._banner:
             ui.label(text)
             for name, way in (ways or file).items():
-                ui.button(name, on_click=lambda way=way: chosen(way)).props("flat dense color=black")
+                ui.button(name, on_click=lambda way=way: chosen(way)).props("flat dense")
         self._banner.visible = True
 
     # --- changes ---
@@ -396,6 +412,7 @@ class Mapper:
     def _show(self) -> None:
         """Show all of what is open."""
         mapping = self._map
+        self._nothing.visible, self._open.visible = mapping is None, mapping is not None
         self._show_files()
         self._showing = True
         if mapping is not None:
@@ -409,6 +426,7 @@ class Mapper:
         self._ask()
 
     def _show_status(self) -> None:
+        self._write.visible = self._map is not None
         self._write.set_enabled(self._map is not None and self._changed)
         where = self._desk.file
         self._status.text = f"{'not written yet: ' if self._changed else ''}{where}" if self._map else ""
@@ -422,12 +440,10 @@ class Mapper:
             used = _columns_in(self._map)
             fitting.sort(key=lambda c: c.name not in used)
         with self._list:
-            if self._record is None:
-                ui.label("Drop a recording above, or choose one of the study's folder.").classes("q-pa-md")
             for column in fitting[:MOST_ROWS]:
                 self._build_row(column)
             if len(fitting) > MOST_ROWS:
-                ui.label(f"{len(fitting) - MOST_ROWS} more: search for a part of their names.").classes("text-caption")
+                ui.label(f"{len(fitting) - MOST_ROWS} more: search for a part of their names.").classes("small")
 
     def _build_row(self, column: Column) -> None:
         assert self._record is not None
@@ -435,12 +451,12 @@ class Mapper:
         signals: dict[str, tuple[Kind, str]] = {f"input {n}": ("input", n) for n in model.inputs}
         signals |= {f"output {n}": ("output", n) for n in model.outputs}
         options = {"": "not used", **{name: name for name in signals}}
-        with ui.row().classes("w-full items-center no-wrap gap-2 q-py-xs").style("border-bottom: 1px solid #8884"):
+        with ui.element("div").classes("signal"):
             ui.html(self._sketch(column.name), sanitize=False)
-            with ui.column().classes("gap-0").style("width: 10rem; min-width: 0"):
+            with ui.element("div"):
                 ui.label(column.name).classes("ellipsis text-bold w-full").tooltip(column.name)
-                self._levels[column.name] = ui.label(_about(column)).classes("text-caption")
-            with ui.column().classes("col gap-0").style("min-width: 0"):
+                self._levels[column.name] = ui.label(_about(column)).classes("small")
+            with ui.element("div"):
                 chosen = ui.select(options, with_input=True).props("dense options-dense").classes("w-full")
                 chosen.props["aria-label"] = f"{column.name} is"
                 details = ui.column().classes("w-full gap-0")
@@ -487,7 +503,7 @@ class Mapper:
                 number.props["aria-label"] = f"{line.signal}: {key}"
                 number.props("dense step=any")
         if line.why:
-            ui.label(f"proposed: {line.why}").classes("text-caption")
+            ui.label(f"proposed: {line.why}").classes("small")
 
     def _build_candidates(self, column: Column) -> None:
         """Build a button for each signal that the column may be."""
@@ -596,7 +612,7 @@ class Mapper:
         self._said.clear()
         with self._said:
             if draft is None:
-                ui.label(text).classes("text-negative")
+                ui.label(text).classes("alert")
                 return
             found = draft.summary.to_dict()
             doubts = {*found["rest_lines"], *(f"steady state, {line}" for line in found["steady_state"])}
@@ -686,4 +702,4 @@ def _about(column: Column) -> str:
     return f"{'at rest' if column.quiet else 'first'} {column.level:.4g}{noise} {column.unit}"
 
 
-TAB = Tab(order=20, title="Recording", build=lambda desk: Mapper(desk).build(), maps=True)
+TAB = Tab(order=20, title="Recording", build=lambda page: Mapper(page.desk).build(), maps=True)

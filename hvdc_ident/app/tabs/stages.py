@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from nicegui import run, ui
 
 import hvdc_ident as hi
-from hvdc_ident.app.desk import Desk
+from hvdc_ident.app.compared_runs import ComparedRuns
 from hvdc_ident.app.exports import ExportButtons
-from hvdc_ident.app.result_panels import PANELS, FoundResults, Panel
+from hvdc_ident.app.page import Page, Tab
+from hvdc_ident.app.result_panels import PANELS
+from hvdc_ident.app.results import FoundResults
 from hvdc_ident.app.runs import (
     EVERYTHING,
     LETTER,
@@ -22,9 +25,8 @@ from hvdc_ident.app.runs import (
     signature,
     standings,
 )
-from hvdc_ident.app.server import Tab
+from hvdc_ident.app.study_folder import stamp
 from hvdc_ident.errors import HvdcIdentError
-from hvdc_ident.next_step import next_sentence
 from hvdc_ident.text import percentage
 
 LOOK = 0.3
@@ -38,22 +40,23 @@ MARKS = {
     "running": ("autorenew", "primary"),
 }
 """Icon and colour of each state."""
-NO_STUDY = (
-    "No study is open. The tab Recording writes one from your recordings; `hvdc-ident app STUDY` opens one; `hvdc-ident new DIR` "
-    "writes one with data to start from."
-)
+COMPARISON = "Comparison"
 
 
 class StageDesk:
     """The tab in one browser: the study as its files are now, the folder of results, and the elements that show both."""
 
-    def __init__(self, desk: Desk, study: hi.Study) -> None:
-        self._desk, self._study = desk, study
+    def __init__(self, page: Page, study: hi.Study) -> None:
+        self._page, self._desk, self._study = page, page.desk, study
         self._folder = first_folder(study)
         self._seen: Any = None
+        self._stages: Any = None
+        self._read_last: Any = None
+        self._drawn: Any = None
         self._busy = False
         self._letter: StudyRun | None = None
-        self._panels: list[tuple[Panel, Any]] = []
+        self._panels: dict[str, tuple[Any, Any]] = {}
+        self._comparison = ComparedRuns()
         self._panel_keys: dict[str, Any] = {}
         self._starts: list[Any] = []
         self._unreadable = ""
@@ -62,38 +65,49 @@ class StageDesk:
 
     def build(self) -> None:
         """Build the tab's elements, which look after the run and the files from then on."""
-        self._panel = ui.context.slot.parent
-        with ui.row().classes("w-full no-wrap items-start"):
-            with ui.column().classes("gap-1").style("width: 21rem; flex: none"):
-                self._build_folder()
-                self._build_run()
-                self._list = ui.column().classes("w-full gap-0")
-                ui.separator()
+        with ui.element("div").classes("bench"):
+            with ui.element("div").classes("rail tile"):
+                self._folders = ui.select({}, label="folder of results", on_change=self._choose_folder)
+                self._folders.props("dense options-dense").classes("w-full")
+                with ui.element("div").classes("q-mt-sm"):
+                    self._build_run()
+                self._list = ui.element("div").classes("w-full")
+                ui.separator().classes("q-my-sm")
                 self._exports = ExportButtons(lambda: (self._study, self._folder), self._write_letter)
                 self._exports.build()
-            with ui.column().classes("col gap-1").style("min-width: 0"):
-                self._trouble = (
-                    ui.label("").classes("text-negative").props('role="alert"').style("white-space: pre-line")
-                )
-                self._next = ui.label("").classes("text-body2")
-                with ui.tabs().props("dense align=left no-caps") as bar:
-                    for panel in PANELS:
-                        ui.tab(panel.title)
-                with ui.tab_panels(bar, value=PANELS[0].title, animated=False).classes("w-full"):
-                    for panel in PANELS:
-                        with ui.tab_panel(panel.title).classes("q-pa-none"):
-                            self._panels.append((panel, ui.column().classes("w-full gap-2 q-pt-sm")))
+            with ui.element("div").classes("stack"):
+                self._trouble = ui.label("").classes("alert").props('role="alert"')
+                self._nothing = ui.html(
+                    "<p><strong>Nothing has run yet.</strong></p><p>Run all computes every stage that the study asks for. "
+                    "The results open here as they come: what the recordings tell, the fit over them, what the model lacks, "
+                    "and what to record next.</p>",
+                    sanitize=False,
+                ).classes("tile empty")
+                with ui.element("div").classes("tile") as self._results:
+                    self._build_panels()
+        self._results.visible = self._nothing.visible = False
         ui.timer(LOOK, self._look)
 
-    def _build_folder(self) -> None:
-        folders = {str(p): folder_name(self._study, p) for p in result_folders(self._study)}
-        if len(folders) > 1:
-            ui.select(
-                folders,
-                value=str(self._folder),
-                label="folder of results",
-                on_change=self._choose_folder,
-            ).props("dense options-dense").classes("w-full")
+    def _build_panels(self) -> None:
+        """Build a tab for each panel; those that have something to show can be seen."""
+        titles = [*(p.title for p in PANELS), COMPARISON]
+        with ui.tabs().props("dense align=left no-caps outside-arrows mobile-arrows") as self._bar:
+            tabs = {title: ui.tab(title) for title in titles}
+        with ui.tab_panels(self._bar, value=titles[0], animated=False).classes("w-full"):
+            for title in titles:
+                with ui.tab_panel(title):
+                    self._panels[title] = tabs[title], ui.element("div").classes("stack q-pt-sm")
+        for tab, _ in self._panels.values():
+            tab.visible = False
+        with self._panels[COMPARISON][1]:
+            self._comparison.build()
+
+    def _offer_folders(self) -> list[Path]:
+        """Offer the folders that hold results, and return those besides the one that is open."""
+        found = result_folders(self._study)
+        self._folders.set_options({str(p): folder_name(self._study, p) for p in found}, value=str(self._folder))
+        self._folders.visible = len(found) > 1
+        return [p for p in found if p != self._folder and p.is_dir() and any(p.glob("*.json"))]
 
     def _choose_folder(self, event: Any) -> None:
         chosen = next((p for p in result_folders(self._study) if str(p) == event.value), None)
@@ -101,14 +115,14 @@ class StageDesk:
             self._folder, self._seen = chosen, None
 
     def _build_run(self) -> None:
-        with ui.row().classes("w-full items-center no-wrap"):
-            self._all = ui.button("Run all", on_click=lambda: self._start(EVERYTHING)).props("dense").classes("q-px-md")
+        with ui.element("div").classes("line"):
+            self._all = ui.button("Run all", on_click=lambda: self._start(EVERYTHING)).props("dense unelevated").classes("q-px-md")
             self._all.tooltip("Every stage that the study asks for; what stands is kept.")
             self._cancel = (
                 ui.button("Cancel", on_click=self._end).props("dense outline color=negative").classes("q-px-md")
             )
             self._cancel.tooltip("Ends the work now. What is finished is kept, and the next run goes on from there.")
-        with ui.column().classes("w-full gap-0") as self._progress:
+        with ui.column().classes("w-full gap-0 q-pt-sm") as self._progress:
             self._bar = ui.linear_progress(0.0, show_value=False).props("instant-feedback aria-label=progress")
             self._times = ui.label("").classes("text-caption")
             self._text = ui.label("").classes("text-caption").style("overflow-wrap: anywhere; min-height: 2.6em")
@@ -138,27 +152,26 @@ class StageDesk:
     # --- what is seen ---
 
     async def _look(self) -> None:
-        """Show what has changed since the last look, while somebody looks."""
-        if self._busy or not self._is_open():
+        """Show what has changed since the last look."""
+        if self._busy:
             return
         self._busy = True
         try:
             found = RUNS.of(self._folder)
             self._show_run(found)
-            seen = (self._folder, signature(self._study, self._folder), found and (found.stage, found.outcome))
+            beside = sorted(p for p in self._study.path.resolve().parent.iterdir() if p.is_dir() and p != self._folder)
+            marks = signature(self._study, self._folder)
+            seen = (self._folder, marks, found and (found.stage, found.outcome), [stamp(p) for p in beside])
             if seen != self._seen:
                 await self._read(seen)
+            if self._read_last is not self._drawn and (self._drawn is None or self._page.is_open(TAB.title)):
+                await self._draw(*self._read_last)
             if found is not None and found is self._letter and found.outcome != "running":
                 self._letter = None
                 if found.outcome == "done":
                     self._exports.give(self._folder / "letter.html")
         finally:
             self._busy = False
-
-    def _is_open(self) -> bool:
-        """Return whether the tab is the one that is open: another one's sliders have the processor for themselves."""
-        panels = self._panel.parent_slot.parent if self._panel.parent_slot else None
-        return getattr(panels, "value", TAB.title) == TAB.title
 
     async def _read(self, seen: Any) -> None:
         """Read the study where its files have changed, and the results."""
@@ -178,14 +191,34 @@ class StageDesk:
             return  # the server is ending
         self._study, stages, self._unreadable = found
         self._seen = seen
-        self._show_stages(stages)
         data = {s.stage.name: s.data for s in stages if s.data and s.state in ("done", "stale")}
         shown = FoundResults(self._study, self._folder, data)
-        for panel, place in self._panels:
-            if self._panel_keys.get(panel.title) != (key := panel.key(shown)):
+        await run.io_bound(lambda: (shown.summary, shown.supposed))  # what takes a while is made here
+        self._read_last = stages, shown
+        self._page.tell(shown)
+
+    async def _draw(self, stages: tuple[StageStanding, ...], shown: FoundResults) -> None:
+        """Show how the stages stand, and the panels that have something to show.
+
+        A part that is replaced while its tab is closed is not found by its tooltips when that is opened.
+        """
+        self._drawn = self._read_last
+        self._show_stages(stages)
+        others = self._offer_folders()
+        self._nothing.visible, self._results.visible = not shown.data, bool(shown.data)
+        for panel in PANELS:
+            tab, place = self._panels[panel.title]
+            tab.visible = bool(shown.of(panel.uses[0]))
+            if tab.visible and self._panel_keys.get(panel.title) != (key := panel.key(shown)):
                 self._panel_keys[panel.title] = key
-                panel.show(shown, place)
-        self._next.text = " ".join(next_sentence(step, "page") for step in shown.summary.next)
+                place.clear()
+                with place:
+                    panel.build(shown, self._page)
+        self._panels[COMPARISON][0].visible = bool(shown.data and others)
+        if not self._panels.get(self._bar.value or "", next(iter(self._panels.values())))[0].visible:
+            self._bar.value = next((title for title, (tab, _) in self._panels.items() if tab.visible), self._bar.value)
+        if shown.data and others:
+            await self._comparison.offer(self._study, self._folder, others)
 
     def _show_run(self, found: StudyRun | None) -> None:
         working = found is not None and found.outcome == "running"
@@ -206,6 +239,9 @@ class StageDesk:
     def _show_stages(self, found: tuple[StageStanding, ...]) -> None:
         at_work = RUNS.of(self._folder)
         working = at_work is not None and at_work.outcome == "running"
+        if (shown := (found, working, at_work and at_work.stage)) == self._stages:
+            return
+        self._stages = shown
         self._list.clear()
         self._starts = []
         with self._list:
@@ -237,12 +273,12 @@ class StageDesk:
             self._starts.append(button)
 
 
-def build(desk: Desk) -> None:
-    """Build the tab: of a study its stages, else what to do."""
-    if desk.study is None:
-        ui.markdown(desk.why or NO_STUDY)
+def build(page: Page) -> None:
+    """Build the tab: of a study its stages, else why it cannot be read."""
+    if page.desk.study is None:
+        ui.label(page.desk.why).classes("tile empty alert")
         return
-    StageDesk(desk, desk.study).build()
+    StageDesk(page, page.desk.study).build()
 
 
-TAB = Tab(order=30, title="Run", build=build)
+TAB = Tab(order=30, title="Run", build=build, of_study=True)
