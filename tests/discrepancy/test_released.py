@@ -13,18 +13,20 @@ from hvdc_ident.discrepancy.moves import _with_free, held_again, released
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.fit import FitParameter
+from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
 
 FRICTION = 0.45
 CANDIDATES = (*FREE, FitParameter("b", 0.3, 0.01, 2.0))
 VERDICTS = {"Kp": "identifiable", "Ki": "identifiable", "b": "weak"}
-REPORT = {
-    "identifiable": ["Kp", "Ki"],
-    "not_judged": [],
-    "parameters": {n: {"verdict": v, "unit": "", "conditional_on": ()} for n, v in VERDICTS.items()},
-    "held": {"b": {"value": 0.3, "reason": "the model does not fit"}},
-}
+REPORT = IdentifiabilityReport.from_dict(
+    {
+        "identifiable": ["Kp", "Ki"],
+        "parameters": {n: {"name": n, "verdict": v, "reason": "", "value": 1.0} for n, v in VERDICTS.items()},
+        "held": {"b": {"value": 0.3, "reason": "the model does not fit"}},
+    }
+)
 """A report that a misfit has kept from telling the friction, which is held at a wrong value."""
 TRIED = ["lag", "coupling", "gain", "loss", "conductance"]
 """Among them those that put a wrong friction into words as an effect."""

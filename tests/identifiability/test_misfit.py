@@ -134,9 +134,9 @@ def test_a_damping_that_the_misfit_hides_is_right_beside_the_effect_that_is_name
 
 
 def test_a_misfit_is_told_first_and_beside_every_interval() -> None:
-    line = {"verdict": "identifiable", "reason": "known", "ci95": [1.0, 2.0]}
+    line = {"verdict": "identifiable", "reason": "known", "value": 1.5, "ci95": [1.0, 2.0]}
     data = {
-        "parameters": {"a": line, "b": {**line, "verdict": "insensitive", "ci95": None}},
+        "parameters": {"a": {**line, "name": "a"}, "b": {**line, "name": "b", "verdict": "insensitive", "ci95": None}},
         "misspecified": True,
         "misspecification": {"signs": ["the residuals are 40 times the noise"], "next": "diagnose"},
         "pilot": {"chi2_per_dof": 1600.0},

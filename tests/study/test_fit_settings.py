@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hvdc_ident.codec import plain as plain_of
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit.tolerance_profile import WINDOWS
 from hvdc_ident.report.sections import gains, output_errors, residuals
@@ -39,9 +40,9 @@ def study(folder: Path, name: str, *edits: tuple[str, str]):
 
 def fitted(made) -> tuple[dict, dict[str, str]]:
     report = stage("identify").run(made, StageOptions(), {})
-    outcome = stage("fit").run(made, StageOptions(), {"identify": json.loads(json.dumps(report.data))})
+    outcome = stage("fit").run(made, StageOptions(), {"identify": json.loads(json.dumps(plain_of(report.data)))})
     assert not outcome.failed, outcome.failed
-    return json.loads(json.dumps(outcome.data, allow_nan=False)), dict(outcome.files)
+    return json.loads(json.dumps(plain_of(outcome.data), allow_nan=False)), dict(outcome.files)
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,7 @@ from hvdc_ident.errors import StudyError
 from hvdc_ident.study.export import SSV
 from hvdc_ident.study.value_sets import value_set
 from hvdc_ident.summary import Results
+from hvdc_ident.summary.stage_results import diagnosis_of, fit_of
 from hvdc_ident.summary.summarise import counting_of
 
 K, T, LAG = 12.0, 0.05, 0.03
@@ -308,9 +309,10 @@ def test_without_a_diagnosis_there_are_no_values_with_an_effect(study: Path, tmp
 )
 def test_one_function_decides(verdict: str, name: str, doubt: str) -> None:
     effect = {"effect": "lag", "at": ["y"], "parameters": {"T": {"value": 0.03, "unit": "s"}}}
-    diagnosis = {"verdict": verdict, "effects": [] if verdict == "no-evidence" else [effect]}
-    found = counting_of({"status": "converged"}, diagnosis)
+    diagnosis = diagnosis_of({"verdict": verdict, "effects": [] if verdict == "no-evidence" else [effect]})
+    converged, failed = fit_of({"status": "converged"}), fit_of({"status": "failed"})
+    found = counting_of(converged, diagnosis)
     assert (found.name, found.doubt) == (name, doubt)
-    assert counting_of({"status": "failed"}, diagnosis).name == ("effect" if name == "effect" else "")
-    assert counting_of({"status": "converged"}, {}).name == "fit"
+    assert counting_of(failed, diagnosis).name == ("effect" if name == "effect" else "")
+    assert counting_of(converged, None).name == "fit"
     assert re.fullmatch(r"(lag at y \(T = 30 ms\))?", found.added)
