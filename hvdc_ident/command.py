@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
 import typer
 
-from hvdc_ident.errors import HvdcIdentError, InputError
+from hvdc_ident.errors import HvdcIdentError, InputError, one_line
 from hvdc_ident.executor import Progress, progress_bar
 from hvdc_ident.study.stages import StageOptions
 
@@ -331,7 +331,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         except Exception as e:
             if os.environ.get("HVDC_IDENT_DEBUG") == "1":
                 traceback.print_exc()
-            what = " ".join(f"{type(e).__name__}: {e}".split())[:300]
+            what = one_line(e, 300)
             report = "HVDC_IDENT_DEBUG=1 shows where, for a report"
             end(1, f"a bug in hvdc-ident, not in your study: {what}. Try: {report}")
 

@@ -142,6 +142,11 @@ LINE = 100
 """Characters: a message shows as many known names as a line holds, and never more than 12."""
 
 
+def one_line(error: BaseException, most: int = 500) -> str:
+    """Return the kind and the words of an error in one line of at most so many characters."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:most]
+
+
 def nearest(name: str, known: Iterable[str]) -> list[str]:
     """Return the known names that are most like a name, at most 3 that are equally like it; none where all are far from it."""
     near = difflib.get_close_matches(name, known, n=3, cutoff=0.5)

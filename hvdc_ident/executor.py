@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
-from hvdc_ident.errors import ComputationError
+from hvdc_ident.errors import ComputationError, one_line
 from hvdc_ident.text import duration
 
 T = TypeVar("T")
@@ -91,7 +91,7 @@ def attempted(function: Callable[[Any], Any], index: int, item: Any) -> Outcome:
     except MemoryError:
         return Outcome(index, None, "not enough memory")
     except Exception as error:
-        return Outcome(index, None, " ".join(f"{type(error).__name__}: {error}".split())[:500])
+        return Outcome(index, None, one_line(error))
 
 
 def in_order(outcomes: Iterable[Outcome]) -> Iterator[Any]:

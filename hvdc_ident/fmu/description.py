@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from hvdc_ident.data import Array
-from hvdc_ident.errors import ModelError
+from hvdc_ident.errors import ModelError, one_line
 from hvdc_ident.fmu.archive import DESCRIPTION, Folder, check_archive, check_identifier, first_bytes, machine_of
 from hvdc_ident.immutable import FrozenMap
 
@@ -232,11 +232,11 @@ def parsed(path: Path) -> Any:
     try:
         given = read_model_description(str(path), validate=False)
     except (etree.LxmlError, ValueError, TypeError, KeyError, IndexError, AttributeError) as e:
-        raise ModelError(f"the model description makes no sense: {_said(e)}", where=str(path)) from None
+        raise ModelError(f"the model description makes no sense: {one_line(e, 300)}", where=str(path)) from None
     except Exception as e:  # FMPy raises bare Exceptions for what it does not support
         if type(e).__module__ not in ("builtins", "fmpy.model_description"):
             raise
-        why = _said(e).removeprefix("Exception: ").rstrip(".")
+        why = one_line(e, 300).removeprefix("Exception: ").rstrip(".")
         raise ModelError(
             f"the model description cannot be used: {why}",
             where=str(path),
@@ -248,10 +248,6 @@ def parsed(path: Path) -> Any:
                 said = header.interfaces.get(kind, {}).get("providesDirectionalDerivatives")
                 interface.providesDirectionalDerivative = said in ("true", "1")
     return given
-
-
-def _said(error: BaseException) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())[:300]
 
 
 def _interface(path: Path, header: Header, asked: Interface | None) -> Interface:

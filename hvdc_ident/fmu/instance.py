@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
+from hvdc_ident.errors import one_line
 from hvdc_ident.fmu.description import Description, Message
 from hvdc_ident.fmu.fmi import DISCARD, ERROR, FATAL, FmiError, FmiLibrary, VariableGroup, quoted, refusal
 from hvdc_ident.parallel import Watch
@@ -91,7 +92,7 @@ def failure(error: Exception, messages: Sequence[str] = ()) -> RunFailed:
     if isinstance(error, MemoryError):
         return RunFailed("not enough memory", fatal=True)
     # A library that cannot be loaded or lacks a function; or a bug of this package.
-    return RunFailed(" ".join(f"{type(error).__name__}: {error}".split())[:500], message=message)
+    return RunFailed(one_line(error), message=message)
 
 
 @contextlib.contextmanager

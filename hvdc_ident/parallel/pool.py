@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Protocol
 
-from hvdc_ident.errors import ComputationError, InputError
+from hvdc_ident.errors import ComputationError, InputError, one_line
 from hvdc_ident.executor import Outcome, attempted, in_order
 from hvdc_ident.parallel import one_thread
 from hvdc_ident.parallel.child import Ending
@@ -108,11 +108,6 @@ def _loads(workers: Workers, name: str, content: bytes) -> bool:
     if error is not None:
         raise _cannot_begin(workers.why(error)[0])
     return True
-
-
-def one_line(error: BaseException) -> str:
-    """Return an error in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:500]
 
 
 def _cannot_begin(reason: str) -> ComputationError:

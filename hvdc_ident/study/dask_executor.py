@@ -14,9 +14,9 @@ from concurrent.futures import CancelledError, Future
 from contextlib import contextmanager
 from typing import Any
 
-from hvdc_ident.errors import InputError
+from hvdc_ident.errors import InputError, one_line
 from hvdc_ident.executor import Outcome, in_order
-from hvdc_ident.parallel.pool import one_line, outcomes_of
+from hvdc_ident.parallel.pool import outcomes_of
 
 CONNECT = 20.0  # s
 
@@ -91,7 +91,7 @@ def _checked(client: Any, address: str) -> int:
         raise InputError(
             "the workers cannot run this package",
             where=f"--executor {address}",
-            got=" ".join(f"{type(error).__name__}: {error}".split())[:200],
+            got=one_line(error, 200),
             hint="install the same version of hvdc_ident on every machine",
         ) from None
     other = sorted(worker for worker, version in versions.items() if version != expected)
