@@ -123,7 +123,7 @@ def _most_wanted(search: SearchContext, here: Refit, held: Sequence[FitParameter
     if not held:
         return None
     nominal = here.nominal()
-    whole = np.column_stack([_derivative(here, f, nominal.residual) for f in held])
+    whole = np.column_stack([derivative(here, f, nominal.residual) for f in held])
     columns = nominal.projected(whole)
     power = np.sum(columns**2, axis=0)
     determined = power > LEAST_INDEPENDENT_POWER * np.sum(whole**2, axis=0)
@@ -133,7 +133,7 @@ def _most_wanted(search: SearchContext, here: Refit, held: Sequence[FitParameter
     return held[k] if falls[k] > search.options.named_bic else None
 
 
-def _derivative(here: Refit, parameter: FitParameter, residual: Array) -> Array:
+def derivative(here: Refit, parameter: FitParameter, residual: Array) -> Array:
     """Return (N,) the change of the whitened residual with a held parameter, by differences; 0 where it does not run.
 
     residual: (N,) with the parameter as it is held.

@@ -17,6 +17,7 @@ from hvdc_ident.discrepancy.findings import finding, values_by_place
 from hvdc_ident.discrepancy.forms import alternatives
 from hvdc_ident.discrepancy.hypothesis import Refit, signal
 from hvdc_ident.discrepancy.implied import implied
+from hvdc_ident.discrepancy.known_errors import known_errors
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import LISTED, REFUTED, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
@@ -82,7 +83,9 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
         return Conclusion("unnameable", text, tests, instead=better, remainder=remainder)
     explained = first.chi2 - last.chi2
     found = Conclusion("named", "", tests, sets, remainder=remainder)
-    return _weighed(outcome, left, explained, found, labels, options.significance)
+    weighed = _weighed(outcome, left, explained, found, labels, options.significance)
+    against = doubt_of_known_errors(search, outcome) if weighed.verdict == "named" else None
+    return weighed if against is None else _in_doubt(found, labels, against)
 
 
 def _weighed(
@@ -363,6 +366,18 @@ def doubt_of_size(last: Refit, left: Nominal, explained: float) -> Doubt | None:
         if found.p < VARYING_P and found.chi2_fall > TOLERANCE * explained:
             why = f"the experiments ask for different sizes of {label} (p = {found.p:.1g})"
             return Doubt(why, f"The same input in several sizes, in which {label} answers.")
+    return None
+
+
+def doubt_of_known_errors(search: SearchContext, outcome: SearchOutcome) -> Doubt | None:
+    """Doubt because errors that stated values and recorded levels are known to have explain as much as an effect that was put in."""
+    for found in outcome.kept:
+        assert found.winner is not None
+        errors = known_errors(search, found.before)
+        if errors is not None and errors.in_place_of(found.before, found.winner.refit):
+            label = found.candidates[found.winner.pick.candidate].label
+            why = f"stated values and recorded levels that are off by no more than they may be explain as much as {label} ({errors})"
+            return Doubt(why, f"Stated values known better, or fitted, and larger inputs, in which {label} answers.")
     return None
 
 

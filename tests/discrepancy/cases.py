@@ -63,14 +63,15 @@ def experiments(
     seed: int = 0,
     meter: Callable[[Array], Array] | None = None,
     late: Mapping[str, float] | None = None,
+    quieter: float = 1.0,
 ) -> tuple[Experiment, ...]:
     """Records of the drive with something hidden. lag: of the measured speed, s. drag: of the speed, instead of b w.
 
     offset: of the torque that acts. noise: white, ar (0.9) or quantised. meter: what becomes of the torque before it. late: by
-    how much the clock of a record is late, s: its rows show what was so long before.
+    how much the clock of a record is late, s: its rows show what was so long before. quieter: times that the noise is smaller.
     """
     random = np.random.default_rng(seed)
-    found = []
+    found, sigma = [], {n: s / quieter for n, s in SIGMA.items()}
     for name, (role, moves) in RUNS.items():
         inputs = {n: InputSignal.corners(corners({"ref": 1.0, "load": 0.0}[n], m)) for n, m in moves.items()}
         later = (late or {}).get(name, 0.0)
@@ -79,9 +80,9 @@ def experiments(
         clean = _solved(seen, lag, drag or (lambda w: TRUE["b"] * w), offset)
         if meter:
             clean[:, 1] = meter(clean[:, 1])
-        y = np.column_stack([_noisy(clean[:, k], s, noise, random) for k, s in enumerate(SIGMA.values())])
-        measured = Trajectory(TIME, y, tuple(SIGMA), ("", ""))
-        told = FrozenMap(SIGMA) if noise == "white" else FrozenMap()
+        y = np.column_stack([_noisy(clean[:, k], s, noise, random) for k, s in enumerate(sigma.values())])
+        measured = Trajectory(TIME, y, tuple(sigma), ("", ""))
+        told = FrozenMap(sigma) if noise == "white" else FrozenMap()
         found.append(
             Experiment(TIME, name, inputs=FrozenMap(inputs), measured=measured, noise=told, event=EVENT, role=role)
         )
