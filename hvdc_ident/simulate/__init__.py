@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from hvdc_ident.simulate.equations import ACCURACY, ModelEquations, by_structure, torn
     from hvdc_ident.simulate.experiment_run import ModelSimulator, chains_of, simulate, with_recording
     from hvdc_ident.simulate.graph import Graph
-    from hvdc_ident.simulate.native import call, lu, solve
     from hvdc_ident.simulate.object_code import Code, evaluate
     from hvdc_ident.simulate.simulation import Simulation, Statistics
     from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting, with_guesses
@@ -22,7 +21,6 @@ else:
             "engine": "Engine Method Tolerance check_times engine_of",
             "equations": "ACCURACY ModelEquations by_structure torn",
             "graph": "Graph",
-            "native": "call lu solve",
             "object_code": "Code evaluate",
             "experiment_run": "ModelSimulator chains_of simulate with_recording",
             "simulation": "Simulation Statistics",
@@ -46,16 +44,13 @@ __all__ = [
     "Statistics",
     "Tolerance",
     "by_structure",
-    "call",
     "chains_of",
     "check_times",
     "engine_of",
     "equilibria",
     "evaluate",
-    "lu",
     "resting",
     "simulate",
-    "solve",
     "torn",
     "with_guesses",
     "with_recording",

@@ -16,15 +16,17 @@ from hvdc_ident.errors import ModelError, SimulationError, TimingError
 from hvdc_ident.model import Model
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.equations import ModelEquations, by_structure, padded
-from hvdc_ident.simulate.object_code import Code, entry, evaluate
-from hvdc_ident.simulate.run_state import COUNTED, HEAD, HEAD_FIELDS, RUN, place
-from hvdc_ident.simulate.simulation import HINTS, STATUSES, Statistics
+from hvdc_ident.simulate.core import HEAD_FIELDS, PLACE, RUN_FIELDS, integrate, room
+from hvdc_ident.simulate.object_code import Code, evaluate
+from hvdc_ident.simulate.simulation import HINTS, Statistics
 from hvdc_ident.simulate.steady_state import Equilibria
 
 Method = Literal["auto", "nonstiff", "explicit", "rosenbrock"]
 """auto: chosen by the first run of a structure in a process. nonstiff: the explicit pair where it can be, and the Rosenbrock method for
 a run that proves stiff, whatever was run before."""
 Integers = NDArray[np.int64]
+COUNTED = [PLACE[n] for n in ("accepted", "rejected", "events", "evaluations", "segments", "forced_steps")]
+"""What a run reports."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,7 @@ class _Equations:
         self._second = [np.zeros(0, dtype=np.int64)] * 2
 
     def head(self, rosenbrock: bool) -> Integers:
-        """Return the part of a run's record that describes these equations, (HEAD,) integers: sizes, and addresses that live as long as
+        """Return the part of a run's record that describes these equations, (head fields,) integers: sizes, and addresses that live as long as
         this object.
 
         The code that only the Rosenbrock method needs is compiled when it is first asked for.
@@ -120,7 +122,6 @@ class Engine:
         outputs: Sequence[str] | None = None,
         brief: bool = False,
     ) -> None:
-        self._integrate, self._room = entry("integrate"), entry("room")
         self.structure = ModelEquations(model, sensitivities, outputs, brief=brief)
         self._equations = _Equations(self.structure)
         self._slides: dict[int, _Equations] = {}
@@ -128,7 +129,7 @@ class Engine:
         self._equilibria = Equilibria(self.structure, self._address)
         self._explicit: bool | None = None
         self._lock = Lock()
-        self._states: dict[bool, tuple[Integers, Integers, int]] = {}
+        self._records: dict[bool, tuple[Integers, Integers, int]] = {}
 
     # --- the start ---
 
@@ -198,32 +199,45 @@ class Engine:
         y, w = self.start(p, u, begin, search=tolerance.search, model=model)
         constants = self.constants(p)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
-        sizes = np.ones(max(s.np, 1)) if scale is None else np.ascontiguousarray(scale, dtype=float)
-        allowed = np.array([tolerance.rtol, tolerance.atol])
-        t_out = np.ascontiguousarray(time, dtype=float)
+        stops, pointer, times, values = tables
+        given = {
+            "p": p,
+            "constants": constants,
+            "scale": np.ones(max(s.np, 1)) if scale is None else np.ascontiguousarray(scale, dtype=float),
+            "breaks": stops,
+            "pointer": pointer,
+            "times": times,
+            "values": values,
+            "t_out": np.ascontiguousarray(time, dtype=float),
+            "out": out,
+        }
+        fixed = {n: a.ctypes.data for n, a in given.items()}
+        fixed |= {"n_breaks": stops.shape[1], "n_out": time.size, "max_steps": tolerance.max_steps, "slides": tolerance.slides}
+        instants = {"start": begin, "end": end, "rtol": tolerance.rtol, "atol": tolerance.atol}
         explicit = self._is_explicit(method, p, y, w, end - begin)
         while True:
-            state, heads, work = self._state(not explicit)
-            span = np.array([begin, end])
-            state[self._max_steps], state[self._slides_too] = tolerance.max_steps, tolerance.slides
-            status = self._integrate(state, work, span, allowed, y, w, p, constants, *tables, t_out, out, sizes, heads)
-            if STATUSES[status] == "stiff" and method in ("auto", "nonstiff"):
+            record, heads, work = self._record(not explicit)
+            record[[PLACE[n] for n in fixed]] = list(fixed.values())
+            reals = record.view(float)
+            reals[[PLACE[n] for n in instants]] = list(instants.values())
+            status = integrate(record, work, y, w)
+            if status == "stiff" and method in ("auto", "nonstiff"):
                 explicit = False
                 if method == "auto":
                     self._explicit = False
                 continue
-            if STATUSES[status] == "sliding":  # now with the code of that slide
-                self._compile_slide(int(state[place("last_switch")]))
+            if status == "sliding":  # now with the code of that slide
+                self._compile_slide(int(record[PLACE["last_switch"]]))
                 continue
             break
-        counts = state[self._counted].tolist()
-        statistics = Statistics(STATUSES[status], "explicit" if explicit else "rosenbrock", *counts)
-        if status:
+        counts = record[COUNTED].tolist()
+        statistics = Statistics(status, "explicit" if explicit else "rosenbrock", *counts)
+        if status != "converged":
             raise SimulationError(
-                f"the simulation of model '{self.structure.model.name}' stopped: {STATUSES[status]}",
-                where=f"t = {span[0]:.6g} s",
+                f"the simulation of model '{self.structure.model.name}' stopped: {status}",
+                where=f"t = {reals[PLACE['t']]:.6g} s",
                 got=f"{statistics.accepted} steps accepted, {statistics.rejected} rejected, {statistics.events} switches",
-                hint=HINTS[STATUSES[status]],
+                hint=HINTS[status],
             )
         return out, statistics
 
@@ -234,26 +248,26 @@ class Engine:
             if switch not in self._slides:
                 equations = ModelEquations(m.model, m.sensitivities, m.outputs, switch, brief=m.brief)
                 self._slides[switch] = _Equations(equations)
-                self._states.clear()
+                self._records.clear()
 
-    def _state(self, rosenbrock: bool) -> tuple[Integers, Integers, Array]:
-        """A new run's record as integers, the heads of the equations it may use, and its workspace."""
+    def _record(self, rosenbrock: bool) -> tuple[Integers, Integers, Array]:
+        """A new run's record, the heads of the equations it may use, and its workspace."""
         with self._lock:  # two threads that compile would free the code that one of them runs
-            if rosenbrock not in self._states:
-                self._states[rosenbrock] = self._template(rosenbrock)
-            template, heads, room = self._states[rosenbrock]
-        return template.copy(), heads, np.zeros(room)
+            if rosenbrock not in self._records:
+                self._records[rosenbrock] = self._template(rosenbrock)
+            template, heads, doubles = self._records[rosenbrock]
+        return template.copy(), heads, np.zeros(doubles)
 
     def _template(self, rosenbrock: bool) -> tuple[Integers, Integers, int]:
         """The record before a run, its heads, and how many doubles of workspace a run takes."""
-        heads = np.zeros((self.structure.sizes.ns + 1, HEAD), dtype=np.int64)
+        heads = np.zeros((self.structure.sizes.ns + 1, len(HEAD_FIELDS)), dtype=np.int64)
         for row, equations in {**self._slides, -1: self._equations}.items():
             heads[row] = equations.head(rosenbrock)
-        state = np.zeros(len(RUN.fields or ()), dtype=np.int64)
-        state[:HEAD] = heads.max(axis=0)  # room for the largest
-        self._counted = [place(name) for name in COUNTED]
-        self._max_steps, self._slides_too = place("max_steps"), place("slides")
-        return state, heads, self._room(state.copy())
+        record = np.zeros(len(RUN_FIELDS), dtype=np.int64)
+        record[: len(HEAD_FIELDS)] = heads.max(axis=0)  # room for the largest
+        doubles = room(record)
+        record[PLACE["heads"]] = heads.ctypes.data
+        return record, heads, doubles
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
         """True where the explicit pair is the better choice: no unknowns, and no eigenvalue so fast that it would rule the step."""

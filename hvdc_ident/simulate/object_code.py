@@ -10,10 +10,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import hashlib
-import importlib
 import os
-import platform
-import sys
 import uuid
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -220,55 +217,3 @@ def evaluate(address: int, y: Array, w: Array, p: Array, m: Array, out: Array) -
     """Call one generated function from Python."""
     arrays = [np.ascontiguousarray(a, dtype=float) for a in (y, y, w, np.zeros_like(w), p, m)]
     _GENERATED(int(address))(*(a.ctypes.data for a in arrays), out.ctypes.data)
-
-
-# --- the integrators ---
-
-ENTRIES = dict.fromkeys(("integrate", "room"), "integrator") | dict.fromkeys(
-    ("newton", "continuation", "pseudo_transient", "implicit_euler", "minimum_norm", "judge"), "steady_state_kernels"
-)
-"""Functions of compiled code that Python calls, with their modules."""
-KERNEL_FILES = (
-    "codegen", "equations", "events", "exogenous", "integrator", "native", "run_state", "simd", "simulation", "sliding",
-    "steady_state_kernels", "steps", "unknowns",
-)  # fmt: skip
-"""Modules that these functions are made from."""
-
-
-@cache
-def entry(name: str) -> Callable[..., int]:
-    """Return one of `ENTRIES`, loaded, or compiled where this installation has not compiled it as it is.
-
-    It takes arrays, contiguous and of the right type, which is for the caller to see to; it raises MemoryError.
-    """
-    import numba
-    from numba.core.registry import cpu_target
-    from numba.core.runtime import rtsys
-
-    rtsys.initialize(cpu_target.target_context)  # makes what compiled code calls (memory, errors) known by name
-    files = [hashlib.sha256((Path(__file__).parent / f"{f}.py").read_bytes()).hexdigest() for f in KERNEL_FILES]
-    facts = " ".join([name, numba.__version__, platform.python_version(), *files])
-    engine = loaded(kept(facts, lambda: _compiled_entry(name)))
-    function = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.py_object)(engine.get_function_address(_symbol(name)))
-
-    def call(*arrays: Any, _engine: llvm.ExecutionEngine = engine) -> int:
-        answer = function(arrays)
-        if answer == 0:
-            raise MemoryError
-        return answer - 1
-
-    return call
-
-
-def _compiled_entry(name: str) -> bytes:
-    from numba import cfunc, types
-
-    if name == "integrate":  # most of the time; the others take seconds
-        print(
-            "hvdc_ident: compiling the integrators, once for this installation (about half a minute) ...",
-            file=sys.stderr,
-            flush=True,
-        )
-    function = getattr(importlib.import_module(f"hvdc_ident.simulate.{ENTRIES[name]}"), name)
-    made = cfunc(types.int64(types.int64), error_model="numpy")(function)
-    return compiled(str(made.inspect_llvm()).replace(made.native_name, _symbol(name)), effort=3)

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     import xarray
 
 
-STATUSES = ("converged", "step-limit", "not-finite", "chatter", "inconsistent", "stiff", "sliding", "two-slides")
 HINTS = {
     "step-limit": "look for a very fast part of the model, or for a jump (`where`) that the state's own derivative turns back: "
     "give it a width, as clip((a - b)/width, 0, 1); from Python, Tolerance(max_steps=..., rtol=...)",

@@ -23,7 +23,8 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, State, blended
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.equations import ACCURACY, SHORTEST, TINY, ModelEquations, by_structure
-from hvdc_ident.simulate.object_code import Code, entry, evaluate
+from hvdc_ident.simulate.core import SteadyEquations
+from hvdc_ident.simulate.object_code import Code, evaluate
 
 Branch = Literal["own", "unconnected"]
 
@@ -33,6 +34,7 @@ HALVES = 0.5
 AWAY = (0.005, 0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 """Distances from its guess at which a reference is looked for, of 1 and its size: a control's range is some per cent of that."""
 ROOM = 256
+EPSILON = float(np.finfo(float).eps)
 DOUBLINGS = 11  # of a hundredth of a state's size: to ten times that, beyond which a state is hardly a neighbour
 
 
@@ -65,6 +67,30 @@ class SteadyState:
     branch: Branch = "own"
 
 
+def minimum_norm(equations: SteadyEquations, size: Array, v: Array) -> None:
+    """Move v (n,) by Newton steps of least norm, for a Jacobian that is singular where a state does not matter.
+
+    size: the most that each unknown counts for.
+    """
+    for _ in range(50):
+        r, jac, weights = equations.judged(size, v)
+        if not (np.isfinite(r).all() and np.isfinite(jac).all()):
+            return
+        step = np.linalg.lstsq(jac / weights[:, None], -r / weights, rcond=1e-12)[0]
+        before, damping = float(np.linalg.norm(r / weights)), 1.0
+        while damping > 1e-4:
+            trial = v + damping * step
+            after = float(np.linalg.norm(equations.judged(size, trial)[0] / weights))
+            if after < before or before < 1e-14:
+                break
+            damping /= 2
+        else:
+            return
+        v[:] = trial
+        if np.abs(step).max(initial=0.0) < 1e-14:
+            return
+
+
 class Equilibria:
     """The steady states of one model structure; its machine code stays with whoever made it, as long as this is used."""
 
@@ -72,8 +98,8 @@ class Equilibria:
         self.structure, self._address, self._code = structure, address, code
         s = structure.sizes
         self.n, self.extra = s.nx + s.nz, s.nd + s.nq
-        self._sizes = np.array([s.nx, self.n, 1 + s.nu, self.n + self.extra, s.width], dtype=np.int64)
-        self._solve = entry("newton")
+        self._sizes = (s.nx, self.n, 1 + s.nu, self.n + self.extra, s.width)
+        self._functions = [int(address[NAMES.index(n)]) for n in ("modes", "rest", "rest_jac", "rest_p")]
         self._references: dict[tuple[Model, bytes], ReferenceEquilibrium | None] = {}
         self.names = (*structure.states, *structure.unknowns, *structure.model.delays, *structure.model.sampled)
 
@@ -267,10 +293,10 @@ class Equilibria:
         for k, (a, b) in enumerate(pairwise(way)):
             ends_p, ends_w = np.array([a[0], b[0]]), np.array([[a[2], *a[1]], [b[2], *b[1]]])
             equations, reached = self._equations(a[0].copy(), a[1], a[2]), np.array([sign, 0.0])
-            entry("continuation")(*equations, ends_p, ends_w, v, reached)
+            equations.continuation(ends_p, ends_w, v, reached)
             if reached[0] < 1.0:
-                w, p = equations[3], equations[5]
-                at = (p, w[1 : ends_w.shape[1]].copy(), float(w[0]))
+                w = equations.w
+                at = (equations.p, w[1 : ends_w.shape[1]].copy(), float(w[0]))
                 turned = judged and self._turns(v, at, ends_p, ends_w)
                 return Path(v, (k + float(reached[0])) / legs, "fold" if turned else "jump", at)
         return Path(v, 1.0, "arrived")
@@ -339,20 +365,20 @@ class Equilibria:
     ) -> SteadyState | None:
         """Solution that Newton's method finds from v; None where it finds none. contraction, sign: the rule of `newton`."""
         equations, rule = self._equations(p, u, time, v), np.array([contraction, sign])
-        if not self._solve(*equations, rule):
+        if not equations.newton(rule):
             return None
-        y, w, first = equations[2], equations[3], 1 + self.structure.sizes.nu
+        y, w, first = equations.y, equations.w, 1 + self.structure.sizes.nu
         return SteadyState(y, w, np.concatenate([y[: self.n], w[first : first + self.extra]]), float(rule[1]))
 
-    def _equations(self, p: Array, u: Array, time: float, v: Array | None = None) -> tuple[Any, ...]:
-        """Arguments that every compiled function of steady states begins with: addresses, sizes, y, w, its rate, p and modes."""
+    def _equations(self, p: Array, u: Array, time: float, v: Array | None = None) -> SteadyEquations:
+        """The steady-state equations at parameters, inputs and a time, with the unknowns at v (default: 0)."""
         s = self.structure.sizes
         y, w = np.zeros(self.n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
         w[0], w[1 : 1 + s.nu] = time, u
         if v is not None:
             y[: self.n], w[1 + s.nu : 1 + s.nu + self.extra] = v[: self.n], v[self.n :]
         p = np.ascontiguousarray(p, dtype=float)
-        return self._address, self._sizes, y, w, np.zeros_like(w), p, np.zeros(max(s.ns, 1))
+        return SteadyEquations(self._functions, self._sizes, y, w, p, np.zeros(max(s.ns, 1)), values=1 + s.nu)
 
     def _directly(self, reference: ReferenceEquilibrium, p: Array, u: Array, time: float) -> SteadyState | None:
         """Solution at other values that Newton's method finds from a known one, and leads back from.
@@ -368,9 +394,9 @@ class Equilibria:
 
     def _judged(self, v: Array, p: Array, u: Array, time: float) -> tuple[Array, Array, Array]:
         """(residual, Jacobian, scaled residuals) of the rest equations at v."""
-        n = self.n + self.extra
-        r, jac, shares = np.zeros(n), np.zeros((n, n)), np.zeros(n)
-        entry("judge")(*self._equations(p, u, time), self._region.size, v, r, jac, shares)
+        r, jac, weights = self._equations(p, u, time).judged(self._region.size, v)
+        rounding = np.abs(jac) @ np.abs(v)
+        shares = np.where(np.abs(r) <= 16.0 * EPSILON * rounding, 0.0, np.abs(r) / weights)
         return r, jac, shares
 
     # --- where a search begins ---
@@ -498,7 +524,8 @@ class Equilibria:
             raise self._refused(r, shares, v)
         v, _, jac, _ = tried[-1]
         s, n = self.structure.sizes, self.n + self.extra
-        _, _, y, w, _, p, m = self._equations(p, u, time, v)
+        equations = self._equations(p, u, time, v)
+        y, w, p, m = equations.y, equations.w, equations.p, equations.m
         if s.width:
             rows = np.zeros(n * s.width)
             evaluate(self._address[NAMES.index("modes")], y, w, p, m, m)
@@ -518,8 +545,12 @@ class Equilibria:
 
     def _move(self, solvers: tuple[str, ...], v: Array, p: Array, u: Array, time: float) -> None:
         """Move v by fallback solvers, one after the other."""
+        equations, size = self._equations(p, u, time), self._region.size
         for solver in solvers:
-            entry(solver)(*self._equations(p, u, time), self._region.size, v)
+            if solver == "minimum_norm":
+                minimum_norm(equations, size, v)
+            else:
+                getattr(equations, solver)(size, v)
 
     # --- what is told where there is none ---
 

@@ -9,7 +9,6 @@ import numpy as np
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import object_code, simulate
-from hvdc_ident.simulate.object_code import KERNEL_FILES
 
 OUTPUTS = {
     "sine": "sin(x) + cos(2*x)",
@@ -61,11 +60,3 @@ def test_outputs_of_a_plain_run_and_of_one_with_sensitivities_are_what_their_tex
             found = simulate(parse_card(CARD), step, sensitivities=names, rtol=1e-9, method=method)
             for name, values in expected(time, x, u).items():
                 assert np.allclose(found[name], values, rtol=1e-7, atol=1e-7), (name, names, method)
-
-
-def test_the_cache_knows_every_file_that_is_compiled():
-    folder = Path(object_code.__file__).parent
-    compiled = {"@kernel", "@njit", "@intrinsic", "@elementwise"}
-    found = {p.stem for p in folder.glob("*.py") if any(word in p.read_text() for word in compiled)}
-    assert found <= set(KERNEL_FILES)
-    assert all((folder / f"{name}.py").exists() for name in KERNEL_FILES)

@@ -1,0 +1,131 @@
+"""The integrators and the steady-state solvers in C: their records, and their functions by ctypes.
+
+The library is built when the package is installed, for any processor and for those with AVX2. The layout of a run's record is
+read from `core.h`, where it stands once.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import re
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+
+import llvmlite.binding as llvm
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.data import Array
+
+FOLDER = Path(__file__).parent
+BUILDS = {"avx2": ("avx2", "fma"), "baseline": ()}
+"""The builds of the library, best first, with the features of the processor that each needs."""
+LIBRARY = "core-{build}.so"
+STATUSES = (
+    "converged", "step-limit", "not-finite", "chatter", "inconsistent", "stiff", "sliding", "two-slides", "out-of-memory",
+)  # fmt: skip
+"""How a run ends, in the order of `enum status`."""
+Record = NDArray[np.int64]
+
+
+def _fields(*lists: str) -> tuple[str, ...]:
+    """Return the names that the header's lists of fields hold, in their order."""
+    header = re.sub(r"/\*.*?\*/", "", (FOLDER / "core.h").read_text(), flags=re.DOTALL)
+    found: list[str] = []
+    for name in lists:
+        body = re.search(rf"#define {name}\((\w+)\)((?:.*\\\n)*.*)", header)
+        assert body is not None
+        found += re.findall(rf"\b{body[1]}\((\w+)\)", body[2])
+    return tuple(found)
+
+
+HEAD_FIELDS = _fields("SIZES", "FUNCTIONS", "SECOND_DERIVATIVES")
+"""What one set of equations brings; first in a run's record."""
+RUN_FIELDS = (*HEAD_FIELDS, *_fields("VECTORS", "INDICES", "COUNTS", "FLAGS", "INSTANTS"))
+"""Fields of a run's record, eight bytes each."""
+PLACE = {name: k for k, name in enumerate(RUN_FIELDS)}
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """Return the library that suits this processor. Raises ImportError where it was not built."""
+    features = llvm.get_host_cpu_features()
+    for build, needed in BUILDS.items():
+        path = FOLDER / LIBRARY.format(build=build)
+        if path.exists() and all(features.get(f) for f in needed):
+            found = ctypes.CDLL(str(path))
+            found.hvdc_ident_room.restype = ctypes.c_int64
+            found.hvdc_ident_judge.restype = found.hvdc_ident_repeat.restype = None
+            return found
+    raise ImportError(
+        f"{FOLDER}: the compiled core is not there, expected {LIBRARY.format(build='baseline')}. "
+        "Install the package (pip install .), or build it in a checkout with: python build_backend.py"
+    )
+
+
+def _pointers(*arrays: Array | Record) -> list[ctypes.c_void_p]:
+    return [ctypes.c_void_p(a.ctypes.data) for a in arrays]
+
+
+def room(record: Record) -> int:
+    """Return how many doubles of workspace a run takes, from a record that has its sizes."""
+    return int(library().hvdc_ident_room(*_pointers(record)))
+
+
+def integrate(record: Record, work: Array, y: Array, w: Array) -> str:
+    """Run as `hvdc_ident_integrate` says, and return how it ended. Raises MemoryError."""
+    status = STATUSES[library().hvdc_ident_integrate(*_pointers(record, work, y, w))]
+    if status == "out-of-memory":
+        raise MemoryError
+    return status
+
+
+class SteadyEquations:
+    """The record of a model's steady-state equations and the vectors that stand in it.
+
+    address: of the functions modes, rest, rest_jac, rest_p. sizes: states, elements of y, elements of w before the unknowns in it,
+    unknowns, width of a row over the parameters. y, w, wd, p, m: vectors, which the solvers read and write.
+    """
+
+    def __init__(
+        self, address: Sequence[int], sizes: Sequence[int], y: Array, w: Array, p: Array, m: Array, values: int
+    ) -> None:
+        """values: elements of w that are values from outside, time included."""
+        self.y, self.w, self.wd, self.p, self.m = y, w, np.zeros_like(w), p, m
+        counts = (m.size, p.size, values)
+        vectors = [a.ctypes.data for a in (y, w, self.wd, p, m)]
+        self.record = np.array([*address, *sizes, *counts, *vectors], dtype=np.int64)
+        self.unknowns = int(sizes[3])
+
+    def newton(self, rule: Array) -> bool:
+        """Return True where the steady state was found, as `hvdc_ident_newton` says. Raises MemoryError."""
+        return self._called("newton", rule) > 0
+
+    def continuation(self, ends_p: Array, ends_w: Array, v: Array, way: Array) -> None:
+        """Move v along a path of values, as `hvdc_ident_continuation` says. Raises MemoryError."""
+        self._called("continuation", ends_p, ends_w, v, way)
+
+    def pseudo_transient(self, size: Array, v: Array) -> None:
+        """Move v by implicit Euler steps that follow the model. size: the most that each unknown counts for. Raises MemoryError."""
+        self._called("pseudo_transient", size, v)
+
+    def implicit_euler(self, size: Array, v: Array) -> None:
+        """Move v by implicit Euler steps that are solved each. size: the most that each unknown counts for. Raises MemoryError."""
+        self._called("implicit_euler", size, v)
+
+    def judged(self, size: Array, v: Array) -> tuple[Array, Array, Array]:
+        """Return the residual at v, (n,), its Jacobian, (n, n), and what each equation's residual is measured by, (n,).
+
+        size: the most that each unknown counts for.
+        """
+        n = self.unknowns
+        r, jac, weights = np.zeros(n), np.zeros((n, n)), np.zeros(n)
+        library().hvdc_ident_judge(*_pointers(self.record, size, v, r, jac, weights))
+        return r, jac, weights
+
+    def _called(self, name: str, *arrays: Array) -> int:
+        answer = int(getattr(library(), f"hvdc_ident_{name}")(*_pointers(self.record, *arrays)))
+        if answer < 0:
+            raise MemoryError
+        return answer

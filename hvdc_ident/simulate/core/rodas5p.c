@@ -1,0 +1,165 @@
+/* RODAS5P: G. Steinebach, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks within the Julia Differential
+   Equations package, BIT 63 (2023): order 5, stiffly accurate, L-stable, for index-1 DAEs, dense output of order 4. In the
+   transformed form: stage i at y + sum a_ij k_j, right-hand side f + M sum c_ij k_j / h + h d_i f_t. */
+
+#include "core.h"
+
+static const double RODAS_GAMMA = 0.21193756319429014;
+static const double RODAS_A[6][5] = {
+    {0.0, 0.0, 0.0, 0.0, 0.0},
+    {3.0, 0.0, 0.0, 0.0, 0.0},
+    {2.849394379747939, 0.45842242204463923, 0.0, 0.0, 0.0},
+    {-6.954028509809101, 2.489845061869568, -10.358996098473584, 0.0, 0.0},
+    {2.8029986275628964, 0.5072464736228206, -0.3988312541770524, -0.04721187230404641, 0.0},
+    {-7.502846399306121, 2.561846144803919, -11.627539656261098, -0.18268767659942256, 0.030198172008377946},
+};
+
+static const double RODAS_C[8][7] = {
+    {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0},
+    {-14.155112264123755, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0},
+    {-17.97296035885952, -2.859693295451294, 0.0, 0.0, 0.0, 0.0, 0.0},
+    {147.12150275711716, -1.41221402718213, 71.68940251302358, 0.0, 0.0, 0.0, 0.0},
+    {165.43517024871676, -0.4592823456491126, 42.90938336958603, -5.961986721573306, 0.0, 0.0, 0.0},
+    {24.854864614690072, -3.0009227002832186, 47.4931110020768, 5.5814197821558125, -0.6610691825249471, 0.0, 0.0},
+    {30.91273214028599, -3.1208243349937974, 77.79954646070892, 34.28646028294783, -19.097331116725623, -28.087943162872662, 0.0},
+    {37.80277123390563, -3.2571969029072276, 112.26918849496327, 66.9347231244047, -40.06618937091002, -54.66780262877968, -9.48861652309627},
+};
+
+static const double RODAS_TIME[8] = {0.0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1.0, 1.0, 1.0};
+
+static const double RODAS_D[8] = {0.21193756319429014, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069, 0.0, 0.0, 0.0};
+
+static const double RODAS_H[3][8] = {
+    {25.948786856663858, -2.5579724845846235, 10.433815404888879, -2.3679251022685204, 0.524948541321073, 1.1241088310450404, 0.4272876194431874, -0.17202221070155493},
+    {-9.91568850695171, -0.9689944594115154, 3.0438037242978453, -24.495224566215796, 20.176138334709044, 15.98066361424651, -6.789040303419874, -6.710236069923372},
+    {11.419903575922262, 2.8879645146136994, 72.92137995996029, 80.12511834622643, -52.072871366152654, -59.78993625266729, -0.15582684282751913, 4.883087185713722},
+};
+
+/* Sums over stages with weights of one row, in the loop over the elements i. */
+#define SUM1(w) (w)[0] * k0[i]
+#define SUM2(w) SUM1(w) + (w)[1] * k1[i]
+#define SUM3(w) SUM2(w) + (w)[2] * k2[i]
+#define SUM4(w) SUM3(w) + (w)[3] * k3[i]
+#define SUM5(w) SUM4(w) + (w)[4] * k4[i]
+#define SUM6(w) SUM5(w) + (w)[5] * k5[i]
+#define SUM7(w) SUM6(w) + (w)[6] * k6[i]
+#define SUM8(w) SUM7(w) + (w)[7] * k7[i]
+
+/* Write r->u, where the stage's right-hand side is taken (r->y at stage 0), and r->add, what is added to it.
+
+   From stage 5 on the point is that of the stage before and its k, and the right-hand side has no f_t. */
+static void rodas_prepare(run *r, integer stage)
+{
+    integer count = r->stride;
+    const double *restrict k0 = r->k, *restrict k1 = k0 + count, *restrict k2 = k1 + count, *restrict k3 = k2 + count;
+    const double *restrict k4 = k3 + count, *restrict k5 = k4 + count, *restrict k6 = k5 + count;
+    const double *restrict y = r->y, *restrict mass = r->mass, *restrict ft = r->ft;
+    double *restrict u = r->u, *restrict add = r->add;
+    double inverse = 1.0 / r->hs, push = r->hs * RODAS_D[stage];
+#define STAGE(number, point, sum)                                             \
+    case number:                                                              \
+        for (integer i = 0; i < count; i++) {                                 \
+            u[i] = point;                                                     \
+            add[i] = mass[i] * (inverse * (sum(RODAS_C[number]))) + push * ft[i]; \
+        }                                                                     \
+        break;
+    switch (stage) {
+    case 0:
+        for (integer i = 0; i < count; i++)
+            add[i] = push * ft[i];
+        break;
+        STAGE(1, y[i] + SUM1(RODAS_A[1]), SUM1)
+        STAGE(2, y[i] + (SUM2(RODAS_A[2])), SUM2)
+        STAGE(3, y[i] + (SUM3(RODAS_A[3])), SUM3)
+        STAGE(4, y[i] + (SUM4(RODAS_A[4])), SUM4)
+        STAGE(5, y[i] + (SUM5(RODAS_A[5])), SUM5)
+        STAGE(6, u[i] + k5[i], SUM6)
+        STAGE(7, u[i] + k6[i], SUM7)
+    }
+#undef STAGE
+}
+
+/* Factor M/(h gamma) - J: 1 by the generated elimination, 2 by dense partial pivoting, 0 if it is singular.
+
+   The generated one takes its pivots as they come: it is trusted where none is small against its row. */
+static int rodas_factor(run *r)
+{
+    integer n = r->n;
+    double shift = 1.0 / (r->hs * RODAS_GAMMA);
+    r->shift[0] = shift;
+    if (r->factors) {
+        r->do_lu(r->jac, r->yd, r->shift, r->yd, r->yd, r->m, r->factor);
+        if (r->factor[r->factors] < 1e7)
+            return 1;
+    }
+    for (integer q = 0; q < n * n; q++)
+        r->matrix[q] = -r->jac[q];
+    for (integer i = 0; i < r->nx; i++)
+        r->matrix[i * n + i] += shift;
+    return lu(r->matrix, r->pivots, n) ? 2 : 0;
+}
+
+/* The work of the generated solve by dense linear algebra: from the right-hand side in k to the stage. */
+static void rodas_solve(run *r, double *k)
+{
+    integer n = r->n, width = r->width;
+    for (integer q = 0; q < r->stride; q++)
+        k[q] += r->add[q];
+    solve(r->matrix, r->pivots, k, n);
+    if (width == 0)
+        return;
+    double *rows = k + n;
+    for (integer q = 0; q < r->hessians; q++)
+        subtract(rows + r->hess_row[q] * width, r->hessian + q * width, -k[r->hess_column[q]], width);
+    solve_rows(r->matrix, r->pivots, rows, n, width);
+}
+
+/* One step into r->yn. Returns the error over the first `rows` unknowns. */
+static double rodas_step(run *r, integer rows)
+{
+    outside(r, r->t, r->t);
+    if (!r->again) {
+        evaluate(r, r->do_jac, r->y, r->jac);
+        if (r->forced)
+            evaluate(r, r->do_ft, r->y, r->ft);
+        if (r->hessians)
+            evaluate(r, r->do_hess, r->y, r->hessian);
+    }
+    int kind = rodas_factor(r);
+    if (kind == 0)
+        return INFINITY;
+    r->evaluations += 8;
+    for (integer stage = 0; stage < 8; stage++) {
+        if (0 < stage && stage < 6) /* the later ones are taken at the same instant as 5 */
+            outside(r, stage == 5 ? r->step_end : r->t + RODAS_TIME[stage] * r->hs, r->t);
+        rodas_prepare(r, stage);
+        double *k = r->k + r->stride * stage;
+        evaluate(r, r->do_rhs, stage ? r->u : r->y, k);
+        if (kind == 1)
+            r->do_solve(r->add, r->hessian, r->w, r->wd, r->factor, r->m, k);
+        else
+            rodas_solve(r, k);
+    }
+    const double *restrict error = r->k + r->stride * 7, *restrict u = r->u;
+    double *restrict yn = r->yn;
+    for (integer i = 0; i < r->stride; i++)
+        yn[i] = u[i] + error[i];
+    return error_norm(r, error, rows);
+}
+
+/* Write the quartic of the step that ended in r->yn into r->dense. */
+static void rodas_dense(run *r)
+{
+    integer count = r->stride;
+    const double *restrict k0 = r->k, *restrict k1 = k0 + count, *restrict k2 = k1 + count, *restrict k3 = k2 + count;
+    const double *restrict k4 = k3 + count, *restrict k5 = k4 + count, *restrict k6 = k5 + count, *restrict k7 = k6 + count;
+    const double *restrict y = r->y, *restrict yn = r->yn;
+    double *restrict d0 = r->dense, *restrict d1 = d0 + count, *restrict d2 = d1 + count, *restrict d3 = d2 + count;
+    for (integer i = 0; i < count; i++) {
+        double a = SUM8(RODAS_H[0]), b = SUM8(RODAS_H[1]), c = SUM8(RODAS_H[2]);
+        d0[i] = (yn[i] - y[i]) + a;
+        d1[i] = b - a;
+        d2[i] = c - b;
+        d3[i] = -c;
+    }
+}

@@ -1,0 +1,304 @@
+/* Segments between breaks: inputs jump, samples are taken, delayed jumps come back; rows of outputs and the history in between. */
+
+#include "core.h"
+
+/* --- rows of outputs and the history of delayed signals --- */
+
+static integer columns(const run *r)
+{
+    integer count = r->no * (1 + r->width);
+    return count > 1 ? count : 1;
+}
+
+/* Write the next row of outputs from the flat vector y, with what comes from outside as it stands. */
+static void write_row(run *r, const double *y)
+{
+    evaluate(r, r->do_observe, y, r->out + r->i_out * columns(r));
+    r->i_out++;
+}
+
+/* Write the step's quartic at four instants to the rows of r->block. */
+static void interpolate_four(run *r, const double *instants)
+{
+    double scale = 1.0 / r->hs;
+    for (integer k = 0; k < LANES; k++)
+        interpolate(r, (instants[k] - r->t) * scale, r->size, r->block + k * r->stride);
+}
+
+/* Write the next `count` rows in one go; the rows up to the fourth get the last one's values, until their turn comes. */
+static void write_four(run *r, integer count)
+{
+    for (integer k = 0; k < LANES; k++)
+        r->instants[k] = r->t_out[r->i_out + (k < count ? k : count - 1)];
+    interpolate_four(r, r->instants);
+    if (r->do_rows) {
+        r->do_rows(r->block, r->instants, r->w, r->wd, r->p, r->m, r->out + r->i_out * columns(r));
+        r->i_out += count;
+    } else {
+        for (integer k = 0; k < count; k++) {
+            outside(r, r->instants[k], r->t);
+            write_row(r, r->block + r->stride * k);
+        }
+    }
+}
+
+/* Write the rows of outputs within the present step, from its dense output. */
+static void write_rows(run *r)
+{
+    for (;;) {
+        integer count = 0;
+        while (count < LANES && r->i_out + count < r->n_out) {
+            double at = r->t_out[r->i_out + count];
+            if (!(at < r->step_end || (at == r->step_end && r->step_end < r->tb)))
+                break;
+            count++;
+        }
+        if (count == 0)
+            return;
+        if (r->quiet && count > 2 && r->i_out + LANES <= r->n_out) { /* four at once cost about as much as two alone */
+            write_four(r, count);
+            continue;
+        }
+        for (integer k = 0; k < count; k++) {
+            double at = r->t_out[r->i_out];
+            interpolate(r, (at - r->t) / r->hs, r->size, r->u);
+            outside(r, at, r->t);
+            write_row(r, r->u);
+        }
+    }
+}
+
+/* Add the present step to the history of delayed signals. */
+static void remember(run *r)
+{
+    integer nd = r->nd, width = r->width, rows = 1 + width;
+    for (integer j = 0; j < NODES; j++) {
+        double share = (double)j / (NODES - 1) * (r->step_end - r->t) / r->hs;
+        interpolate(r, share, r->size, r->u);
+        outside(r, fmin(r->t + share * r->hs, r->step_end), r->t);
+        evaluate(r, r->do_sources, r->u, r->src);
+        for (integer i = 0; i < nd; i++) {
+            double *node = r->nodes + (i * NODES + j) * rows;
+            node[0] = r->src[i];
+            for (integer c = 0; c < width; c++)
+                node[1 + c] = r->src[nd + r->nq + i * width + c];
+        }
+    }
+    double *step = r->history + (2 + nd * NODES * rows) * r->kept;
+    step[0] = r->t;
+    step[1] = r->step_end - r->t;
+    for (integer i = 0; i < nd; i++)
+        quartics(r->nodes + i * NODES * rows, step + 2 + i * NODES * rows, rows);
+    r->kept++;
+}
+
+/* --- the beginning of a segment --- */
+
+/* The next instant at which a step has to end: a break of an input, a returning jump, a sample, the end. */
+static double next_stop(const run *r)
+{
+    double stop = r->end;
+    if (r->i_break < r->n_breaks)
+        stop = fmin(stop, r->breaks[r->i_break]);
+    for (integer i = 0; i < r->echoes; i++)
+        if (r->echo[i * (2 + r->width)] > r->t)
+            stop = fmin(stop, r->echo[i * (2 + r->width)]);
+    for (integer i = 0; i < r->nq; i++) {
+        if (r->tick[i] > r->t)
+            stop = fmin(stop, r->tick[i]);
+        if (r->publish[i] > r->t)
+            stop = fmin(stop, r->publish[i]);
+    }
+    return stop;
+}
+
+/* Publish the samples that are due. False: the unknowns have no solution with them. */
+static bool publish_samples(run *r)
+{
+    integer nd = r->nd, width = r->width;
+    for (integer i = 0; i < r->nq; i++) {
+        if (r->publish[i] != r->t)
+            continue;
+        if (width)
+            evaluate(r, r->do_f, r->y, r->f_before);
+        r->w[1 + r->nu + nd + i] = r->pending[i];
+        for (integer c = 0; c < width; c++)
+            r->w[r->nw + (nd + i) * width + c] = r->pending_p[i * width + c];
+        if (!settle(r))
+            return false;
+        if (width) {
+            evaluate(r, r->do_f, r->y, r->f_after);
+            shift_rows(r, r->f_before, r->f_after, r->publish_p + i * width);
+        }
+        r->publish[i] = INFINITY;
+        r->published = 1;
+    }
+    return !r->published || consistent(r, false);
+}
+
+/* Take the samples that are due: value and rows, at the instant's own dependence on the parameters.
+
+   A sample whose compute time is the whole period is published first, but all are taken from the signals before that. False: the
+   unknowns have no solution with what is published. */
+static bool take_samples(run *r)
+{
+    integer nd = r->nd, nq = r->nq, width = r->width;
+    const double *rows = r->constants + nd + 2 * nq;
+    bool due = false, whole = false;
+    for (integer i = 0; i < nq; i++)
+        if (r->tick[i] == r->t) {
+            due = true;
+            whole = whole || r->publish[i] == r->t;
+        }
+    if (!due)
+        return true;
+    evaluate(r, r->do_sources, r->y, r->src);
+    rates(r);
+    evaluate(r, r->do_srcd, r->y, r->src_rate);
+    if (whole && !publish_samples(r))
+        return false;
+    for (integer i = 0; i < nq; i++) {
+        if (r->tick[i] != r->t)
+            continue;
+        r->pending[i] = r->src[nd + i];
+        for (integer c = 0; c < width; c++) {
+            double own = r->ticks[i] * rows[(nd + i) * width + c];
+            r->pending_p[i * width + c] = r->src[nd + nq + (nd + i) * width + c] + r->src_rate[nd + i] * own;
+            r->publish_p[i * width + c] = own + rows[(nd + nq + i) * width + c];
+        }
+        r->publish[i] = r->t + r->constants[nd + nq + i];
+        r->ticks[i] += 1.0;
+        r->tick[i] = r->start + r->ticks[i] * r->constants[nd + i];
+        if (fabs(r->publish[i] - r->tick[i]) <= 1e-13 * fmax(1.0, fabs(r->t)))
+            r->publish[i] = r->tick[i]; /* one instant, so that rounding does not decide which comes first */
+    }
+    return true;
+}
+
+/* Jumps and corners of a delayed signal's source come back after the delay. */
+static void echo_sources(run *r)
+{
+    evaluate(r, r->do_src, r->y, r->src);
+    for (integer i = 0; i < r->nd; i++) {
+        double was = r->first ? r->before[i * (1 + r->width)] : r->src_left[i];
+        bool jumped = fabs(r->src[i] - was) > 1e-12 * (1.0 + fabs(r->src[i]));
+        double order = jumped ? 0.0 : r->order + 1.0;
+        if (order <= 4.0)
+            add_echo(r, i, order);
+    }
+}
+
+/* Begin a segment at r->t: inputs jump, samples are taken and published, outputs are written. False: no solution there. */
+static bool begin_segment(run *r)
+{
+    bool final = !(r->t < r->end);
+    r->tb = final ? r->t + 1.0 : next_stop(r);
+    enter_segment(r);
+    r->wd[0] = 1.0;
+    r->still = r->quiet = 0;
+    outside(r, r->t, r->t); /* what comes from outside is seen after its jump */
+    if (!settle(r))
+        return false;
+    if (!r->first && r->width && r->echo_now) {
+        evaluate(r, r->do_fs, r->y, r->f_after);
+        shift_rows(r, r->f_before, r->f_after, r->jump_p);
+        consistent(r, false);
+    }
+    r->echo_now = r->published = 0;
+    if (r->nq && !final) {
+        if (!take_samples(r) || !publish_samples(r))
+            return false;
+        r->tb = next_stop(r);
+    }
+    if (r->nd && (r->first || r->published || r->disturbed))
+        echo_sources(r);
+    for (integer c = 0; c < r->width; c++)
+        r->jump_p[c] = 0.0;
+    while (r->i_out < r->n_out && r->t_out[r->i_out] <= r->t)
+        write_row(r, r->y);
+    return true;
+}
+
+/* The length that changes the states by a hundredth of themselves, in the error's weights, or the last step's if shorter. */
+static void first_step(run *r)
+{
+    double span = r->end - r->start, d0 = 0.0, d1 = 0.0;
+    for (integer i = 0; i < r->nx; i++) {
+        double weight = r->atol + r->rtol * fabs(r->y[i]);
+        d0 += (r->y[i] / weight) * (r->y[i] / weight);
+        d1 += (r->k[i] / weight) * (r->k[i] / weight);
+        for (integer c = 0; c < r->np; c++) {
+            integer q = r->n + i * r->width + c;
+            weight = r->floors[c] + r->rtol * fabs(r->y[q]);
+            d0 += (r->y[q] / weight) * (r->y[q] / weight);
+            d1 += (r->k[q] / weight) * (r->k[q] / weight);
+        }
+    }
+    double guess = d1 > 0.0 && d0 > 0.0 ? 0.01 * sqrt(d0 / d1) : 0.1 * span;
+    r->h = r->h == 0.0 || guess < r->h ? fmin(fmax(guess, 1e-9 * span), 0.1 * span) : fmin(r->h, guess);
+}
+
+/* Set the constants of the segment, the switches' tolerances and the first step's length. */
+static void prepare_segment(run *r)
+{
+    r->segments++;
+    bool still = enter_segment(r);
+    for (integer i = 0; i < r->nu; i++)
+        still = still && r->wd[1 + i] == 0.0;
+    r->still = still;
+    r->quiet = still && r->nd == 0;
+    force(r);
+    if (r->ns) {
+        evaluate(r, r->do_sw, r->y, r->sv);
+        for (integer i = 0; i < r->ns; i++) {
+            if (fabs(r->sv[i]) < INFINITY)
+                r->top[i] = fmax(r->top[i], fabs(r->sv[i]));
+            r->slack[i] = 0.01 * r->rtol * r->top[i] + 1e-14;
+        }
+    }
+    evaluate(r, r->do_rhs, r->y, r->k);
+    r->evaluations++;
+    first_step(r);
+    r->fresh = 1;
+    r->again = 0;
+}
+
+/* --- its end --- */
+
+/* The segment's end, seen from before its jump: outputs of the left side, what comes back now, what comes next. */
+static void end_segment(run *r)
+{
+    integer width = r->width, line = 2 + width, kept = 0;
+    r->still = r->quiet = 0;
+    r->tb = r->t;
+    outside(r, r->t, r->start);
+    if (r->nd)
+        evaluate(r, r->do_src, r->y, r->src_left);
+    while (r->i_out + 1 < r->n_out && r->t_out[r->i_out] == r->t && r->t_out[r->i_out + 1] == r->t)
+        write_row(r, r->y);
+    r->order = 0.0;
+    r->disturbed = 0;
+    for (integer i = 0; i < r->echoes; i++) {
+        const double *echo = r->echo + i * line;
+        if (echo[0] == r->t) {
+            r->echo_now = r->disturbed = 1;
+            r->order = fmax(r->order, echo[1]);
+            for (integer c = 0; c < width; c++)
+                r->jump_p[c] = echo[2 + c];
+        } else if (echo[0] > r->t) {
+            for (integer q = 0; q < line; q++)
+                r->echo[kept * line + q] = echo[q];
+            kept++;
+        }
+    }
+    r->echoes = kept;
+    if (r->echo_now && width)
+        evaluate(r, r->do_f, r->y, r->f_before);
+    const double *returns = r->breaks + r->n_breaks;
+    while (r->i_break < r->n_breaks && r->breaks[r->i_break] <= r->t) {
+        if (returns[r->i_break] > 0.0)
+            r->disturbed = 1;
+        r->i_break++;
+    }
+    r->first = 0;
+}
