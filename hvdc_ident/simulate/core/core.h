@@ -30,6 +30,9 @@ enum {
     LANES = 4    /* instants that a generated function over several of them takes at once; elements of a loop over a vector */
 };
 
+/* A loop whose turns do not depend on each other: over elements of vectors that do not overlap, or are the same (-fopenmp-simd). */
+#define EACH(i, count) _Pragma("omp simd") for (integer i = 0; i < (count); i++)
+
 /* --- one set of equations: of the model, or of a slide on the surface of a switch --- */
 
 #define SIZES(INT)                                                                                                             \

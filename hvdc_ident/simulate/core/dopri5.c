@@ -27,7 +27,7 @@ static double *dopri_prepare(run *r, integer stage)
     double h = r->hs;
 #define STAGE(number, sum)                              \
     case number:                                        \
-        for (integer i = 0; i < count; i++)             \
+        EACH(i, count)             \
             u[i] = y[i] + h * (sum(DOPRI_A[number]));   \
         break;
     switch (stage) {
@@ -59,7 +59,7 @@ static double dopri_step(run *r, integer rows)
 {
     integer count = r->stride;
     if (!r->fresh)
-        for (integer i = 0; i < count; i++)
+        EACH(i, count)
             r->k[i] = r->k[6 * count + i];
     r->evaluations += 6;
     for (integer stage = 1; stage < 7; stage++) {
@@ -70,7 +70,7 @@ static double dopri_step(run *r, integer rows)
     const double *restrict k0 = r->k, *restrict k1 = k0 + count, *restrict k2 = k1 + count, *restrict k3 = k2 + count;
     const double *restrict k4 = k3 + count, *restrict k5 = k4 + count, *restrict k6 = k5 + count;
     double *restrict e = r->e, h = r->hs;
-    for (integer i = 0; i < count; i++)
+    EACH(i, count)
         e[i] = h * (SUM7(DOPRI_E));
     return error_norm(r, r->e, rows);
 }
@@ -84,7 +84,7 @@ static void dopri_dense(run *r)
     const double *restrict y = r->y, *restrict yn = r->yn;
     double *restrict d0 = r->dense, *restrict d1 = d0 + count, *restrict d2 = d1 + count, *restrict d3 = d2 + count;
     double h = r->hs;
-    for (integer i = 0; i < count; i++) {
+    EACH(i, count) {
         double change = yn[i] - y[i], bend = h * k0[i] - change, curl = change - h * k6[i] - bend;
         double end = h * (SUM7(DOPRI_DENSE));
         d0[i] = change + bend;

@@ -107,7 +107,7 @@ static bool enter_segment(run *r)
 /* Write into c (5, count) the power coefficients of the quartics through v (5, count) at 0, 1/4, 1/2, 3/4, 1. */
 static void quartics(const double *restrict v, double *restrict c, integer count)
 {
-    for (integer j = 0; j < count; j++) {
+    EACH(j, count) {
         double v0 = v[j], v1 = v[count + j], v2 = v[2 * count + j], v3 = v[3 * count + j], v4 = v[4 * count + j];
         c[j] = v0;
         c[count + j] = (-25 * v0 + 48 * v1 - 36 * v2 + 16 * v3 - 3 * v4) / 3;

@@ -35,7 +35,7 @@ static bool lu(double *a, integer *pivots, integer n)
                 continue;
             double share = own[k] * inverse;
             own[k] = share;
-            for (integer j = k + 1; j < n; j++)
+            _Pragma("omp simd") for (integer j = k + 1; j < n; j++)
                 own[j] -= share * pivot_row[j];
         }
     }
@@ -75,7 +75,7 @@ static void solve(const double *a, const integer *pivots, double *b, integer n)
 static void subtract(double *restrict from, const double *restrict row, double share, integer width)
 {
     if (share != 0.0)
-        for (integer c = 0; c < width; c++)
+        EACH(c, width)
             from[c] -= share * row[c];
 }
 

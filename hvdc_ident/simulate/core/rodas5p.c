@@ -58,14 +58,14 @@ static void rodas_prepare(run *r, integer stage)
     double inverse = 1.0 / r->hs, push = r->hs * RODAS_D[stage];
 #define STAGE(number, point, sum)                                             \
     case number:                                                              \
-        for (integer i = 0; i < count; i++) {                                 \
+        EACH(i, count) {                                 \
             u[i] = point;                                                     \
             add[i] = mass[i] * (inverse * (sum(RODAS_C[number]))) + push * ft[i]; \
         }                                                                     \
         break;
     switch (stage) {
     case 0:
-        for (integer i = 0; i < count; i++)
+        EACH(i, count)
             add[i] = push * ft[i];
         break;
         STAGE(1, y[i] + SUM1(RODAS_A[1]), SUM1)
@@ -103,7 +103,7 @@ static int rodas_factor(run *r)
 static void rodas_solve(run *r, double *k)
 {
     integer n = r->n, width = r->width;
-    for (integer q = 0; q < r->stride; q++)
+    EACH(q, r->stride)
         k[q] += r->add[q];
     solve(r->matrix, r->pivots, k, n);
     if (width == 0)
@@ -142,7 +142,7 @@ static double rodas_step(run *r, integer rows)
     }
     const double *restrict error = r->k + r->stride * 7, *restrict u = r->u;
     double *restrict yn = r->yn;
-    for (integer i = 0; i < r->stride; i++)
+    EACH(i, r->stride)
         yn[i] = u[i] + error[i];
     return error_norm(r, error, rows);
 }
@@ -155,7 +155,7 @@ static void rodas_dense(run *r)
     const double *restrict k4 = k3 + count, *restrict k5 = k4 + count, *restrict k6 = k5 + count, *restrict k7 = k6 + count;
     const double *restrict y = r->y, *restrict yn = r->yn;
     double *restrict d0 = r->dense, *restrict d1 = d0 + count, *restrict d2 = d1 + count, *restrict d3 = d2 + count;
-    for (integer i = 0; i < count; i++) {
+    EACH(i, count) {
         double a = SUM8(RODAS_H[0]), b = SUM8(RODAS_H[1]), c = SUM8(RODAS_H[2]);
         d0[i] = (yn[i] - y[i]) + a;
         d1[i] = b - a;

@@ -12,7 +12,7 @@ static void column_sums(const run *r, const double *restrict e, const double *re
         double sum[LANES] = {0.0};
         for (integer i = 0; i < rows; i++) {
             const double *restrict own = e + i * width + c, *restrict a = y + i * width + c, *restrict b = yn + i * width + c;
-            for (integer q = 0; q < LANES; q++) {
+            EACH(q, LANES) {
                 double before = fabs(a[q]), after = fabs(b[q]);
                 double share = own[q] / (floors[c + q] + rtol * (before > after ? before : after));
                 sum[q] += share * share;
@@ -56,6 +56,6 @@ static void interpolate(const run *r, double x, integer count, double *out)
     const double *restrict d = c + r->stride;
     double *restrict u = out;
     integer whole = (count + LANES - 1) / LANES * LANES;
-    for (integer i = 0; i < whole; i++)
+    EACH(i, whole)
         u[i] = y[i] + x * (a[i] + x * (b[i] + x * (c[i] + x * d[i])));
 }
