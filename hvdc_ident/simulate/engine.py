@@ -16,7 +16,7 @@ from hvdc_ident.errors import ModelError, SimulationError, TimingError
 from hvdc_ident.model import Model
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.equations import ModelEquations, by_structure, padded
-from hvdc_ident.simulate.core import HEAD_FIELDS, PLACE, RUN_FIELDS, integrate, room
+from hvdc_ident.simulate.core import GIVEN, GIVEN_INSTANTS, HEAD_FIELDS, PLACE, RUN_FIELDS, address, integrate, room
 from hvdc_ident.simulate.object_code import Code, evaluate
 from hvdc_ident.simulate.simulation import HINTS, Statistics
 from hvdc_ident.simulate.steady_state import Equilibria
@@ -195,31 +195,22 @@ class Engine:
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
         p = np.ascontiguousarray(p, dtype=float)
-        u, *tables = _tables(tuple(inputs), begin, end)
+        u, addresses, _ = _tables(tuple(inputs), begin, end)
         y, w = self.start(p, u, begin, search=tolerance.search, model=model)
         constants = self.constants(p)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
-        stops, pointer, times, values = tables
-        given = {
-            "p": p,
-            "constants": constants,
-            "scale": np.ones(max(s.np, 1)) if scale is None else np.ascontiguousarray(scale, dtype=float),
-            "breaks": stops,
-            "pointer": pointer,
-            "times": times,
-            "values": values,
-            "t_out": np.ascontiguousarray(time, dtype=float),
-            "out": out,
-        }
-        fixed = {n: a.ctypes.data for n, a in given.items()}
-        fixed |= {"n_breaks": stops.shape[1], "n_out": time.size, "max_steps": tolerance.max_steps, "slides": tolerance.slides}
-        instants = {"start": begin, "end": end, "rtol": tolerance.rtol, "atol": tolerance.atol}
+        n_breaks, *tables = addresses
+        t_out, scales = np.array(time, dtype=float), np.ones(max(s.np, 1)) if scale is None else np.array(scale, dtype=float)
+        p = np.array(p)
+        own = [address(a) for a in (p, constants, scales, t_out, out)]
+        given = [*own, *tables, n_breaks, time.size, tolerance.max_steps, tolerance.slides]
+        instants = [begin, end, tolerance.rtol, tolerance.atol]
         explicit = self._is_explicit(method, p, y, w, end - begin)
         while True:
             record, heads, work = self._record(not explicit)
-            record[[PLACE[n] for n in fixed]] = list(fixed.values())
+            record[GIVEN] = given
             reals = record.view(float)
-            reals[[PLACE[n] for n in instants]] = list(instants.values())
+            reals[GIVEN_INSTANTS] = instants
             status = integrate(record, work, y, w)
             if status == "stiff" and method in ("auto", "nonstiff"):
                 explicit = False
@@ -328,7 +319,10 @@ class Engine:
 
 @lru_cache(maxsize=64)
 def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[Any, ...]:
-    """Return the tables that an integration reads of its inputs: start values, stops, then the pieces of all of them and their points."""
+    """Return what an integration reads of its inputs: start values; the number of stops and the addresses of the tables; the tables.
+
+    The tables are the stops, where the pieces of each input begin, and the points of all of them: times, values.
+    """
     # "At the first row" is what stood before anything happened: the value from the left.
     u = [
         float(i.values[0] if i.times.size == 1 or i.times[0] >= begin else i(np.nextafter(begin, -np.inf)))
@@ -340,7 +334,8 @@ def _tables(inputs: tuple[InputSignal, ...], begin: float, end: float) -> tuple[
     pointer = np.cumsum([0, *(i.times.size for i in inputs)]).astype(np.int64)
     times = np.concatenate([i.times for i in inputs]) if inputs else np.empty(0)
     values = np.concatenate([i.values for i in inputs]) if inputs else np.empty(0)
-    return np.array(u), stops, pointer, times, values
+    tables = (stops, pointer, times, values)
+    return np.array(u), (stops.shape[1], *(address(a) for a in tables)), tables
 
 
 ROOM = 128

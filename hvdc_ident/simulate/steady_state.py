@@ -373,12 +373,10 @@ class Equilibria:
     def _equations(self, p: Array, u: Array, time: float, v: Array | None = None) -> SteadyEquations:
         """The steady-state equations at parameters, inputs and a time, with the unknowns at v (default: 0)."""
         s = self.structure.sizes
-        y, w = np.zeros(self.n * (1 + s.width)), np.zeros(1 + s.nu + self.extra * (1 + s.width))
-        w[0], w[1 : 1 + s.nu] = time, u
+        equations = SteadyEquations(self._functions, self._sizes, (time, *u), p, s.ns)
         if v is not None:
-            y[: self.n], w[1 + s.nu : 1 + s.nu + self.extra] = v[: self.n], v[self.n :]
-        p = np.ascontiguousarray(p, dtype=float)
-        return SteadyEquations(self._functions, self._sizes, y, w, p, np.zeros(max(s.ns, 1)), values=1 + s.nu)
+            equations.y[: self.n], equations.w[1 + s.nu : 1 + s.nu + self.extra] = v[: self.n], v[self.n :]
+        return equations
 
     def _directly(self, reference: ReferenceEquilibrium, p: Array, u: Array, time: float) -> SteadyState | None:
         """Solution at other values that Newton's method finds from a known one, and leads back from.

@@ -34,17 +34,25 @@ def _fields(*lists: str) -> tuple[str, ...]:
     header = re.sub(r"/\*.*?\*/", "", (FOLDER / "core.h").read_text(), flags=re.DOTALL)
     found: list[str] = []
     for name in lists:
-        body = re.search(rf"#define {name}\((\w+)\)((?:.*\\\n)*.*)", header)
+        body = re.search(rf"#define {name}\(.*?\)((?:.*\\\n)*.*)", header)
         assert body is not None
-        found += re.findall(rf"\b{body[1]}\((\w+)\)", body[2])
+        found += re.findall(r"\b[A-Z]+\((\w+)\)", body[1])
     return tuple(found)
 
 
 HEAD_FIELDS = _fields("SIZES", "FUNCTIONS", "SECOND_DERIVATIVES")
 """What one set of equations brings; first in a run's record."""
-RUN_FIELDS = (*HEAD_FIELDS, *_fields("VECTORS", "INDICES", "COUNTS", "FLAGS", "INSTANTS"))
+_STATED, _STATED_INSTANTS = _fields("GIVEN"), _fields("GIVEN_INSTANTS")
+RUN_FIELDS = (
+    *HEAD_FIELDS, *_STATED, *_STATED_INSTANTS, *_fields("VECTORS", "INDICES", "COUNTS", "FLAGS", "INSTANTS"),
+)  # fmt: skip
 """Fields of a run's record, eight bytes each."""
 PLACE = {name: k for k, name in enumerate(RUN_FIELDS)}
+GIVEN = slice(len(HEAD_FIELDS), len(HEAD_FIELDS) + len(_STATED))
+"""Where in the record stands what the caller states: addresses of p, constants, scale, t_out, out, breaks, pointer, times, values;
+numbers of breaks and outputs, the most steps, whether the run may slide."""
+GIVEN_INSTANTS = slice(GIVEN.stop, GIVEN.stop + len(_STATED_INSTANTS))
+"""Then, as doubles, start, end and the tolerances, relative and absolute."""
 
 
 @cache
@@ -64,8 +72,16 @@ def library() -> ctypes.CDLL:
     )
 
 
+_NOTHING = ctypes.c_char * 0
+
+
+def address(array: Array | Record) -> int:
+    """Return the address of a writable array's data; a quarter of the time that `array.ctypes` takes."""
+    return ctypes.addressof(_NOTHING.from_buffer(array))
+
+
 def _pointers(*arrays: Array | Record) -> list[ctypes.c_void_p]:
-    return [ctypes.c_void_p(a.ctypes.data) for a in arrays]
+    return [ctypes.c_void_p(address(a)) for a in arrays]
 
 
 def room(record: Record) -> int:
@@ -84,19 +100,24 @@ def integrate(record: Record, work: Array, y: Array, w: Array) -> str:
 class SteadyEquations:
     """The record of a model's steady-state equations and the vectors that stand in it.
 
-    address: of the functions modes, rest, rest_jac, rest_p. sizes: states, elements of y, elements of w before the unknowns in it,
-    unknowns, width of a row over the parameters. y, w, wd, p, m: vectors, which the solvers read and write.
+    functions: addresses of modes, rest, rest_jac, rest_p. sizes: states, elements of y, elements of w before the unknowns in it,
+    unknowns, width of a row over the parameters. y, w, wd, p, m: vectors, which the solvers read and write; p is a copy.
     """
 
     def __init__(
-        self, address: Sequence[int], sizes: Sequence[int], y: Array, w: Array, p: Array, m: Array, values: int
+        self, functions: Sequence[int], sizes: Sequence[int], values: Sequence[float], p: Array, switches: int
     ) -> None:
-        """values: elements of w that are values from outside, time included."""
-        self.y, self.w, self.wd, self.p, self.m = y, w, np.zeros_like(w), p, m
-        counts = (m.size, p.size, values)
-        vectors = [a.ctypes.data for a in (y, w, self.wd, p, m)]
-        self.record = np.array([*address, *sizes, *counts, *vectors], dtype=np.int64)
-        self.unknowns = int(sizes[3])
+        """values: what comes from outside, time first; the unknowns beyond it, and y, are 0."""
+        _, inner, first, n, width = sizes
+        lengths = (inner * (1 + width), first + (n - inner) * (1 + width), first + (n - inner) * (1 + width), p.size, switches)
+        ends = np.cumsum(lengths).tolist()
+        block = np.zeros(ends[-1] + 1)  # never empty, so that it has an address
+        self.y, self.w, self.wd, self.p, self.m = (block[e - k : e] for k, e in zip(lengths, ends, strict=True))
+        self.w[:first], self.p[:] = values, p
+        base = address(block)
+        places = (base + 8 * (e - k) for k, e in zip(lengths, ends, strict=True))
+        self.record = np.array([*functions, *sizes, switches, p.size, first, *places], dtype=np.int64)
+        self.unknowns = n
 
     def newton(self, rule: Array) -> bool:
         """Return True where the steady state was found, as `hvdc_ident_newton` says. Raises MemoryError."""

@@ -56,16 +56,27 @@ enum {
 
 #define SECOND_DERIVATIVES(INDEX) INDEX(hess_row) INDEX(hess_column)
 
-/* --- the vectors of a run, in its workspace or the caller's --- */
+/* --- what the caller states of a run --- */
+
+#define GIVEN(VECTOR, INDEX, INT)                                                                                              \
+    VECTOR(p) VECTOR(constants) VECTOR(scale)  /* parameters; timing constants with their rows; size of each parameter */       \
+    VECTOR(t_out) VECTOR(out)                  /* instants of the outputs, and the outputs with their rows */                   \
+    VECTOR(breaks) INDEX(pointer) VECTOR(times) VECTOR(values) /* of the inputs: stops, first points of each, points */        \
+    INT(n_breaks) INT(n_out) INT(max_steps)                                                                                     \
+    INT(slides)                                /* whether the run may slide along the surface of a switch */
+
+#define GIVEN_INSTANTS(REAL) REAL(start) REAL(end) REAL(rtol) REAL(atol)
+
+/* --- the vectors of a run, in its workspace --- */
 
 #define VECTORS(VECTOR)                                                                                                        \
     VECTOR(y) VECTOR(yn) VECTOR(u)                 /* flat: at the step's start, at its end, at a stage */                      \
     VECTOR(k) VECTOR(e) VECTOR(dense)              /* stages, error, the four rows of the step's quartic */                     \
     VECTOR(add) VECTOR(mass) VECTOR(ft)            /* what a stage adds to the right-hand side, 1 where it has a derivative, f_t */ \
     VECTOR(f_before) VECTOR(f_after)               /* right-hand sides at both sides of a switch or jump */                     \
-    VECTOR(yd) VECTOR(w) VECTOR(wd) VECTOR(p) VECTOR(m) /* arguments of the generated functions */                              \
+    VECTOR(yd) VECTOR(w) VECTOR(wd) VECTOR(m) /* arguments of the generated functions */                              \
     VECTOR(jac) VECTOR(matrix) VECTOR(small) VECTOR(hessian) VECTOR(factor) VECTOR(shift) /* linear algebra */                  \
-    VECTOR(floors) VECTOR(totals) VECTOR(scale)    /* error weights and sums of each parameter */                               \
+    VECTOR(floors) VECTOR(totals)                  /* error weights and sums of each parameter */                               \
     VECTOR(z_before) VECTOR(z_from) VECTOR(z_step) VECTOR(side) /* unknowns before a solve, a step of it, the modes there */    \
     VECTOR(sv) VECTOR(top) VECTOR(slack) VECTOR(sws) /* switches: values, largest so far, tolerance, rows */                    \
     VECTOR(src) VECTOR(src_rate) VECTOR(src_left)  /* sources of delays and samples; the delays' before the segment */          \
@@ -73,23 +84,21 @@ enum {
     VECTOR(nodes) VECTOR(history) VECTOR(echo)     /* history of delayed signals; instants at which jumps come back */          \
     VECTOR(tick) VECTOR(publish) VECTOR(ticks) VECTOR(pending) VECTOR(pending_p) VECTOR(publish_p) /* samples */                \
     VECTOR(jump_p)                                 /* derivative of the present jump's instant by the parameters */             \
-    VECTOR(constants) VECTOR(breaks) VECTOR(times) VECTOR(values) /* timing constants; inputs */                                \
     VECTOR(surface)                                /* of a slide */                                                             \
-    VECTOR(t_out) VECTOR(out) VECTOR(instants) VECTOR(block) /* outputs; four instants and their flat vectors */
+    VECTOR(instants) VECTOR(block)                 /* four instants and their flat vectors */
 
 #define INDICES(INDEX)                                                                                                         \
     INDEX(pivots) INDEX(small_pivots) /* row exchanges of the factors */                                                        \
-    INDEX(at) INDEX(pointer)          /* each input's present piece, and where its pieces begin */                              \
+    INDEX(at)                         /* each input's present piece */                              \
     INDEX(heads)                      /* heads of this record for the slide on each switch, then without one */
 
 #define COUNTS(INT)                                                                                                            \
     INT(accepted) INT(rejected) INT(events) INT(evaluations) INT(segments) INT(forced_steps) /* what a run reports */           \
-    INT(steps) INT(max_steps) INT(n_out) INT(i_out) INT(n_breaks) INT(i_break) INT(echoes) INT(kept)                            \
+    INT(steps) INT(i_out) INT(i_break) INT(echoes) INT(kept)                            \
     INT(history_room) INT(echo_room)  /* rows for which there is memory */                                                      \
     INT(stiff) INT(chatter) INT(last_switch) INT(aim)
 
 #define FLAGS(INT)                                                                                                             \
-    INT(slides)    /* whether the run may slide along the surface of a switch */                                                \
     INT(still)     /* no input has a slope in this segment */                                                                   \
     INT(quiet)     /* nothing comes from outside in this segment but time */                                                    \
     INT(forced)    /* the right-hand side may change with time alone */                                                         \
@@ -100,9 +109,9 @@ enum {
     INT(echo_now) INT(disturbed) INT(published) /* what happened at the present break */
 
 #define INSTANTS(REAL)                                                                                                         \
-    REAL(start) REAL(end) REAL(t) REAL(tb)     /* tb: the present segment's end */                                              \
+    REAL(t) REAL(tb)     /* tb: the present segment's end */                                              \
     REAL(h) REAL(hs) REAL(step_end)            /* the step wanted, the step taken, its end */                                   \
-    REAL(rtol) REAL(atol) REAL(order) REAL(shortest) REAL(last_event) REAL(error) REAL(stiffness)                               \
+    REAL(order) REAL(shortest) REAL(last_event) REAL(error) REAL(stiffness)                               \
     REAL(surface_top)                          /* largest value of the sliding switch so far */
 
 #define AS_INTEGER(name) integer name;
@@ -118,6 +127,7 @@ typedef struct head {
 
 typedef struct run {
     SIZES(AS_INTEGER) FUNCTIONS(AS_FUNCTION) SECOND_DERIVATIVES(AS_INDICES)
+    GIVEN(AS_VECTOR, AS_INDICES, AS_INTEGER) GIVEN_INSTANTS(AS_REAL)
     VECTORS(AS_VECTOR) INDICES(AS_INDICES) COUNTS(AS_INTEGER) FLAGS(AS_INTEGER) INSTANTS(AS_REAL)
 } run;
 
