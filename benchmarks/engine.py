@@ -19,12 +19,12 @@ from itertools import pairwise
 
 import numpy as np
 import sympy as sp
-from numba import njit
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate import NAMES, Tolerance, call, engine_of, simulate
+from hvdc_ident.simulate import NAMES, Tolerance, engine_of, simulate
+from hvdc_ident.simulate.core import repeat
 
 GAINS = ("KPVDC", "KIVDC", "KPP", "KIP", "KPQ", "KIQ", "KPQ2", "KIQ2")
 STEPS = {"Vdcref1": (0.1, 1.0, 1.019), "Pref2": (0.5, 0.4, 0.5), "Qref1": (0.9, 0.0, 0.1)}
@@ -44,12 +44,6 @@ def _timed(function):
     return time.process_time() - start
 
 
-@njit(error_model="numpy")
-def _many(address, y, w, p, m, out, count):
-    for _ in range(count):
-        call(address, y, y, w, w, p, m, out)
-
-
 def cost(code, name):
     """Return the time of one call of a generated function, s."""
     s = code.structure.sizes
@@ -60,7 +54,7 @@ def cost(code, name):
     out, m = np.zeros(100_000), np.zeros(max(s.ns, 1))
     if name in ("lu", "solve"):  # these take the Jacobian in y, the shift in w, the factors in p
         y, w, p = np.full(10_000, 1e-3), np.full(w.size, 1e3), np.full(10_000, 1e-3)
-    return best(lambda: _many(address, y, w, p, m, out, 20_000), 9) / 20_000
+    return best(lambda: repeat(address, y, w, p, m, out, 20_000), 9) / 20_000
 
 
 def floor(model, sensitivities, statistics):
@@ -184,9 +178,9 @@ def _casadi(e, values, rules):
 def fresh_structure(slot):
     """Return CPU and wall time, s, from the definition of a new structure to its first trajectory with sensitivities."""
     link = load_model("vsc-hvdc-link")
-    kept = os.environ.get("NUMBA_CACHE_DIR")
+    kept = os.environ.get("HVDC_IDENT_CACHE")
     with tempfile.TemporaryDirectory() as empty:
-        os.environ["NUMBA_CACHE_DIR"] = empty  # code from an earlier run of this file is on disk
+        os.environ["HVDC_IDENT_CACHE"] = empty  # code from an earlier run of this file is on disk
         start = time.process_time(), time.perf_counter()
         model = apply_effects(
             link,
@@ -197,9 +191,9 @@ def fresh_structure(slot):
         )
         simulate(model, CASE, sensitivities=GAINS)
         taken = time.process_time() - start[0], time.perf_counter() - start[1]
-    del os.environ["NUMBA_CACHE_DIR"]
+    del os.environ["HVDC_IDENT_CACHE"]
     if kept is not None:
-        os.environ["NUMBA_CACHE_DIR"] = kept
+        os.environ["HVDC_IDENT_CACHE"] = kept
     return taken
 
 

@@ -5,7 +5,7 @@
 The plant: three machines, each with exciter, stabiliser and governor, on lines to a common bus with a load, and from there a line to an
 infinite bus. All of it are standard components; the units' values are those of tests/plants/cases.toml. A run: 10 s, a step of a reference
 at 1 s, 1001 rows, all outputs, default tolerance. Processor time, the least of 15. Nothing of the two models is compiled before their
-first runs, apart from what the power flow of the plant needs; what all models share is.
+first runs, apart from what the power flow of the plant needs.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from hvdc_ident.model import Model, parse_card, read_card
 from hvdc_ident.models import load_model
 from hvdc_ident.plants import UnitPart, parts_of, unit_card
 from hvdc_ident.simulate import simulate
-from hvdc_ident.simulate.object_code import ENTRIES, entry
 
 CASES = Path(__file__).resolve().parents[1] / "tests" / "plants" / "cases.toml"
 UNITS = {"steam": "sexs", "reheat": "ieeeg1", "hydro": "hygov"}
@@ -146,9 +145,7 @@ def figures(model: Model, stepped: str, by: float, names: Sequence[str]) -> dict
 
 
 def warm() -> None:
-    """Compile what all models share, and make the same calls on a single unit."""
-    for name in ENTRIES:
-        entry(name)
+    """Make the same calls on a single unit."""
     card = unit_card(parts_of(tomllib.loads(CASES.read_text(encoding="utf-8"))["sexs"]), R=0.01, X=0.3, f0=60.0)
     point = find_operating_point(parse_card(card), outputs={"P": 80.0, "Vt": 1.02}, free=["Vref", "Pref"])
     figures(parse_card(card).with_values(point.inputs), "Vref", 0.02, ("gen.H", "avr.K"))
@@ -176,7 +173,7 @@ def measure() -> None:
 def main() -> None:
     """Measure in a process that compiles into an empty folder."""
     with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": folder, "OMP_NUM_THREADS": "1"}
+        environment = {**os.environ, "HVDC_IDENT_CACHE": folder, "OMP_NUM_THREADS": "1"}
         subprocess.run([sys.executable, __file__, "--measure"], env=environment, check=True)
 
 

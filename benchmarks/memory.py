@@ -38,7 +38,7 @@ def main(runs: int = 10_000, structures: int = 1_000) -> None:
     names = list(link.parameters)
     pairs = [(a, b, c) for a in names for b in names for c in names if len({a, b, c}) == 3]
     with tempfile.TemporaryDirectory() as empty:
-        os.environ["NUMBA_CACHE_DIR"] = empty
+        os.environ["HVDC_IDENT_CACHE"] = empty
         for three in pairs[:50]:
             Engine(link, three)
         for source in ("compiled", "from disk"):

@@ -49,5 +49,5 @@ def test_the_package_and_the_command_line_import_nothing_heavy() -> None:
     loaded = set(
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     )
-    heavy = {"numpy", "scipy", "sympy", "numba", "llvmlite", "matplotlib", "pydantic", "xarray", "control", "tomlkit"}
+    heavy = {"numpy", "scipy", "sympy", "llvmlite", "matplotlib", "pydantic", "xarray", "control", "tomlkit"}
     assert not loaded & heavy

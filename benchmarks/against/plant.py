@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import engine as link_bench  # of the folder above
 import numpy as np
-from numba import njit
 
 from hvdc_ident.data import InputSignal, Trajectory, experiment
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.models import load_model
-from hvdc_ident.simulate import NAMES, ModelSimulator, call, engine_of, simulate
+from hvdc_ident.simulate import NAMES, ModelSimulator, engine_of, simulate
+from hvdc_ident.simulate.core import repeat
 
 RTOL = 1e-6
 STEP = (0.1, 1.0, 1.019)
@@ -35,12 +35,6 @@ class Line:
     def __str__(self) -> str:
         times = f"{self.own * 1e3:.3g} | {self.theirs * 1e3:.4g} | {self.theirs / self.own:.3g}"
         return f"| {self.what} | {self.peer} | {times} | {self.more} |"
-
-
-@njit(error_model="numpy")
-def _rhs(modes, f, y, w, p, m, out):
-    call(modes, y, y, w, w, p, m, m)
-    call(f, y, y, w, w, p, m, out)
 
 
 class Plant:
@@ -71,7 +65,9 @@ class Plant:
         w[1 + self.place] = level
 
         def f(t: float, y: np.ndarray) -> np.ndarray:
-            _rhs(self._at[0], self._at[1], np.ascontiguousarray(y), w, p, self._m, self._out)
+            x = np.array(y)
+            repeat(self._at[0], x, w, p, self._m, self._m, 1)
+            repeat(self._at[1], x, w, p, self._m, self._out, 1)
             return self._out.copy()
 
         return f

@@ -15,8 +15,8 @@ from hvdc_ident.data import Array, InputSignal
 from hvdc_ident.errors import ModelError, SimulationError, TimingError
 from hvdc_ident.model import Model
 from hvdc_ident.simulate.codegen import NAMES
-from hvdc_ident.simulate.equations import ModelEquations, by_structure, padded
 from hvdc_ident.simulate.core import GIVEN, GIVEN_INSTANTS, HEAD_FIELDS, PLACE, RUN_FIELDS, address, integrate, room
+from hvdc_ident.simulate.equations import ModelEquations, by_structure, padded
 from hvdc_ident.simulate.object_code import Code, evaluate
 from hvdc_ident.simulate.simulation import HINTS, Statistics
 from hvdc_ident.simulate.steady_state import Equilibria
@@ -77,8 +77,8 @@ class _Equations:
         self._second = [np.zeros(0, dtype=np.int64)] * 2
 
     def head(self, rosenbrock: bool) -> Integers:
-        """Return the part of a run's record that describes these equations, (head fields,) integers: sizes, and addresses that live as long as
-        this object.
+        """Return the part of a run's record that describes these equations, (head fields,) integers: sizes, and addresses that live
+        as long as this object.
 
         The code that only the Rosenbrock method needs is compiled when it is first asked for.
         """
@@ -200,14 +200,19 @@ class Engine:
         constants = self.constants(p)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
         n_breaks, *tables = addresses
-        t_out, scales = np.array(time, dtype=float), np.ones(max(s.np, 1)) if scale is None else np.array(scale, dtype=float)
+        t_out, scales = (
+            np.array(time, dtype=float),
+            np.ones(max(s.np, 1)) if scale is None else np.array(scale, dtype=float),
+        )
         p = np.array(p)
         own = [address(a) for a in (p, constants, scales, t_out, out)]
         given = [*own, *tables, n_breaks, time.size, tolerance.max_steps, tolerance.slides]
         instants = [begin, end, tolerance.rtol, tolerance.atol]
         explicit = self._is_explicit(method, p, y, w, end - begin)
         while True:
-            record, heads, work = self._record(not explicit)
+            record, _heads, work = self._record(
+                not explicit
+            )  # the heads live as long as the record that points to them
             record[GIVEN] = given
             reals = record.view(float)
             reals[GIVEN_INSTANTS] = instants

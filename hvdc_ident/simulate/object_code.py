@@ -16,7 +16,6 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import llvmlite
 import llvmlite.binding as llvm
@@ -32,8 +31,8 @@ _PREFIX, _DIGEST = "code-", hashlib.sha256().digest_size
 
 
 def folders() -> Iterator[Path]:
-    """Folders for object code, best first: as numba's own files do, beside the sources, else with the user's caches."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
+    """Folders for object code, best first: where HVDC_IDENT_CACHE says; else beside the sources, then with the user's caches."""
+    given = os.environ.get("HVDC_IDENT_CACHE")
     if given:
         yield Path(given)
         return

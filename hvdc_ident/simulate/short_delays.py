@@ -74,7 +74,9 @@ def run(
     shortest = 0.0
     if (times < span / COARSEST).any():
         plain = _without(model, tuple(model.delays))
-        fastest = engine_of(plain, sensitivities, outputs, brief=tolerance.brief).fastest(p, inputs, time, tolerance, plain)
+        fastest = engine_of(plain, sensitivities, outputs, brief=tolerance.brief).fastest(
+            p, inputs, time, tolerance, plain
+        )
         shortest = span / _steps(span * fastest, inputs, tolerance)
     lengths = zip(model.delays, times.tolist(), by_parameters, strict=True)
     short = {name: (length, rows) for name, length, rows in lengths if length == 0.0 or length < shortest}

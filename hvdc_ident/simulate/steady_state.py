@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import pairwise, product
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,8 @@ from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, State, blended
 from hvdc_ident.simulate.codegen import NAMES
-from hvdc_ident.simulate.equations import ACCURACY, SHORTEST, TINY, ModelEquations, by_structure
 from hvdc_ident.simulate.core import SteadyEquations
+from hvdc_ident.simulate.equations import ACCURACY, SHORTEST, TINY, ModelEquations, by_structure
 from hvdc_ident.simulate.object_code import Code, evaluate
 
 Branch = Literal["own", "unconnected"]

@@ -97,7 +97,7 @@ def _checked(client: Any, address: str) -> int:
     other = sorted(worker for worker, version in versions.items() if version != expected)
     if other:
         raise InputError(
-            f"{len(other)} of {len(versions)} workers have another version of this package or of numpy, scipy, sympy, numba",
+            f"{len(other)} of {len(versions)} workers have another version of this package or of numpy, scipy, sympy",
             where=f"--executor {address}",
             got=other[0],
             hint="the same environment on every machine: results are the same bit for bit or not given",

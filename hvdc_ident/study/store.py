@@ -270,7 +270,7 @@ def _short_digest(value: Any) -> str:
 def code_version() -> str:
     """A hash of the package's source and of the versions of what its numbers rest on."""
     parts = [source_hash()]
-    for name in ("numpy", "scipy", "sympy", "numba", "llvmlite"):
+    for name in ("numpy", "scipy", "sympy", "llvmlite"):
         with contextlib.suppress(metadata.PackageNotFoundError):
             parts.append(f"{name} {metadata.version(name)}")
     return digest("\n".join(parts).encode())

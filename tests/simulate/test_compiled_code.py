@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.model import parse_card
-from hvdc_ident.simulate import object_code, simulate
+from hvdc_ident.simulate import simulate
 
 OUTPUTS = {
     "sine": "sin(x) + cos(2*x)",

@@ -16,7 +16,7 @@ import numpy as np
 from hvdc_ident.errors import ModelError
 from hvdc_ident.files import write_bytes
 from hvdc_ident.fmu.compile import binary_folder, compiled, compiler, library_suffix
-from hvdc_ident.fmu.export.c_code import CModel, tableau
+from hvdc_ident.fmu.export.c_code import CModel
 from hvdc_ident.fmu.export.model_description import KINDS, ExportedVariables, build_description, description
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, used_names, without_delays
@@ -120,10 +120,11 @@ def identifier_of(name: str) -> str:
 def _content(code: CModel, version: str, kinds: Sequence[str], identifier: str, stop: float) -> dict[str, bytes]:
     """Return the FMU's files but for the binary, by name."""
     runtime = resources.files("hvdc_ident.fmu.export") / "runtime"
+    tableau = resources.files("hvdc_ident.simulate.core") / "tableau.h"
     shared = (*_RUNTIME, f"fmi{version[0]}.c")
     names = ("model.c", *shared)
     variables = ExportedVariables(code)
-    files = {"model.c": code.source, "tableau.h": tableau()}
+    files = {"model.c": code.source, "tableau.h": tableau.read_text("utf-8")}
     files |= {n: (runtime / n).read_text("utf-8") for n in (*shared, "fmi.h", "internal.h")}
 
     def described(token: str) -> str:

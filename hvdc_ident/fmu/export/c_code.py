@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SteadyStateError
 from hvdc_ident.model import Model
-from hvdc_ident.simulate import Elimination, Graph, ModelEquations, engine_of, steps
+from hvdc_ident.simulate import Elimination, Graph, ModelEquations, engine_of
 
 TOLERANCE = 1e-8
 """Relative tolerance of co-simulation where the importer names none; the absolute one is a hundredth of it."""
@@ -153,31 +153,6 @@ class CModel:
     @cached_property
     def _elimination(self) -> Elimination | None:
         return self.structure.elimination
-
-
-def tableau() -> str:
-    """Return the text of tableau.h: the coefficients of the integrator."""
-    tables = {
-        "RODAS_A": steps.RODAS_A,
-        "RODAS_C": steps.RODAS_C,
-        "RODAS_H": steps.RODAS_H,
-        "RODAS_TIME": steps.RODAS_TIME,
-        "RODAS_D": steps.RODAS_D,
-    }
-    lines = [
-        "/* RODAS5P: G. Steinebach, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks within the",
-        "   Julia Differential Equations package, BIT 63 (2023). */",
-        f"#define RODAS_GAMMA {c_number(steps.RODAS_GAMMA)}",
-    ]
-    for name, table in tables.items():
-        shape = "".join(f"[{k}]" for k in table.shape)
-        lines.append(f"static const double {name}{shape} = {_braces(table)};")
-    return "\n".join([*lines, ""])
-
-
-def _braces(table: Array) -> str:
-    items = (c_number(float(v)) if np.ndim(v) == 0 else _braces(v) for v in table)
-    return "{" + ", ".join(items) + "}"
 
 
 def _comment(name: str) -> str:

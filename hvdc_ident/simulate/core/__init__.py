@@ -11,12 +11,16 @@ import re
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING, cast
 
 import llvmlite.binding as llvm
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
+
+if TYPE_CHECKING:
+    from typing_extensions import Buffer
 
 FOLDER = Path(__file__).parent
 BUILDS = {"avx2": ("avx2", "fma"), "baseline": ()}
@@ -63,7 +67,9 @@ def library() -> ctypes.CDLL:
         path = FOLDER / LIBRARY.format(build=build)
         if path.exists() and all(features.get(f) for f in needed):
             found = ctypes.CDLL(str(path))
-            found.hvdc_ident_room.restype = ctypes.c_int64
+            found.hvdc_ident_room.restype = found.hvdc_ident_fields.restype = ctypes.c_int64
+            if found.hvdc_ident_fields() != len(RUN_FIELDS):
+                raise ImportError(f"{path} was built with another core.h: build it anew, with: python build_backend.py")
             found.hvdc_ident_judge.restype = found.hvdc_ident_repeat.restype = None
             return found
     raise ImportError(
@@ -77,7 +83,7 @@ _NOTHING = ctypes.c_char * 0
 
 def address(array: Array | Record) -> int:
     """Return the address of a writable array's data; a quarter of the time that `array.ctypes` takes."""
-    return ctypes.addressof(_NOTHING.from_buffer(array))
+    return ctypes.addressof(_NOTHING.from_buffer(cast("Buffer", array)))
 
 
 def _pointers(*arrays: Array | Record) -> list[ctypes.c_void_p]:
@@ -97,6 +103,11 @@ def integrate(record: Record, work: Array, y: Array, w: Array) -> str:
     return status
 
 
+def repeat(function: int, y: Array, w: Array, p: Array, m: Array, out: Array, count: int) -> None:
+    """Call a generated function, by address, so many times: to measure what it costs."""
+    library().hvdc_ident_repeat(ctypes.c_void_p(function), *_pointers(y, w, p, m, out), ctypes.c_int64(count))
+
+
 class SteadyEquations:
     """The record of a model's steady-state equations and the vectors that stand in it.
 
@@ -109,7 +120,13 @@ class SteadyEquations:
     ) -> None:
         """values: what comes from outside, time first; the unknowns beyond it, and y, are 0."""
         _, inner, first, n, width = sizes
-        lengths = (inner * (1 + width), first + (n - inner) * (1 + width), first + (n - inner) * (1 + width), p.size, switches)
+        lengths = (
+            inner * (1 + width),
+            first + (n - inner) * (1 + width),
+            first + (n - inner) * (1 + width),
+            p.size,
+            switches,
+        )
         ends = np.cumsum(lengths).tolist()
         block = np.zeros(ends[-1] + 1)  # never empty, so that it has an address
         self.y, self.w, self.wd, self.p, self.m = (block[e - k : e] for k, e in zip(lengths, ends, strict=True))

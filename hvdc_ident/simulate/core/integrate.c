@@ -205,6 +205,12 @@ int hvdc_ident_integrate(run *r, double *work, const double *y, const double *w)
     return status;
 }
 
+/* Fields of a run's record, by which a caller sees that it was built with the same header. */
+integer hvdc_ident_fields(void)
+{
+    return (integer)(sizeof(run) / sizeof(integer));
+}
+
 /* Call a generated function so many times, to measure what it costs. */
 void hvdc_ident_repeat(function code, const double *y, const double *w, const double *p, const double *m, double *out, integer count)
 {
