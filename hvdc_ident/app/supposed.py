@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,11 @@ from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.result import FoundEffect, Rival
 from hvdc_ident.errors import ComputationError, HvdcIdentError
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.identifiability.experiment_design import ExperimentDesign, Move, single_input_designs
+from hvdc_ident.identifiability.experiment_design import ExperimentDesign, single_input_designs
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.augmented import use_of
-from hvdc_ident.summary.stage_results import diagnosis_of
+from hvdc_ident.summary.stage_results import diagnosis_of, identified_of
 from hvdc_ident.text import listed
 
 
@@ -123,8 +123,9 @@ def planned_experiments(study: hi.Study, identified: Mapping[str, Any]) -> tuple
     the moves of each input that a person can set."""
     inputs = study.model.inputs
     units = {n: i.unit for n, i in inputs.items()}
-    advice = identified.get("recommended_experiment") or {}
-    told = tuple(dict.fromkeys(_planned((advice, *(advice.get("others") or ())), units)))
+    advice = identified_of(identified).recommended
+    ranked = () if advice is None else (advice.best, *advice.others)
+    told = tuple(dict.fromkeys(PlannedExperiment(r.design.text(units), r.design, r.record, r.new) for r in ranked))
     if told or not study.experiments:
         return told
     record = tuple(dict.fromkeys(o for e in study.experiments for o in e.outputs))
@@ -132,10 +133,3 @@ def planned_experiments(study: hi.Study, identified: Mapping[str, Any]) -> tuple
     longest = max(study.experiments, key=lambda e: float(np.ptp(e.time)))
     designs = single_input_designs(study.experiments, values, units, longest)
     return tuple(PlannedExperiment(d.text(units), d, record, ()) for d in designs)
-
-
-def _planned(told: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> Iterator[PlannedExperiment]:
-    for line in told:
-        if line.get("moves"):
-            design = ExperimentDesign(tuple(Move.of(m) for m in line["moves"]))
-            yield PlannedExperiment(design.text(units), design, tuple(line["record"]), tuple(line["new_signals"]))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.codec import read_fields
+from hvdc_ident.codec import Coded, read_fields
 from hvdc_ident.display import Shown, Table, axes_of, data_frame, first_rows, library
 from hvdc_ident.errors import StudyError, WaveformError, unknown_name
 from hvdc_ident.text import with_unit
@@ -52,7 +52,7 @@ class _Lists:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Trajectory(Shown):
+class Trajectory(Coded, Shown):
     """Signals sampled at the same instants.
 
     time: (n,) in s, non-decreasing; a time that stands twice is a jump, the first row before it and the second after.

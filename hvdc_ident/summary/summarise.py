@@ -423,7 +423,7 @@ def _next(found: StageResults, parameters: tuple[ParameterSummary, ...]) -> tupl
         steps.append(NextStep("diagnose"))
     own = {} if found.estimates else found.identified.parameters
     known = bool(parameters) and all(p.determined or _closely(own.get(p.name)) for p in parameters)
-    wanted = found.of_identified.advice
+    wanted = found.identified.recommended
     if not added_to(diagnosis) and not known and wanted is not None and (advice := _advice(wanted.text)):
         steps.append(NextStep("narrow", advice))
     if found.estimates and not steps:

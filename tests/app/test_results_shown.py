@@ -21,6 +21,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.next_step import NextStep, next_sentence
 from hvdc_ident.report.overlay import Overlay, overlay_of
 from hvdc_ident.summary import Results
+from hvdc_ident.summary.stage_results import identified_of
 from hvdc_ident.summary.tables import findings_table, sets_table, verdicts_table
 from tests.app.small_study import LATE
 
@@ -67,7 +68,7 @@ def test_without_a_finding_there_is_no_supposition(study: hi.Study, tmp_path: Pa
     ],
 )
 def test_a_move_is_read_as_it_was_told(move: Move) -> None:
-    again = Move.of(json.loads(json.dumps(move.to_dict())))
+    again = Move.from_dict(json.loads(json.dumps(move.to_dict())))
     t = np.linspace(0.0, 1.0, 101)
     assert again == move
     np.testing.assert_array_equal(again.signal(1.0)(t), move.signal(1.0)(t))
@@ -103,12 +104,11 @@ def test_where_none_is_recommended_every_move_of_a_settable_input_can_be_looked_
 
 
 def test_a_profile_passes_its_level_at_the_ends_of_the_interval(study: hi.Study) -> None:
-    profile = told(study, "identifiability")["profiles"]["k"]
+    profile = identified_of(told(study, "identifiability")).profiles["k"]
     at, between, computed, level, ends = profile_columns(profile)
-    limits = [profile[side]["limit"] for side in ("lower", "upper")]
-    np.testing.assert_allclose(at[np.isfinite(ends)], limits)
+    np.testing.assert_allclose(at[np.isfinite(ends)], profile.ci95)
     np.testing.assert_allclose(between[np.isfinite(ends)], 1.0, atol=0.02)
-    assert (level == 1.0).all() and np.isfinite(computed).sum() == len(set(profile["values"]))
+    assert (level == 1.0).all() and np.isfinite(computed).sum() == len(set(profile.values.tolist()))
 
 
 def test_the_errors_drawn_are_those_that_the_fit_states(study: hi.Study) -> None:
@@ -123,7 +123,7 @@ def test_the_errors_drawn_are_those_that_the_fit_states(study: hi.Study) -> None
 
 def test_tables_hold_verdicts_findings_and_gaps(study: hi.Study) -> None:
     identified, diagnosis = told(study, "identifiability"), told(study, "discrepancy")
-    (row,) = verdicts_table(identified).rows
+    (row,) = verdicts_table(identified_of(identified)).rows
     assert row[:2] == ("k", identified["parameters"]["k"]["verdict"]) and "1/s" in row
     assert float(row[2]) == pytest.approx(identified["parameters"]["k"]["value"], rel=1e-3)
     assert len(findings_table(Results(study.folder).summary).rows) == len(diagnosis["findings"]) > 0
