@@ -205,6 +205,25 @@ def test_a_result_has_its_parameters_by_name_and_comes_back_from_its_json(report
     assert dict(again.values) == pytest.approx(dict(fit.values), rel=1e-6)
 
 
+def test_a_diagnosis_gives_the_intervals_of_the_parameters_beside_what_it_put_in() -> None:
+    """A late plant: the interval of T holds the plant's, which that of a fit without the delay misses."""
+    late = hi.apply_effects(LAG, [{"effect": "delay", "at": "y", "parameters": {"T": 0.3}}])
+    random = np.random.default_rng(1)
+
+    def record(name: str, after: float) -> hi.Experiment:
+        step = {"u": hi.step(0.0, after, at=STEP)}
+        y = hi.simulate(late, TIME, {"T": T, "k": K}, inputs=step)["y"] + NOISE * random.standard_normal(TIME.size)
+        return hi.Experiment(TIME, name, inputs=step, outputs={"y": y}, noise={"y": NOISE})
+
+    bounds = {n: BOUNDS[n] for n in ("T", "k")}
+    found = hi.diagnose(LAG, [record("up", 1.0), record("down", -0.5)], bounds, effects=["delay"])
+    low, high = found.params["T"].interval
+    assert low < T < high and found.params["T"].value == found.parameters_after["T"] and found.params["T"].unit == "s"
+    assert high - low < 0.1 * T and not low < found.parameters_refitted["T"] < high
+    nothing = hi.diagnose(LAG, RECORD, bounds, effects=["delay"])
+    assert nothing.params["T"].value == nothing.parameters_after["T"] and nothing.params["T"].interval is None
+
+
 def test_tables_and_linear_results_come_back_from_their_json_too() -> None:
     run = hi.simulate(LAG, RECORD, sensitivities=["T", "k"])
     linear = hi.linearize(LAG, inputs="u", outputs="y")

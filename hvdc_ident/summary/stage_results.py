@@ -47,10 +47,9 @@ class Context(Coded):
 
 @dataclass(frozen=True)
 class DiagnosisContext(Coded):
-    """What the JSON of a diagnosis has beside it. judgement: of the model with each set of values. estimates_after: with what it put in."""
+    """What the JSON of a diagnosis has beside it. judgement: of the model with each set of values."""
 
     judgement: Judgements = field(default_factory=Judgements)
-    estimates_after: Mapping[str, Estimate] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
