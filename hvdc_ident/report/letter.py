@@ -14,6 +14,7 @@ from pathlib import Path
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
 from hvdc_ident.fit.uncertainty import MOVED
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.report.html import badge, table_of, text
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
@@ -97,7 +98,7 @@ def letter_of(results: Results) -> Letter:
             "there is no diagnosis to write a letter about",
             where=str(results.folder),
             expected=f"{STAGE}.json",
-            hint="hvdc-ident diagnose STUDY",
+            next=(NextStep("diagnose"),),
         )
     sentences = (_missed(s), _consistent(s), _values_judged(s), gained_sentence(s))
     return Letter(tuple(t for t in sentences if t), _request(s), _next(s), tuple(_attached(results)))

@@ -10,8 +10,9 @@ from typing import Any, TypeVar
 
 from hvdc_ident.codec import Coded, read_fields
 from hvdc_ident.display import Shown, Table
-from hvdc_ident.errors import InputError
+from hvdc_ident.errors import InputError, in_python
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.report.comparison import comparison_page
 from hvdc_ident.study.stages import Stage, stages
 from hvdc_ident.summary import Results, RunSummary
@@ -225,6 +226,7 @@ class RunComparison(Coded, Shown):
         return lines
 
 
+@in_python
 def compare_runs(first: str | Path, second: str | Path) -> RunComparison:
     """Return two results side by side. first, second: folders of results, or studies whose results stand beside them.
 
@@ -275,7 +277,7 @@ def folder_of(path: Path) -> Path:
             "no such study, and no such folder",
             where=str(path),
             expected="a study file, or a folder that a run wrote its results into",
-            hint="`hvdc-ident run STUDY` writes such a folder, STUDY-results",
+            next=(NextStep("run"),),
         )
     return path
 
