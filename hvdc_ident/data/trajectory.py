@@ -43,7 +43,7 @@ class Origin:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lists:
+class _Columns:
     """A trajectory as JSON has it."""
 
     time: Array
@@ -156,7 +156,7 @@ class Trajectory(Coded, Shown):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
         """Return the trajectory that `to_dict` wrote. Raises InputError for anything else."""
-        table = read_fields(_Lists, data)
+        table = read_fields(_Columns, data)
         columns = np.reshape(list(table.signals.values()), (len(table.signals), table.time.size)).T
         return cls(table.time, columns, tuple(table.signals), tuple(table.units.get(n, "") for n in table.signals))
 

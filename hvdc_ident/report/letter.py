@@ -184,7 +184,9 @@ def _values(s: RunSummary) -> str:
     """The one table: each parameter given, fitted and with the effect; and what the values that count rest on."""
     if not s.parameters:
         return ""
-    return table_of(values_table(s)) + (f"<p>{text(told)}</p>" if (told := condition(s, "The values")) else "")
+    subject = "The fitted values" if s.counting.name == "fit" else "The values"
+    told = condition(s, subject)
+    return table_of(values_table(s)) + (f"<p>{text(told)}</p>" if told else "")
 
 
 def _figure(results: Results) -> str:

@@ -50,12 +50,13 @@ def use_of(effect: FoundEffect | Rival) -> EffectUse:
 def compared(study: Study, found: Diagnosis) -> tuple[dict[str, Any], dict[str, str]]:
     """Return what discrepancy.json says of the augmented model beside the recordings, and a CSV file of its curves by name.
 
-    The JSON holds `judgement` and `rmse_after`, as fit.json does of the fit; where no effect was put in, the judgement alone, at the
-    given values.
+    The JSON holds `units` of the outputs, `judgement` and `rmse_after`, as fit.json does of the fit; where no effect was put in, no
+    errors but those at the given values.
     """
     sets = {"given": fitting.curves_at_given(study)}
+    units = {o: study.model.outputs[o].unit for e in study.experiments for o in e.outputs}
     if found.augmented is None:
-        return {"judgement": fitting.judgement_of(study, sets)}, {}
+        return {"units": units, "judgement": fitting.judgement_of(study, sets)}, {}
     curves = _curves(study, found)
     files = {
         f"discrepancy.{e.name}.csv": fitting.curves_csv(e, curves[e.name])
@@ -66,7 +67,8 @@ def compared(study: Study, found: Diagnosis) -> tuple[dict[str, Any], dict[str, 
     for name, line in curves.items():
         for output, curve in line.items():
             rmse.setdefault(output, {})[name] = curve.rmse
-    return {"rmse_after": rmse, "judgement": fitting.judgement_of(study, {**sets, "effect": curves})}, files
+    judgement = fitting.judgement_of(study, {**sets, "effect": curves})
+    return {"units": units, "rmse_after": rmse, "judgement": judgement}, files
 
 
 def _curves(study: Study, found: Diagnosis) -> dict[str, dict[str, Curve]]:
@@ -113,12 +115,11 @@ def with_estimates(study: Study, found: Diagnosis, fitted: Sequence[str]) -> Dia
     known = uncertainty(blocks, problem.names, spans, problem.noise_source, None, problem.noise_dof)
     known = known.widened(adequacy(problem, blocks, sources, known.effective, known.rho).widening)
     estimates = estimates_of(problem, problem.start, blocks, known, known, systematic=found.beyond_noise)
-    placed = Estimate(math.nan, reason="it depends on which of the likely effects and places is the true one")
+    why = "it depends on which of the likely effects and places is the true one"
+    placed = {n: Estimate(math.nan, unit=estimates[n].unit, reason=why) for n in found.values_by_place if n in estimates}
     return replace(
         found,
-        estimates_after=FrozenMap(
-            {n: placed if n in found.values_by_place else estimates[n] for n in fitted if n in estimates}
-        ),
+        estimates_after=FrozenMap({n: placed.get(n) or estimates[n] for n in fitted if n in estimates}),
         residual_tests_after=residual_tests(blocks, problem.fitted_experiments),
     )
 

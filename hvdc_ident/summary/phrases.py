@@ -197,6 +197,8 @@ def why_conditional(s: RunSummary) -> str:
     fitted = s.sets.get("fitted")
     if s.counting.name == "fit" and s.counting.doubt and fitted is not None and fitted.verdict == "pass":
         return s.counting.doubt
+    if s.counting.name == "fit" and s.counting.added:
+        return f"without {s.counting.added} more than the noise remains"
     return "what remains is more than the noise"
 
 

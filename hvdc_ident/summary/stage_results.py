@@ -47,8 +47,9 @@ class Context(Coded):
 
 @dataclass(frozen=True)
 class DiagnosisContext(Coded):
-    """What the JSON of a diagnosis has beside it. judgement: of the model with each set of values."""
+    """What the JSON of a diagnosis has beside it. units: of the outputs. judgement: of the model with each set of values."""
 
+    units: Mapping[str, str] = field(default_factory=dict)
     judgement: Judgements = field(default_factory=Judgements)
 
 

@@ -243,7 +243,7 @@ def _worst(judgement: Judgement, swing: Swing) -> Signal | None:
 def _signals(
     judgements: Mapping[str, Judgement], judged: str | None, limits: Yardstick, found: StageResults
 ) -> tuple[SignalSummary, ...]:
-    units = {**found.simulated.units, **found.of_fit.units}
+    units = {**found.of_diagnosis.units, **found.simulated.units, **found.of_fit.units}
     experiments = {**found.simulated.experiments, **found.of_fit.experiments}
     errors: dict[Signal, dict[str, SignalJudgement]] = {}
     for name, judgement in judgements.items():
@@ -278,7 +278,8 @@ def _parameters(found: StageResults, counting: Counting) -> tuple[ParameterSumma
     fit, diagnosis, identified = found.fit, found.diagnosis, found.identified
     lines = found.of_fit.candidates or found.of_identified.candidates or found.simulated.candidates
     if not lines and diagnosis is not None:
-        lines = {n: Candidate(given) for n, given in diagnosis.parameters_before.items()}
+        known = diagnosis.estimates_after
+        lines = {n: Candidate(v, unit=known[n].unit if n in known else "") for n, v in diagnosis.parameters_before.items()}
     fitted, estimates = found.fitted, found.estimates
     later: Mapping[str, Estimate] = {} if diagnosis is None else diagnosis.estimates_after
     bounds = {n: e for n, e in estimates.items() if fitted and n not in fitted and e.method == "one-sided"}

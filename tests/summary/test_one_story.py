@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 from hvdc_ident.cli import app
 from hvdc_ident.report.letter import write_letter
 from hvdc_ident.report.page import write_report
-from hvdc_ident.summary import Results, RunSummary
+from hvdc_ident.summary import Results, RunSummary, summarise
 from hvdc_ident.summary.run_summary import ParameterSummary
 from tests.report.demo_like import demo_like
 
@@ -300,8 +300,11 @@ def test_the_parts_that_were_told_wrongly(study_of: Callable[[str], Told]) -> No
     assert ta.by_place and ta.value is None and kb.moved
     assert {round(v.value, 1) for v in ta.by_place} == {0.1, 0.4} and "Your value of Ta" not in places.letter
     assert "wherever it is, the recordings ask for other values than you gave: Kb = 1.50" in places.letter
+    assert "The fitted values hold only if nothing else is missing: without lag at y" in places.letter
     mixed = found["mixed-units"]
     assert mixed.summary.sets["given"].in_limits.not_judged == 1 and "every signal it is less" not in mixed.letter
     assert "1 signal not judged: yb" in mixed.report
+    alone = summarise({"discrepancy": Results(mixed.folder).get("discrepancy")})
+    assert {x.output: x.unit for x in alone.signals} == {"ya": "pu", "yb": "MW"}, "as told after `diagnose` alone"
     right = found["right"].summary
     assert right.verdict == "pass" and not right.findings and not right.moved and not right.counting.kind
