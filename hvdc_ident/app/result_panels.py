@@ -22,7 +22,6 @@ from hvdc_ident.report.html import table_of
 from hvdc_ident.report.overlay import Overlay, overlay_of
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.phrases import WORDS, advice
-from hvdc_ident.summary.stage_results import identified_of
 from hvdc_ident.summary.tables import findings_table, sets_table, values_table, verdicts_table
 from hvdc_ident.text import with_unit
 
@@ -56,7 +55,7 @@ def show_table(table: Table) -> None:
 
 def _identifiability(found: FoundResults, page: Page) -> None:
     """Build the verdicts, and the profile of the parameter that is chosen."""
-    report = identified_of(found.of("identify"))
+    report = found.objects.identified
     if report.misspecified:
         ui.label(f"The model does not explain these data: {'; '.join(report.misspecification.signs)}.")
     show_table(verdicts_table(report))
@@ -160,8 +159,8 @@ def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = F
 
 def _diagnosed(found: FoundResults, page: Page) -> None:
     """Build what the diagnosis says, its findings, and the errors with each set of values."""
-    data = found.of("diagnose")
-    ui.label(str(data.get("text") or data.get("verdict", "")))
+    diagnosis, sizes = found.objects.diagnosis, found.of("diagnose").get("sizes") or {}
+    ui.label("" if diagnosis is None else diagnosis.text or diagnosis.verdict)
     show_table(findings_table(found.summary))
     show_table(sets_table(found.summary))
     models, trouble = found.supposed
@@ -171,7 +170,7 @@ def _diagnosed(found: FoundResults, page: Page) -> None:
         button.props("outline dense").classes("q-px-sm self-start")
         button.tooltip("Opens the model with what was found on the tab Explore; its rivals stand there under “model with”.")
     results = Results(found.folder)
-    told = str((data.get("sizes") or {}).get("experiment", "")) or next(iter(results.experiments), "")
+    told = str(sizes.get("experiment", "")) or next(iter(results.experiments), "")
     ui.label(f"Recorded less simulated in {told}, without and with what was found").classes("small q-mt-sm")
     _overlay(results, told, ui.element("div").classes("w-full"), errors=True)
 
@@ -181,7 +180,7 @@ def _next(found: FoundResults, page: Page) -> None:
     ui.label(advice(found.summary) or found.summary.unadvised or "The results ask for no further record.")
     models, trouble = found.supposed
     ui.label(trouble).classes("alert")
-    NextExperiment(found.study, found.of("identify"), found.fitted, models).build()
+    NextExperiment(found.study, found.objects.identified, found.fitted, models).build()
 
 
 PANELS = (
