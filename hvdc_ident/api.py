@@ -41,17 +41,16 @@ Result = TypeVar("Result")
 
 def _verb(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
     """Return the function as a caller in Python meets it: its errors say what to do in Python, and names of 0.2 still work."""
+    from hvdc_ident.errors import in_python
+
+    told = in_python(function)
 
     @wraps(function)
     def verb(*arguments: Arguments.args, **settings: Arguments.kwargs) -> Result:
         from hvdc_ident.aliases import current
-        from hvdc_ident.errors import HvdcIdentError
 
         given, named = current(function.__name__, arguments, settings)
-        try:
-            return function(*given, **named)
-        except HvdcIdentError as error:
-            raise error.read_in("python") from error.__cause__
+        return told(*given, **named)
 
     return verb
 

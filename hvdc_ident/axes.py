@@ -1,35 +1,39 @@
-"""Drawing of profiles and intervals from the JSON of an identifiability report or a fit, on given axes.
-
-It imports nothing that computes them, so that a page of results is made quickly.
+"""Drawing of profiles and intervals of an identifiability report or a fit, on given axes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hvdc_ident.colours import FITTED, MARK
 from hvdc_ident.data import Array
+from hvdc_ident.text import with_unit
+
+if TYPE_CHECKING:
+    from hvdc_ident.fit.profile import Profile
+    from hvdc_ident.fit.result import Estimate
+    from hvdc_ident.identifiability.verdicts import Verdict
 
 HELD = "#b0b0b0"
 FINEST = 1e-4
 """%: below this the axis of the intervals is linear."""
 
 
-def draw_profile(axes: Any, name: str, profile: Mapping[str, Any], verdict: Mapping[str, Any]) -> None:
+def draw_profile(axes: Any, profile: Profile, verdict: Verdict) -> None:
     """Draw the rise of the cost over one parameter, in units of the 95 % level, with the ends of the interval."""
-    x, y = np.array(profile["values"], dtype=float), np.array(profile["rises"], dtype=float) / profile["threshold"]
+    x, y = profile.values, profile.rises / profile.threshold
     axes.plot(*joined(x, y), color=FITTED, linewidth=1.2)
     axes.plot(x, y, color=FITTED, linewidth=0, marker="o", markersize=2.5)
     axes.axhline(1.0, color=MARK, linewidth=0.8, linestyle="--")
-    for end in ("lower", "upper"):
-        if profile[end]["limit"] is not None:
-            axes.axvline(profile[end]["limit"], color=MARK, linewidth=0.7, linestyle=":")
-    axes.set_xlabel(_labelled(name, verdict), fontsize=8)
+    for end in profile.ci95:
+        if end is not None:
+            axes.axvline(end, color=MARK, linewidth=0.7, linestyle=":")
+    axes.set_xlabel(with_unit(verdict.name, verdict.unit), fontsize=8)
     axes.set_ylabel("rise of the cost / 95 % level", fontsize=8)
-    axes.set_title(str(verdict.get("verdict", "")), fontsize=8)
+    axes.set_title(verdict.verdict, fontsize=8)
     axes.set_ylim(-0.05, min(max(1.6, float(np.nanmax(y, initial=0.0)) * 1.05), 4.0))
     axes.ticklabel_format(axis="x", useOffset=False)
     _plain(axes)
@@ -42,7 +46,7 @@ def joined(x: Array, y: Array) -> tuple[Array, Array]:
     return dense, np.interp(dense, x, root) ** 2
 
 
-def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> None:
+def draw_intervals(axes: Any, parameters: Mapping[str, Verdict] | Mapping[str, Estimate]) -> None:
     """Draw the 95 % interval of each parameter about its value, in % of its scale, open ends as arrows, with any verdict."""
     names = list(parameters)
     ends = {n: _relative(parameters[n]) for n in names}
@@ -63,7 +67,7 @@ def draw_intervals(axes: Any, parameters: Mapping[str, Mapping[str, Any]]) -> No
     ticks = _decades(smallest, reach)
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks], minor=False)
     axes.set_xticks([], minor=True)
-    axes.set_yticks(range(len(names)), [f"{n}\n{parameters[n].get('verdict', '')}".rstrip() for n in names], fontsize=7)
+    axes.set_yticks(range(len(names)), [f"{n}\n{getattr(p, 'verdict', '')}".rstrip() for n, p in parameters.items()], fontsize=7)
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlabel("95 % interval, % of the value (of the range where 0 is admissible); x: held", fontsize=8)
     _plain(axes)
@@ -79,17 +83,13 @@ def _decades(low: float, high: float) -> list[float]:
     return sorted([-s for s in sides] + [0.0] + sides)
 
 
-def _relative(verdict: Mapping[str, Any]) -> tuple[float | None, float | None] | None:
-    """Return the interval's ends about the value, in %; None where there is no interval."""
-    if not verdict.get("ci95") or verdict["value"] is None:
+def _relative(parameter: Verdict | Estimate) -> tuple[float | None, float | None] | None:
+    """Return the interval's ends about the value, in % of what widths are compared with; None where there is no interval."""
+    if not parameter.ci95:
         return None
-    value, scale = float(verdict["value"]), float(verdict.get("scale") or 1.0)
-    low, high = (None if e is None else 100.0 * (float(e) - value) / scale for e in verdict["ci95"])
+    value, scale = parameter.value, getattr(parameter, "scale", abs(parameter.value)) or 1.0
+    low, high = (None if e is None else 100.0 * (e - value) / scale for e in parameter.ci95)
     return low, high
-
-
-def _labelled(name: str, verdict: Mapping[str, Any]) -> str:
-    return f"{name}, {verdict['unit']}" if verdict.get("unit") else name
 
 
 def _plain(axes: Any) -> None:

@@ -295,13 +295,15 @@ def export(
     access: Access,
 ) -> None:
     """Write the model or its linear model. The ending of FILE selects the format."""
+    from hvdc_ident.next_step import next_phrases
     from hvdc_ident.study.export import write
 
     written = write(access.study(study), to, linear, fmu.options(), values, out, reduced=reduced)
     size = written.path.stat().st_size
     about = {"bytes": size, "values": written.values, "set": written.of, "note": written.note}
     console.print_json({"schema": 1, "file": written.path.as_posix(), **about})
-    console.say(f"{written.path}: {size} bytes" + (f"; {written.note}" if written.note else ""))
+    said = [f"{size} bytes", written.note, next_phrases(written.next)]
+    console.say(f"{written.path}: {'; '.join(filter(None, said))}")
 
 
 def convert(

@@ -1,9 +1,9 @@
 """The one codec of results: frozen dataclasses as JSON holds them, and back.
 
 A field stands under its own name. `stored_as` gives it another key, or leaves it out where it is empty; `NOT_STORED` keeps it out
-of the JSON, `WRITTEN_ONLY` is written and has its default when it is read back. `stored_properties` of a class are written beside
-its fields, for those who read the JSON with other tools. A number that is not finite is written as null; where only a number can
-stand, null is read back as nan. A complex number is [re, im].
+of the JSON, `INLINE` puts the keys of a part among those of the whole. `stored_properties` of a class are written beside its fields,
+for those who read the JSON with other tools. A number that is not finite is written as null; where only a number can stand, null is
+read back as nan, or as the field's default where that is not finite. A complex number is [re, im].
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from hvdc_ident.immutable import FrozenMap
 T = TypeVar("T")
 NOT_STORED: dict[str, Any] = {"json": ""}
 """Metadata of a field that the JSON does not have: it can be made again, or no JSON can hold it."""
-WRITTEN_ONLY: dict[str, Any] = {"read": False}
-"""Metadata of a field whose JSON is a digest of it, from which it cannot be made again."""
+INLINE: dict[str, Any] = {"inline": True}
+"""Metadata of a field that is a dataclass and whose keys stand among those of the whole."""
 
 
 def stored_as(key: str, *, optional: bool = False) -> dict[str, Any]:
@@ -93,10 +93,12 @@ def _plain_other(value: Any) -> Any:
 
 def plain_fields(value: Any) -> dict[str, Any]:
     """Return the fields of a dataclass, and its stored properties, under their keys."""
-    found = {}
+    found: dict[str, Any] = {}
     for f in fields(value):
         own, key = getattr(value, f.name), _key(f)
-        if key and not (f.metadata.get("optional") and _empty(own)):
+        if f.metadata.get("inline"):
+            found |= plain(own)
+        elif key and not (f.metadata.get("optional") and _empty(own)):
             found[key] = plain(own)
     return found | {name: plain(getattr(value, name)) for name in getattr(value, "stored_properties", ())}
 
@@ -195,7 +197,7 @@ def _array(parts: tuple[Any, ...], value: Any) -> Any:
     if not issubclass(wanted, np.complexfloating):
         return array if wanted is Any else array.astype(wanted, copy=False)
     _expect(array.size == 0 or array.shape[-1] == 2, value, "pairs [re, im]")
-    return array[..., 0] + 1j * array[..., 1] if array.size else np.zeros(0, dtype=complex)
+    return array[..., 0] + 1j * array[..., 1] if array.size else array.astype(complex)
 
 
 def _one_of(parts: tuple[Any, ...], value: Any) -> Any:
@@ -219,9 +221,13 @@ def _fields(kind: Any, data: Any) -> Any:
     made = {}
     for f in fields(kind):
         key = _key(f)
-        if not (f.init and key and f.metadata.get("read", True)):
+        if not (f.init and key):
             continue
-        if key in data:
+        if f.metadata.get("inline"):
+            made[f.name] = _read(_annotations(kind)[f.name], data)
+        elif key in data and data[key] is None and isinstance(f.default, float) and not math.isfinite(f.default):
+            made[f.name] = f.default
+        elif key in data:
             made[f.name] = _under(key, _annotations(kind)[f.name], data[key])
         elif f.default is MISSING and f.default_factory is MISSING:
             raise _Misread(f"the key {key}", [*data])
@@ -245,7 +251,7 @@ def _expect(right: bool, value: Any, expected: str) -> Any:
 def _annotations(kind: type) -> dict[str, Any]:
     """Return the annotations of the fields of a dataclass that are read, each in the names of the module that states it."""
     found: dict[str, Any] = {}
-    read = {f.name for f in fields(kind) if f.init and _key(f) and f.metadata.get("read", True)}
+    read = {f.name for f in fields(kind) if f.init and _key(f)}
     for owner in reversed(kind.__mro__):
         names = vars(sys.modules[owner.__module__])
         for name, told in vars(owner).get("__annotations__", {}).items():

@@ -316,7 +316,7 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         except typer.Exit:
             raise
         except HvdcIdentError as e:
-            end(2 if isinstance(e, InputError) else 1, str(e))
+            end(2 if isinstance(e, InputError) else 1, str(e.read_in("shell")))
         except CommandFailed as e:
             end(1, str(e))
         except _BudgetSpent as e:

@@ -20,11 +20,15 @@ Every message says what is wrong, where, what was expected, what was found and w
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 from hvdc_ident.next_step import Door, NextStep, next_phrases
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
 class HvdcIdentError(Exception):
@@ -75,6 +79,19 @@ class HvdcIdentError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         return _rebuild, (type(self), self.what, self._parts)
+
+
+def in_python(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return the function as a caller in Python meets it: its errors say what to do in Python."""
+
+    @wraps(function)
+    def called(*arguments: Arguments.args, **settings: Arguments.kwargs) -> Result:
+        try:
+            return function(*arguments, **settings)
+        except HvdcIdentError as error:
+            raise error.read_in("python") from error.__cause__
+
+    return called
 
 
 @contextmanager

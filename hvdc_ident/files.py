@@ -15,6 +15,7 @@ from typing import Any
 
 from hvdc_ident.codec import Rows, plain
 from hvdc_ident.errors import InputError
+from hvdc_ident.next_step import NextStep
 
 FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """Beginnings of texts that a spreadsheet takes for a formula."""
@@ -149,5 +150,5 @@ def _cannot_write(path: Path, error: OSError) -> InputError:
     return InputError(
         f"cannot write: {(error.strerror or str(error)).lower()}",
         where=str(path),
-        hint="a folder that can be written to, with --out DIR",
+        next=(NextStep("folder"),),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
@@ -20,12 +21,21 @@ NextKind = Literal[
     "given",
     "raise-noise",
     "lower-noise",
+    "values",
+    "folder",
+    "run",
+    "new",
+    "new-from",
+    "new-unit",
+    "signals",
+    "variables",
 ]
 TO_DO: dict[str, dict[Door, str]] = {
     "diagnose": {"shell": "`hvdc-ident diagnose STUDY`", "python": "`hi.diagnose(...)`", "page": "the stage diagnose"},
     "identify": {"shell": "`hvdc-ident identify STUDY`", "python": "`hi.identify(...)`", "page": "the stage identify"},
     "fit": {"shell": "`hvdc-ident fit STUDY`", "python": "`values=hi.fit(...)`", "page": "the stage fit"},
     "given": {"shell": "`--values given`", "python": '`values="given"`', "page": "the given values"},
+    "values": {"shell": "`--values {}`", "python": '`values="{}"`', "page": "the values “{}”"},
     "force": {"shell": "`--force NAME`", "python": '`force=["NAME"]`', "page": "a fit with `--force NAME`"},
     "letter": {"shell": "`hvdc-ident letter STUDY`", "python": "`hvdc-ident letter`", "page": "the button Letter"},
     "export": {
@@ -33,7 +43,35 @@ TO_DO: dict[str, dict[Door, str]] = {
         "python": "`hi.export(...)`",
         "page": "a button below Take away",
     },
+    "folder": {"shell": "`--out DIR`", "python": "another folder", "page": "another folder"},
+    "run": {"shell": "`hvdc-ident run STUDY`", "python": "`hvdc_ident.study.run_all(...)`", "page": "the tab Run"},
+    "new": {
+        "shell": "`hvdc-ident new DIR`",
+        "python": "`hvdc_ident.study.write_starter(DIR)`",
+        "page": "the tab Recording",
+    },
+    "new-from": {
+        "shell": "`hvdc-ident new DIR --from {} --model MODEL`",
+        "python": "`hi.new_study(DIR, {!r}, MODEL)`",
+        "page": "the tab Recording",
+    },
+    "new-unit": {
+        "shell": "`hvdc-ident new DIR --dyr plant.dyr --bus 101 --from event.csv`",
+        "python": "`hvdc-ident new DIR --dyr plant.dyr --bus 101 --from event.csv` in a shell",
+        "page": "`hvdc-ident new DIR --dyr plant.dyr --bus 101 --from event.csv` in a shell",
+    },
+    "signals": {
+        "shell": "`hvdc-ident convert {} --list ''`",
+        "python": "`hvdc_ident.formats.list_signals({!r})`",
+        "page": "the tab Recording",
+    },
+    "variables": {
+        "shell": "`hvdc-ident check {}`",
+        "python": "`print(hi.load_model({!r}).capabilities)`",
+        "page": "`hvdc-ident check {}` in a shell",
+    },
 }
+"""By kind, what to do; {} is the text of the step, the path of a file or the name of a set of values."""
 PURPOSES = {
     "diagnose": "looks for what the model lacks",
     "identify": "says why of each, and what to measure next",
@@ -42,7 +80,20 @@ PURPOSES = {
     "force": "fits one all the same",
     "letter": "writes one page on this for the model's owner",
     "export": "writes the model with the values that count (.fmu, .mo, .toml)",
+    "folder": "that can be written to and no other run is at work in",
+    "run": "runs the study and keeps its results in STUDY-results",
+    "new": "writes a study to start from",
+    "new-from": "writes a study of it",
+    "new-unit": "writes a study that says so",
+    "signals": "lists its signals",
+    "variables": "lists its variables; a study names it in [model] source",
 }
+VALUES = {
+    "effect": "takes those with the effect",
+    "fit": "takes those of the fit without the effect",
+    "fitted": "takes the best of them",
+}
+"""By name of a set of values, what taking it does."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +102,9 @@ class NextStep:
 
     kind: run the diagnosis; record what tells likely effects apart ("separate"); write the letter to the model's owner; record what
     narrows the intervals; export the values; see why nothing is estimated; fit; fit a parameter against its verdict; take the given
-    values; state a larger noise, or a smaller one. text: of a recording, what to record; of a noise, its standard deviations by output.
+    values; state a larger noise, or a smaller one; take another set of values; take another folder; run the study; write a study to
+    start from, one of a recording, one of a unit of PSS/E; list the signals of a recording, the variables of an FMU. text: of a
+    recording, what to record; of a noise, its standard deviations by output; of values, their name; of a file, its path.
     """
 
     kind: NextKind
@@ -66,7 +119,8 @@ def next_phrase(step: NextStep, door: Door = "shell") -> str:
         return (
             f"state noise = {{{step.text}}}, or leave it out to have it estimated: the intervals are too wide as they are"
         )
-    return f"{TO_DO[step.kind][door]} {PURPOSES[step.kind]}"
+    told = shlex.quote(step.text) if door == "shell" else step.text
+    return f"{TO_DO[step.kind][door].format(told)} {VALUES[step.text] if step.kind == 'values' else PURPOSES[step.kind]}"
 
 
 def next_sentence(step: NextStep, door: Door = "shell") -> str:

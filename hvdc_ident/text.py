@@ -215,8 +215,3 @@ def unstable_roots(stability: Mapping[str, Any]) -> str:
         return "infinitely many unstable roots"
     number = f"{count:.0f} unstable root{'' if count == 1 else 's'}"
     return f"at least {number}" if stability["reason"] else number
-
-
-def form_of(effect: Mapping[str, Any]) -> str:
-    """Return the name of an effect in the results, with its formula where it is outside the catalogue."""
-    return f"{effect['effect']} {effect.get('expression', '')}".rstrip()

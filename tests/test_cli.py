@@ -365,7 +365,7 @@ def test_a_refused_option_says_why_and_what_to_try(study: Path, words: tuple[str
         ),
         ("step.mat", "\0\1\2", ("a file of waveforms, not a study", "hvdc-ident convert {} --list")),
         ("plant.fmu", "PK", ("this is an FMU, not a study", "hvdc-ident check {}`")),
-        ("study.txt", "[model", ("not valid TOML", "hvdc-ident new DIR")),
+        ("study.txt", "[model", ("not valid TOML", "mend this line")),
     ],
 )
 def test_a_file_that_is_no_study_is_called_by_its_kind(
@@ -484,7 +484,7 @@ def test_the_installed_command_answers(tmp_path: Path) -> None:
     )
     assert done.returncode == 2
     assert (
-        done.stderr == "error: none.toml: no such study file. Try: 'hvdc-ident new DIR' writes a study to start from\n"
+        done.stderr == "error: none.toml: no such study file. Try: `hvdc-ident new DIR` writes a study to start from\n"
     )
 
 

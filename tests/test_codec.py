@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hvdc_ident.codec import NOT_STORED, Coded, stored_as
+from hvdc_ident.codec import INLINE, NOT_STORED, Coded, stored_as
 from hvdc_ident.errors import InputError
 from hvdc_ident.immutable import FrozenMap
 
@@ -21,6 +21,12 @@ from hvdc_ident.immutable import FrozenMap
 class Part:
     size: float
     source: str = field(default="", metadata=stored_as("from", optional=True))
+
+
+@dataclass(frozen=True)
+class Bounds:
+    low: float = -math.inf
+    high: float = math.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +42,7 @@ class Whole(Coded):
     path: Path
     nested: Part | None = None
     either: int | tuple[float, float] = 0
+    bounds: Bounds = field(default_factory=Bounds, metadata=INLINE)
     scratch: Any = field(default=None, metadata=NOT_STORED)
     stored_properties = ("doubled",)
 
@@ -72,6 +79,13 @@ def test_every_kind_of_field_comes_back() -> None:
     assert isinstance(found.parts, FrozenMap) and found.parts["x"][1].source == "u" and math.isnan(found.parts["x"][1].size)
     assert found.path == Path("a/b.csv") and found.nested == Part(2.0) and found.either == (1.0, 2.0)
     assert found.scratch is None and found.to_dict() == first.to_dict()
+
+
+def test_a_part_may_stand_among_the_keys_of_the_whole_and_a_bound_that_is_not_there_is_none() -> None:
+    first = whole(bounds=Bounds(high=2.0))
+    data = first.to_dict()
+    assert (data["low"], data["high"]) == (None, 2.0) and "bounds" not in data
+    assert again(first).bounds == first.bounds
 
 
 def test_keys_are_those_that_the_fields_state() -> None:

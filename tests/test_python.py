@@ -17,6 +17,7 @@ from hvdc_ident.axes import draw_intervals
 from hvdc_ident.codec import plain
 from hvdc_ident.errors import InputError
 from hvdc_ident.fit import Problem
+from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.sensitivity.sweep_points import latin_hypercube, log_grid
 from hvdc_ident.study.assemble import experiments_of
 
@@ -93,6 +94,14 @@ def test_python_is_told_calls_and_no_commands(tmp_path: Any) -> None:
     with pytest.raises(InputError, match=r'values="given"') as caught:
         hi.export(tmp_path / "s.toml", tmp_path / "x.toml", values="fitted")
     assert "--values" not in str(caught.value)
+    (tmp_path / "step.csv").write_text("time,u\n0,1\n1,2\n")
+    for name, words in (("none/s.toml", "write_starter"), ("step.csv", r"list_signals\('.*step.csv'\)` lists its signals")):
+        with pytest.raises(InputError, match=words) as caught:
+            hi.load_study(tmp_path / name)
+        assert "hvdc-ident" not in str(caught.value)
+    with pytest.raises(InputError, match="run_all") as caught:
+        hi.compare_runs(tmp_path / "none", tmp_path)
+    assert "hvdc-ident" not in str(caught.value)
     told = str(hi.check(LAG, RECORD, {"T": (2.0, 3.0)}))
     assert told.splitlines()[-1].endswith("`hi.check(...)`") and "hvdc-ident" not in told
 
@@ -100,7 +109,7 @@ def test_python_is_told_calls_and_no_commands(tmp_path: Any) -> None:
 @pytest.mark.parametrize("half", [0.02, 0.9, 1.2, 3.0, 40.0, 900.0])
 def test_the_axis_of_intervals_has_ticks_on_both_sides(half: float) -> None:
     plt = pytest.importorskip("matplotlib.pyplot")
-    verdict = {"verdict": "identifiable", "value": 100.0, "scale": 100.0, "ci95": [100.0 - half, 100.0 + 1.1 * half]}
+    verdict = Verdict("k", "identifiable", "", 100.0, ci95=(100.0 - half, 100.0 + 1.1 * half), scale=100.0)
     axes = plt.subplots()[1]
     draw_intervals(axes, {"k": verdict})
     low, high = axes.get_xlim()
@@ -199,10 +208,28 @@ def test_a_result_has_its_parameters_by_name_and_comes_back_from_its_json(report
     for result in (report, fit):
         data = json.loads(json.dumps(result.to_dict(), allow_nan=False))
         again = type(result).from_dict(data)
-        digests = {"recommended_experiment": None, "sensitivities": None}
-        assert again.to_dict() | digests == data | digests if result is report else again.to_dict() == data
+        assert again.to_dict() == data
     again = hi.fit(LAG, RECORD, BOUNDS, report=hi.IdentifiabilityReport.from_dict(report.to_dict()))
     assert dict(again.values) == pytest.approx(dict(fit.values), rel=1e-6)
+
+
+def test_a_diagnosis_gives_the_intervals_of_the_parameters_beside_what_it_put_in() -> None:
+    """A late plant: the interval of T holds the plant's, which that of a fit without the delay misses."""
+    late = hi.apply_effects(LAG, [{"effect": "delay", "at": "y", "parameters": {"T": 0.3}}])
+    random = np.random.default_rng(1)
+
+    def record(name: str, after: float) -> hi.Experiment:
+        step = {"u": hi.step(0.0, after, at=STEP)}
+        y = hi.simulate(late, TIME, {"T": T, "k": K}, inputs=step)["y"] + NOISE * random.standard_normal(TIME.size)
+        return hi.Experiment(TIME, name, inputs=step, outputs={"y": y}, noise={"y": NOISE})
+
+    bounds = {n: BOUNDS[n] for n in ("T", "k")}
+    found = hi.diagnose(LAG, [record("up", 1.0), record("down", -0.5)], bounds, effects=["delay"])
+    low, high = found.params["T"].interval
+    assert low < T < high and found.params["T"].value == found.parameters_after["T"] and found.params["T"].unit == "s"
+    assert high - low < 0.1 * T and not low < found.parameters_refitted["T"] < high
+    nothing = hi.diagnose(LAG, RECORD, bounds, effects=["delay"])
+    assert nothing.params["T"].value == nothing.parameters_after["T"] and nothing.params["T"].interval is None
 
 
 def test_tables_and_linear_results_come_back_from_their_json_too() -> None:

@@ -138,7 +138,7 @@ def _ordered(lines: Sequence[SignalLine]) -> tuple[SignalLine, ...]:
     return tuple(sorted(lines, key=lambda line: line.kind != "input"))
 
 
-class Held(Recordings):
+class LoadedRecording(Recordings):
     """A recording that has been read, as the reader of experiments asks for it: a file of a million rows is read once."""
 
     def __init__(self, record: Trajectory) -> None:
@@ -183,7 +183,7 @@ def experiment_of(
     mapping: RecordingMap, record: Trajectory, model: AnyModel, where: str
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     """Return the experiment and where its noise comes from. Raises InputError as `hi.load_study` does."""
-    (experiment,), notes = read_experiments([mapping.table(where)], model, Held(record), where)
+    (experiment,), notes = read_experiments([mapping.table(where)], model, LoadedRecording(record), where)
     return experiment, notes[experiment.name]
 
 

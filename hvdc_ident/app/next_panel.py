@@ -15,6 +15,7 @@ from hvdc_ident.app.supposed import PlannedExperiment, Supposition, planned_expe
 from hvdc_ident.colours import SERIES
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.errors import HvdcIdentError
+from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.summary.phrases import WORDS
 from hvdc_ident.text import with_unit
 
@@ -62,12 +63,12 @@ class NextExperiment:
     def __init__(
         self,
         study: hi.Study,
-        identified: Mapping[str, Any],
+        report: IdentifiabilityReport,
         fitted: Supposition | None,
         rivals: tuple[Supposition, ...],
     ) -> None:
         self._study = study
-        self._planned = planned_experiments(study, identified)
+        self._planned = planned_experiments(study, report)
         self._models = (fitted or Supposition(WORDS["given"], study.model), *rivals[:MOST])
 
     def build(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,8 @@ from hvdc_ident.app.results import FoundResults
 from hvdc_ident.axes import joined
 from hvdc_ident.data import Array
 from hvdc_ident.display import Table
+from hvdc_ident.fit.profile import Profile
+from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.report.html import table_of
 from hvdc_ident.report.overlay import Overlay, overlay_of
 from hvdc_ident.summary import Results
@@ -53,12 +55,11 @@ def show_table(table: Table) -> None:
 
 def _identifiability(found: FoundResults, page: Page) -> None:
     """Build the verdicts, and the profile of the parameter that is chosen."""
-    data = found.of("identify")
-    if data.get("misspecified"):
-        signs = data["misspecification"]
-        ui.label(f"The model does not explain these data: {'; '.join(signs['signs'])}.")
-    show_table(verdicts_table(data))
-    profiles = {n: p for n, p in (data.get("profiles") or {}).items() if len(p.get("values") or ()) > 1}
+    report = found.objects.identified
+    if report.misspecified:
+        ui.label(f"The model does not explain these data: {'; '.join(report.misspecification.signs)}.")
+    show_table(verdicts_table(report))
+    profiles = {n: p for n, p in report.profiles.items() if p.values.size > 1}
     if not profiles:
         return
     first = next(iter(profiles))
@@ -66,17 +67,16 @@ def _identifiability(found: FoundResults, page: Page) -> None:
     place = ui.element("div").classes("w-full")
 
     def draw() -> None:
-        _draw_profile(data, profiles[which.value], which.value, place)
+        _draw_profile(profiles[which.value], report.parameters[which.value], place)
 
     which.on_value_change(draw)
     draw()
 
 
-def _draw_profile(data: Mapping[str, Any], profile: Mapping[str, Any], name: str, place: Any) -> None:
+def _draw_profile(profile: Profile, verdict: Verdict, place: Any) -> None:
     place.clear()
     with place:
-        unit = data["parameters"].get(name, {}).get("unit", "")
-        ui.label(f"Profile of {name}: the least cost over all other parameters").classes("small")
+        ui.label(f"Profile of {verdict.name}: the least cost over all other parameters").classes("small")
         curves = (
             Trace("rise of the cost", NOW),
             Trace("computed", NOW, mark="dot", size=6),
@@ -84,17 +84,17 @@ def _draw_profile(data: Mapping[str, Any], profile: Mapping[str, Any], name: str
             Trace("ends of the interval", RECORDED, mark="ring", size=10),
         )
         grid = Grid("rise of the cost / 95 % level", curves)
-        plot = Plot([grid], with_unit(name, unit), 330, f"Profile of {name}").classes("w-full")
+        unit = with_unit(verdict.name, verdict.unit)
+        plot = Plot([grid], unit, 330, f"Profile of {verdict.name}").classes("w-full")
         plot.whole(0, profile_columns(profile))
 
 
-def profile_columns(profile: Mapping[str, Any]) -> list[Array]:
+def profile_columns(profile: Profile) -> list[Array]:
     """Return the columns of a profile's picture, (n,) each: the values, the rise of the cost between what was computed, the
     rise computed, the 95 % level, and the ends of the interval; the rise in units of that level, nan where there is none.
     """
-    x = np.array(profile["values"], dtype=float)
-    rise = np.array(profile["rises"], dtype=float) / profile["threshold"]
-    ends = [end for side in ("lower", "upper") if (end := profile[side]["limit"]) is not None]
+    x, rise = profile.values, profile.rises / profile.threshold
+    ends = [end for end in profile.ci95 if end is not None]
     dense, between = joined(x, rise)
     at = np.unique(np.concatenate([dense, x, ends]))
 
@@ -159,8 +159,8 @@ def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = F
 
 def _diagnosed(found: FoundResults, page: Page) -> None:
     """Build what the diagnosis says, its findings, and the errors with each set of values."""
-    data = found.of("diagnose")
-    ui.label(str(data.get("text") or data.get("verdict", "")))
+    diagnosis, sizes = found.objects.diagnosis, found.of("diagnose").get("sizes") or {}
+    ui.label("" if diagnosis is None else diagnosis.text or diagnosis.verdict)
     show_table(findings_table(found.summary))
     show_table(sets_table(found.summary))
     models, trouble = found.supposed
@@ -170,7 +170,7 @@ def _diagnosed(found: FoundResults, page: Page) -> None:
         button.props("outline dense").classes("q-px-sm self-start")
         button.tooltip("Opens the model with what was found on the tab Explore; its rivals stand there under “model with”.")
     results = Results(found.folder)
-    told = str((data.get("sizes") or {}).get("experiment", "")) or next(iter(results.experiments), "")
+    told = str(sizes.get("experiment", "")) or next(iter(results.experiments), "")
     ui.label(f"Recorded less simulated in {told}, without and with what was found").classes("small q-mt-sm")
     _overlay(results, told, ui.element("div").classes("w-full"), errors=True)
 
@@ -180,7 +180,7 @@ def _next(found: FoundResults, page: Page) -> None:
     ui.label(advice(found.summary) or found.summary.unadvised or "The results ask for no further record.")
     models, trouble = found.supposed
     ui.label(trouble).classes("alert")
-    NextExperiment(found.study, found.of("identify"), found.fitted, models).build()
+    NextExperiment(found.study, found.objects.identified, found.fitted, models).build()
 
 
 PANELS = (

@@ -14,6 +14,7 @@ from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.study.stages import stage
 from hvdc_ident.summary import Results, RunSummary, summarise
 from hvdc_ident.summary.phrases import WORDS
+from hvdc_ident.summary.stage_results import StageResults
 
 
 @dataclass(frozen=True)
@@ -29,22 +30,31 @@ class FoundResults:
         return self.data.get(stage, {})
 
     @cached_property
+    def _by_file(self) -> dict[str, Mapping[str, Any]]:
+        return {Path(stage(n).file).stem: data for n, data in self.data.items()}
+
+    @cached_property
+    def objects(self) -> StageResults:
+        """The results as objects; those of stages that have not run are empty."""
+        return StageResults.read(self._by_file)
+
+    @cached_property
     def summary(self) -> RunSummary:
         """Summary of the results."""
-        return summarise({Path(stage(n).file).stem: data for n, data in self.data.items()}, Results(self.folder).swing)
+        return summarise(self._by_file, Results(self.folder).swing)
 
     @cached_property
     def fitted(self) -> Supposition | None:
         """The model with the values of the fit; None where there are none."""
-        values = {n: v for n, v in (self.of("fit").get("values") or {}).items() if v is not None}
-        own = {n: float(v) for n, v in values.items() if n in self.study.model.parameters}
+        fit = self.objects.fit
+        own = {} if fit is None else {n: v for n, v in fit.values.items() if n in self.study.model.parameters}
         return Supposition(WORDS["fitted"], self.study.model.with_values(own)) if own else None
 
     @cached_property
     def supposed(self) -> tuple[tuple[Supposition, ...], str]:
         """The models with what a diagnosis found, the best first; and why they cannot be had."""
         try:
-            return suppositions(self.study, self.of("diagnose"), self.folder), ""
+            return suppositions(self.study, self.objects.diagnosis, self.folder), ""
         except HvdcIdentError as error:
             return (), str(error)
 

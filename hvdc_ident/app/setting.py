@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 import hvdc_ident as hi
 from hvdc_ident.data import Array, Experiment, SignalLike
@@ -210,7 +211,7 @@ def equations_of(model: AnyModel) -> Model | None:
     return model if isinstance(model, Model) else None
 
 
-def near(poles: Array) -> Array:
+def near(poles: NDArray[Any]) -> NDArray[Any]:
     """Return the poles that a picture shows: those within 30 times the slowest; faster ones would press them into a line."""
     sizes = np.abs(poles)
     slowest = np.min(sizes, where=sizes > 0, initial=np.inf)

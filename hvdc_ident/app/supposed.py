@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import hvdc_ident as hi
 from hvdc_ident.data import Experiment
+from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.discrepancy.result import FoundEffect, Rival
 from hvdc_ident.errors import ComputationError, HvdcIdentError
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.identifiability.experiment_design import ExperimentDesign, Move, single_input_designs
+from hvdc_ident.identifiability import IdentifiabilityReport
+from hvdc_ident.identifiability.experiment_design import ExperimentDesign, single_input_designs
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.augmented import use_of
-from hvdc_ident.summary.stage_results import diagnosis_of
 from hvdc_ident.text import listed
 
 
@@ -35,22 +35,21 @@ class Supposition:
     fitted: bool = True
 
 
-def suppositions(study: hi.Study, diagnosis: Mapping[str, Any], folder: Path) -> tuple[Supposition, ...]:
+def suppositions(study: hi.Study, diagnosis: Diagnosis | None, folder: Path) -> tuple[Supposition, ...]:
     """Return the models with what a diagnosis found missing: the best one, then those that explain the records as well.
 
     The rivals have the parameters that their refits came to, and those of the best one where the results keep no others:
     `refitted` gives them all. None where nothing was put in; a rival that cannot be built here is left out.
     """
-    result = diagnosis_of(diagnosis)
-    card = folder / Path((result and result.augmented_model) or "").name
-    if result is None or not result.augmented_model or not card.is_file():
+    card = folder / Path((diagnosis and diagnosis.augmented_model) or "").name
+    if diagnosis is None or not diagnosis.augmented_model or not card.is_file():
         return ()
     best = hi.load_model(card)
-    found: Sequence[FoundEffect | Rival] = result.effects
+    found: Sequence[FoundEffect | Rival] = diagnosis.effects
     rivals = [Supposition(_named(found), best, _sizes(study, best))]
-    gains = {n: v for n, v in result.parameters_after.items() if n in study.model.parameters}
+    gains = {n: v for n, v in diagnosis.parameters_after.items() if n in study.model.parameters}
     plant = study.model.with_values(gains)
-    for k, group in enumerate(result.ambiguity):
+    for k, group in enumerate(diagnosis.ambiguity):
         for other in (r for r in group if k >= len(found) or _place_of(r) != _place_of(found[k])):
             effects = [*found[:k], other, *found[k + 1 :]]
             own = {n: v.value for n, v in other.values.items() if n in gains}
@@ -118,13 +117,14 @@ class PlannedExperiment:
         return self.design.experiment(max(study.experiments, key=lambda e: float(np.ptp(e.time))))
 
 
-def planned_experiments(study: hi.Study, identified: Mapping[str, Any]) -> tuple[PlannedExperiment, ...]:
+def planned_experiments(study: hi.Study, report: IdentifiabilityReport) -> tuple[PlannedExperiment, ...]:
     """Return the experiments that an identifiability analysis recommends, the best first; where it has none, those that could be made:
     the moves of each input that a person can set."""
     inputs = study.model.inputs
     units = {n: i.unit for n, i in inputs.items()}
-    advice = identified.get("recommended_experiment") or {}
-    told = tuple(dict.fromkeys(_planned((advice, *(advice.get("others") or ())), units)))
+    advice = report.recommended
+    ranked = () if advice is None else (advice.best, *advice.others)
+    told = tuple(dict.fromkeys(PlannedExperiment(r.design.text(units), r.design, r.record, r.new) for r in ranked))
     if told or not study.experiments:
         return told
     record = tuple(dict.fromkeys(o for e in study.experiments for o in e.outputs))
@@ -132,10 +132,3 @@ def planned_experiments(study: hi.Study, identified: Mapping[str, Any]) -> tuple
     longest = max(study.experiments, key=lambda e: float(np.ptp(e.time)))
     designs = single_input_designs(study.experiments, values, units, longest)
     return tuple(PlannedExperiment(d.text(units), d, record, ()) for d in designs)
-
-
-def _planned(told: Sequence[Mapping[str, Any]], units: Mapping[str, str]) -> Iterator[PlannedExperiment]:
-    for line in told:
-        if line.get("moves"):
-            design = ExperimentDesign(tuple(Move.of(m) for m in line["moves"]))
-            yield PlannedExperiment(design.text(units), design, tuple(line["record"]), tuple(line["new_signals"]))

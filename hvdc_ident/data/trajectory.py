@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.codec import read_fields
+from hvdc_ident.codec import Coded, read_fields
 from hvdc_ident.display import Shown, Table, axes_of, data_frame, first_rows, library
 from hvdc_ident.errors import StudyError, WaveformError, unknown_name
 from hvdc_ident.text import with_unit
@@ -43,7 +43,7 @@ class Origin:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lists:
+class _Columns:
     """A trajectory as JSON has it."""
 
     time: Array
@@ -52,7 +52,7 @@ class _Lists:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Trajectory(Shown):
+class Trajectory(Coded, Shown):
     """Signals sampled at the same instants.
 
     time: (n,) in s, non-decreasing; a time that stands twice is a jump, the first row before it and the second after.
@@ -156,7 +156,7 @@ class Trajectory(Shown):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Trajectory:
         """Return the trajectory that `to_dict` wrote. Raises InputError for anything else."""
-        table = read_fields(_Lists, data)
+        table = read_fields(_Columns, data)
         columns = np.reshape(list(table.signals.values()), (len(table.signals), table.time.size)).T
         return cls(table.time, columns, tuple(table.signals), tuple(table.units.get(n, "") for n in table.signals))
 

@@ -12,6 +12,7 @@ from hvdc_ident.display import Shown, data_frame
 from hvdc_ident.display import Table as TextTable
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import InputError, SteadyStateError
+from hvdc_ident.fit.result import Estimate
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import interval_text, interval_words, percentage, value_by_place
 
@@ -239,8 +240,10 @@ class Diagnosis(Coded, Shown):
     candidates: every candidate's line, the best first. location: where model and data differ.
     gap: before and after. remaining: what is left. beyond_noise: whether that is more than noise; the values and
     the intervals then hold only if nothing else is missing. parameters_*: by name; `parameters_refitted` are the
-    nominal model's own best. augmented: the model with the effects and the new values; None where nothing was put in, and where the
-    diagnosis was read from JSON. augmented_model: the name of its card in `files`; None where it has none.
+    nominal model's own best. estimates_after: what is known of `parameters_after`, where something was put in, of those that were
+    fitted; residual_tests_after: of what the model then leaves, by output and experiment. augmented: the model with the effects and
+    the new values; None where nothing was put in, and where the diagnosis was read from JSON. augmented_model: the name of its card
+    in `files`; None where it has none.
     fallback: the form found outside the catalogue, if one was looked for. noise: standard deviation and AR coefficient by output,
     and where they come from.
     findings: what is missing, each effect with its probability and its likely places, the likeliest first. remainder: {share of
@@ -262,6 +265,8 @@ class Diagnosis(Coded, Shown):
     parameters_before: FrozenMap[float] = field(default_factory=FrozenMap)
     parameters_refitted: FrozenMap[float] = field(default_factory=FrozenMap)
     parameters_after: FrozenMap[float] = field(default_factory=FrozenMap)
+    estimates_after: FrozenMap[Estimate] = field(default_factory=FrozenMap)
+    residual_tests_after: Mapping[str, Any] = field(default_factory=dict)
     augmented: AnyModel | None = field(default=None, metadata=NOT_STORED)
     augmented_model: str | None = None
     fallback: Mapping[str, Any] | None = None
@@ -276,9 +281,15 @@ class Diagnosis(Coded, Shown):
     stand_ins: tuple[StandIn, ...] = ()
 
     @property
-    def params(self) -> FrozenMap[EffectSize]:
-        """The parameters with what was put into the model, by name. Their intervals are those of a study's diagnosis."""
-        return FrozenMap({n: EffectSize(v) for n, v in self.parameters_after.items()})
+    def params(self) -> FrozenMap[Estimate]:
+        """The parameters with what was put into the model, by name, each with its `value` and its 95 % `interval`.
+
+        The interval is None where nothing was put in, where what is left is more than noise, where the value depends on which of
+        the likely effects and places is the true one, of a parameter on a bound, and in studies whose experiments have unknowns of
+        their own.
+        """
+        known = {n: replace(e, value=self.parameters_after[n]) for n, e in self.estimates_after.items()}
+        return FrozenMap({n: known.get(n) or Estimate(v) for n, v in self.parameters_after.items()})
 
     @property
     def files(self) -> dict[str, str]:

@@ -198,8 +198,7 @@ class FitResult(Coded, Shown):
         from hvdc_ident.axes import draw_intervals
 
         axes = axes_of(ax, 7.0, 1.2 + 0.4 * max(len(self.estimates), 1))
-        lines = {n: {"value": e.value, "ci95": e.ci95, "scale": abs(e.value)} for n, e in self.estimates.items()}
-        draw_intervals(axes, lines)
+        draw_intervals(axes, self.estimates)
         return axes
 
     def to_dataframe(self) -> Any:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.errors import HvdcIdentError, ModelError
 from hvdc_ident.fmu.archive import check_archive
 from hvdc_ident.fmu.description import (
@@ -56,16 +57,16 @@ LEARNED = {
 
 
 @dataclass(frozen=True)
-class Capabilities:
+class Capabilities(Coded):
     """An FMU as it describes itself, and as test runs show it.
 
-    interfaces: values of OFFERS by the kinds of interface that it has. platforms: libraries by folder. problem: why it
+    file: its name. interfaces: values of OFFERS by the kinds of interface that it has. platforms: libraries by folder. problem: why it
     cannot be used on this machine, "" where it can. experiment: start, stop, tolerance and step of its default, where
     given. groups: variables by GROUPS; sizes: their numbers. arrays: sizes of variables that are arrays. unused:
     variables that are no numbers. found: results of test runs, in words by subject.
     """
 
-    path: Path
+    file: str
     name: str
     fmi: str
     tool: str
@@ -78,11 +79,12 @@ class Capabilities:
     experiment: FrozenMap[float]
     indicators: int
     log_categories: tuple[str, ...]
-    groups: FrozenMap[FrozenMap[Variable]]
+    groups: FrozenMap[FrozenMap[Variable]] = field(metadata=stored_as("variables"))
     sizes: FrozenMap[int]
     arrays: FrozenMap[str] = field(default_factory=FrozenMap)
     unused: tuple[str, ...] = ()
     found: FrozenMap[str] = field(default_factory=FrozenMap)
+    schema: int = 1
 
     def matching(self, text: str) -> Capabilities:
         """Return a copy with only the variables that have the text in name, unit or description, in any case."""
@@ -100,18 +102,6 @@ class Capabilities:
             unused=tuple(n for n in self.unused if part in n.casefold()),
         )
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return everything, all variables included, in the form of JSON."""
-        plain = {k: v for k, v in self.__dict__.items() if k not in ("path", "interfaces", "groups", "platforms")}
-        return {
-            "schema": 1,
-            "file": self.path.name,
-            **{k: dict(v) if isinstance(v, FrozenMap) else v for k, v in plain.items()},
-            "interfaces": {k: dict(v) for k, v in self.interfaces.items()},
-            "platforms": {k: list(v) for k, v in self.platforms.items()},
-            "variables": {g: {n: _plain(v) for n, v in vs.items()} for g, vs in self.groups.items()},
-        }
-
     def text(self, rows: int | None = ROWS_SHOWN) -> str:
         """Return it as text. rows: of each group that are shown, None for all."""
         return "\n".join([*self._heading(), *self._abilities(), *self._listed(rows)])
@@ -124,7 +114,7 @@ class Capabilities:
         libraries = [f"{p}{'' if files else ' (empty)'}" for p, files in self.platforms.items()]
         sizes = ", ".join(f"{n} {'other variables' if g == 'others' else g}" for g, n in self.sizes.items())
         lines = [
-            f"{self.path.name}: model {self.name}, FMI {self.fmi}{made}{f', {self.date}' if self.date else ''}",
+            f"{self.file}: model {self.name}, FMI {self.fmi}{made}{f', {self.date}' if self.date else ''}",
             *([f"  {self.description}"] if self.description else []),
             f"  offers {', '.join(self.interfaces) or 'neither model exchange nor co-simulation'}; binaries: "
             f"{', '.join(libraries) or 'none'}{'; C sources' if self.sources else ''}",
@@ -179,11 +169,6 @@ def _cells(v: Variable) -> tuple[str, ...]:
     return v.name, v.causality, v.variability, v.unit, start, bounds, " ".join(f"{v.description}{also}".split())
 
 
-def _plain(v: Variable) -> dict[str, Any]:
-    finite = {k: x if np.isfinite(x) else None for k, x in (("min", v.min), ("max", v.max))}
-    return {k: x for k, x in {**asdict(v), **finite, "also": list(v.also)}.items() if k not in ("name", "reference")}
-
-
 def read_capabilities(path: str | Path) -> Capabilities:
     """Return an FMU's capabilities as it describes them, without running it. Raises ModelError for no FMU of FMI 2.0 or 3.0."""
     file = Path(path)
@@ -200,7 +185,7 @@ def read_capabilities(path: str | Path) -> Capabilities:
     default = {"start": "startTime", "stop": "stopTime", "tolerance": "tolerance", "step": "stepSize"}
     stated = {words: getattr(given.defaultExperiment, attribute, None) for words, attribute in default.items()}
     return Capabilities(
-        path=file,
+        file=file.name,
         name=given.modelName or file.stem,
         fmi=str(given.fmiVersion),
         tool=given.generationTool or "",

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Experiment
-from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
+from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
@@ -44,7 +44,7 @@ from hvdc_ident.identifiability.structural import StructuralAnalysis, structural
 from hvdc_ident.identifiability.verdicts import WIDE, scale_of, unjudged_verdict, with_misfit_remark
 from hvdc_ident.immutable import FrozenMap, joined
 from hvdc_ident.model import Model
-from hvdc_ident.sensitivity import LocalSensitivities, collinear_subsets, sensitivities
+from hvdc_ident.sensitivity import collinear_subsets
 from hvdc_ident.simulate import ModelSimulator
 
 
@@ -204,7 +204,6 @@ def _assembled(
             dict(result.noise_source),
         ),
         notes=(*assessment.notes, CONDITIONS),
-        sensitivities=_sensitivities(assessment, whole),
         not_judged=unjudged,
         optima=assessment.optima,
     )
@@ -241,30 +240,6 @@ def _whole(assessment: Assessment, at: LocalAnalysis) -> LocalAnalysis:
     theta = [values[n] for n in assessment.free]
     theta += [v for u, v in zip(at.problem.names, at.theta, strict=True) if u not in assessment.free]
     return LocalAnalysis(replace(assessment.problem, weights=at.problem.weights), np.array(theta, dtype=float))
-
-
-def _sensitivities(assessment: Assessment, whole: LocalAnalysis) -> LocalSensitivities | None:
-    """Return the exact sensitivities of a model with equations, at the values found or held, between what moves and what is seen."""
-    subject = assessment.problem.simulator
-    subject = subject.simulator if isinstance(subject, WithResponses) else subject
-    if not isinstance(subject, ModelSimulator) or not isinstance(subject.model, Model):
-        return None
-    experiments = in_time(assessment.problem.fitted_experiments)
-    if not experiments:
-        return None
-    moved = [n for n in subject.model.inputs if any(n in e.inputs and not e.inputs[n].is_constant for e in experiments)]
-    try:
-        return sensitivities(
-            subject.model,
-            experiments,
-            whole.names,
-            values=whole.problem.values(whole.theta),
-            inputs=moved or None,
-            ranges={n: f.drawn for n, f in assessment.free.items() if not f.min > 0},
-        )
-    except (SimulationError, SteadyStateError) as error:
-        assessment.notes.append(f"No table of sensitivities: {error}.")
-        return None
 
 
 def _recommended(assessment: Assessment, whole: LocalAnalysis, *, misfit: bool) -> Recommendation | str:
@@ -338,5 +313,4 @@ def _noted(report: IdentifiabilityReport, part: Problem) -> IdentifiabilityRepor
         notes=(first, *(f"{mine}: {n}" for n in report.notes if n != CONDITIONS)),
         misspecification=replace(report.misspecification, signs=signs),
         pilot=Pilot(groups=(replace(report.pilot, parameters=tuple(report.parameters)),)),
-        sensitivities=None,  # of a model that the groups share
     )

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
+from hvdc_ident.codec import INLINE, NOT_STORED, Coded, stored_as
 from hvdc_ident.data import Array, Experiment, InputSignal
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.frequency_data import in_time
@@ -45,19 +46,20 @@ LISTED = 8
 
 
 @dataclass(frozen=True)
-class Move:
+class Move(Coded):
     """Move of one input. before, after: in its unit (of a multisine the middle and the highest value); at: s;
     seconds: duration of a ramp, or a multisine's slowest period."""
 
     input: str
     shape: Shape
-    before: float
-    after: float
+    before: float = field(metadata=stored_as("from"))
+    after: float = field(metadata=stored_as("to"))
     at: float
     seconds: float = 0.0
+    stored_properties: ClassVar[tuple[str, ...]] = ("frequencies_hz",)
 
     @property
-    def frequencies(self) -> tuple[float, ...]:
+    def frequencies_hz(self) -> tuple[float, ...]:
         """Frequencies of a multisine, Hz; empty for the others."""
         return tuple(k / self.seconds for k in HARMONICS) if self.shape == "multisine" else ()
 
@@ -75,25 +77,11 @@ class Move:
         """The move in words, to begin a sentence with."""
         unit = f" {units[self.input]}" if units.get(self.input) else ""
         if self.shape == "multisine":
-            hertz = ", ".join(f"{f:.3g}" for f in self.frequencies)
+            hertz = ", ".join(f"{f:.3g}" for f in self.frequencies_hz)
             size = abs(self.after - self.before)
             return f"superimpose on {self.input} ({self.before:g}{unit}) sines of {hertz} Hz together, peak {size:.4g}{unit}"
         span = f"{self.input} from {self.before:g} to {self.after:g}{unit}"
         return f"step {span}" if self.shape == "step" else f"ramp {span} in {self.seconds:.3g} s"
-
-    def to_dict(self) -> dict[str, Any]:
-        """The move as JSON takes it."""
-        more: dict[str, Any] = {"seconds": self.seconds} if self.shape == "ramp" else {}
-        if self.shape == "multisine":
-            more = {"frequencies_hz": list(self.frequencies)}
-        return {"input": self.input, "shape": self.shape, "from": self.before, "to": self.after, "at": self.at, **more}
-
-    @classmethod
-    def of(cls, told: Mapping[str, Any]) -> Move:
-        """Return the move that `to_dict` told."""
-        slowest = min(told.get("frequencies_hz") or (), default=None)
-        seconds = float(told.get("seconds", 0.0)) if slowest is None else HARMONICS[0] / slowest
-        return cls(told["input"], told["shape"], told["from"], told["to"], told["at"], seconds)
 
 
 def _multisine(phase: Array) -> Array:
@@ -109,6 +97,7 @@ class ExperimentDesign:
     """One experiment that could be made; of two moves the second comes when the first has had half of the time."""
 
     moves: tuple[Move, ...]
+    stored_properties: ClassVar[tuple[str, ...]] = ("kind",)
 
     @property
     def kind(self) -> str:
@@ -230,11 +219,11 @@ class RankedDesign:
     interval that the advice is on, None where it stays open.
     """
 
-    design: ExperimentDesign
+    design: ExperimentDesign = field(metadata=INLINE)
     record: tuple[str, ...]
-    new: tuple[str, ...]
+    new: tuple[str, ...] = field(metadata=stored_as("new_signals"))
     criteria: OptimalityCriteria
-    gain: Array
+    gain: Array = field(default_factory=lambda: np.zeros((0, 0)), metadata=NOT_STORED)
     half_width: float | None = None
 
     @property
@@ -245,7 +234,7 @@ class RankedDesign:
 
 
 @dataclass(frozen=True, eq=False)
-class Recommendation:
+class Recommendation(Coded):
     """The experiment that narrows the widest interval most, of those tried.
 
     best: the experiment. aim: the parameter whose interval it narrows, the widest that any narrows. by_determinant: the
@@ -257,60 +246,36 @@ class Recommendation:
     the half-widths then hold only if nothing else is missing, and no interval of 95 % is predicted.
     """
 
-    best: RankedDesign
+    best: RankedDesign = field(metadata=INLINE)
     aim: str
-    by_determinant: RankedDesign
+    by_determinant: RankedDesign = field(metadata=stored_as("d_optimal"))
     now: OptimalityCriteria
-    half_widths_now: FrozenMap[float | None]
-    half_widths: FrozenMap[float | None]
+    half_widths_now: FrozenMap[float | None] = field(metadata=stored_as("half_width_now"))
+    half_widths: FrozenMap[float | None] = field(metadata=stored_as("predicted_half_width"))
     values: FrozenMap[float]
     others: tuple[RankedDesign, ...]
     tried: int
     failed: tuple[str, ...]
     text: str
     misfit: bool = False
+    stored_properties: ClassVar[tuple[str, ...]] = ("input", "predicted_ci95")
 
     @property
     def input(self) -> str:
         """The input that moves first."""
         return self.best.design.moves[0].input
 
-    def to_dict(self) -> dict[str, Any]:
-        """The recommendation as JSON takes it."""
-        first = self.best.design.moves[0]
-        intervals = {
-            n: None if h is None or self.misfit else [self.values[n] - h, self.values[n] + h]
-            for n, h in self.half_widths.items()
-        }
+    @property
+    def predicted_ci95(self) -> dict[str, tuple[float, float] | None]:
+        """The 95 % intervals with the experiment added; None where one stays open, or the model leaves more than noise."""
         return {
-            "input": first.input,
-            "from": first.before,
-            "to": first.after,
-            **self._line(self.best),
-            "aim": self.aim,
-            "criterion": "the widest interval, beside its parameter's scale, is made the narrowest",
-            "predicted_half_width": dict(self.half_widths),
-            "predicted_ci95": intervals,
-            "half_width_now": dict(self.half_widths_now),
-            "text": self.text,
-            "d_optimal": self._line(self.by_determinant),
-            "others": [self._line(r) for r in self.others],
-            "tried": self.tried,
-            "failed": list(self.failed),
+            n: None if half is None or self.misfit else (self.values[n] - half, self.values[n] + half)
+            for n, half in self.half_widths.items()
         }
 
-    def _line(self, r: RankedDesign) -> dict[str, Any]:
-        gain = r.criteria.log_determinant - self.now.log_determinant
-        return {
-            "kind": r.design.kind,
-            "moves": [m.to_dict() for m in r.design.moves],
-            "record": list(r.record),
-            "new_signals": list(r.new),
-            "half_width": r.half_width,
-            "smallest_eigenvalue": {"now": self.now.smallest_eigenvalue, "then": r.criteria.smallest_eigenvalue},
-            "directions_seen": {"now": self.now.directions, "then": r.criteria.directions},
-            "determinant_gain": gain if r.criteria.directions == self.now.directions else None,
-        }
+    def determinant_gain(self, r: RankedDesign) -> float | None:
+        """Return by how much an experiment raises the logarithm of the determinant; None where it shows more directions."""
+        return r.criteria.log_determinant - self.now.log_determinant if r.criteria.directions == self.now.directions else None
 
 
 def recommend(

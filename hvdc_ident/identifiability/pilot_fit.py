@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
+from hvdc_ident.codec import NOT_STORED, Coded
 from hvdc_ident.data import Array
 from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.executor import Executor, Progress
@@ -224,22 +225,29 @@ def _failure(problem: Problem, message: str) -> SimulationError:
 
 
 @dataclass(frozen=True)
-class CramerRaoBounds:
+class CramerRaoBound:
+    """Bound of one parameter, in its unit, at a value. std: beside the others, None where it is held, for these records do not tell it
+    apart from others there, or not at all. conditional_on: for a member of a combination the members that are held."""
+
+    value: float
+    std: float | None
+    unit: str
+    conditional_on: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class CramerRaoBounds(Coded):
     """Cramer and Rao's bounds at the given values: valid as far as the model is linear.
 
-    values: where it was made. std: of each parameter in its unit beside the others, None where it is held, for these records do
-    not tell it apart from others there, or not at all. combinations: in words, what alone is seen of some. conditional_on: for
-    a member of one the members that are held. chi2_per_dof: of the misfit at the given values; None where no noise is
-    known. seconds: what one evaluation with derivatives took.
+    parameters: by name. combinations: in words, what alone is seen of some. chi2_per_dof: of the misfit at the given values; None where
+    no noise is known. seconds: what one evaluation with derivatives took.
     """
 
-    values: FrozenMap[float]
-    units: FrozenMap[str]
-    std: FrozenMap[float | None]
+    parameters: FrozenMap[CramerRaoBound]
     combinations: tuple[str, ...]
-    conditional_on: FrozenMap[tuple[str, ...]]
     chi2_per_dof: float | None
-    seconds: float
+    seconds: float = field(default=0.0, metadata=NOT_STORED)
+    at: Literal["given"] = "given"
 
     @property
     def lines(self) -> list[str]:
@@ -247,36 +255,18 @@ class CramerRaoBounds:
         found = ["First answer, from the curvature at the given values; the search for the optimum follows."]
         if self.chi2_per_dof is not None:
             found.append(f"Misfit of the given values: chi2/dof {self.chi2_per_dof:.3g}.")
-        width = max(map(len, self.values), default=0)
-        for name, value in self.values.items():
-            std, unit = self.std[name], self.units[name]
-            at = f"{name:{width}}  {quantity(value, unit)}"
-            if std is None:
+        width = max(map(len, self.parameters), default=0)
+        for name, p in self.parameters.items():
+            at = f"{name:{width}}  {quantity(p.value, p.unit)}"
+            if p.std is None:
                 found.append(f"{at}: not determined there, held")
             else:
-                share = f" ({100.0 * HALF_95 * std / abs(value):.2g} %)" if value else ""
-                held = f" with {listed(self.conditional_on[name])} held" if name in self.conditional_on else ""
+                share = f" ({100.0 * HALF_95 * p.std / abs(p.value):.2g} %)" if p.value else ""
+                held = f" with {listed(p.conditional_on)} held" if p.conditional_on else ""
                 found.append(
-                    f"{at}: expected 95 % confidence interval \u00b1{quantity(HALF_95 * std, unit, 2)}{share}{held}"
+                    f"{at}: expected 95 % confidence interval \u00b1{quantity(HALF_95 * p.std, p.unit, 2)}{share}{held}"
                 )
         return [*found, *(f"{words[:1].upper()}{words[1:]}." for words in self.combinations)]
-
-    def to_dict(self) -> dict[str, Any]:
-        """The answer as it stands in the JSON under `first`."""
-        return {
-            "at": "given",
-            "chi2_per_dof": self.chi2_per_dof,
-            "parameters": {
-                n: {
-                    "value": v,
-                    "std": self.std[n],
-                    "unit": self.units[n],
-                    "conditional_on": list(self.conditional_on.get(n, ())),
-                }
-                for n, v in self.values.items()
-            },
-            "combinations": list(self.combinations),
-        }
 
 
 def cramer_rao_bounds(problem: Problem) -> CramerRaoBounds:
@@ -305,12 +295,5 @@ def cramer_rao_bounds(problem: Problem) -> CramerRaoBounds:
     }
     known = not any(from_misfit(s) for s in result.noise_source.values())
     units = {n: problem.simulator.parameters[n].unit for n in names}
-    return CramerRaoBounds(
-        FrozenMap({n: at.value(n) for n in names}),
-        FrozenMap(units),
-        FrozenMap(std),
-        tuple(c.words for c in combos),
-        FrozenMap(conditional),
-        at.misfit if known else None,
-        seconds,
-    )
+    bounds = {n: CramerRaoBound(at.value(n), std[n], units[n], conditional.get(n, ())) for n in names}
+    return CramerRaoBounds(FrozenMap(bounds), tuple(c.words for c in combos), at.misfit if known else None, seconds)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from hvdc_ident.codec import NOT_STORED, WRITTEN_ONLY, Coded, plain, stored_as
+from hvdc_ident.codec import NOT_STORED, Coded, stored_as
 from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.fit import StartOutcome
@@ -21,7 +21,7 @@ from hvdc_ident.identifiability.structural import StructuralAnalysis
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.next_step import NextStep, next_sentence
-from hvdc_ident.sensitivity import Collinear, Combination, LocalSensitivities
+from hvdc_ident.sensitivity import Collinear, Combination
 from hvdc_ident.text import interval_text
 
 CONDITIONS = (
@@ -86,8 +86,6 @@ class IdentifiabilityReport(Coded, Shown):
     each size. experiments: what each contributes. profiles: of those that have one; pilot: the fit at whose optimum all stands.
     pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
     search met. recommended: what to measure next; not_recommended: why nothing is.
-    sensitivities: exact ones of trajectories, steady state, eigenvalues and responses at the values found or held; None where
-    the model has no equations here.
     """
 
     parameters: FrozenMap[Verdict] = field(default_factory=FrozenMap)
@@ -101,11 +99,10 @@ class IdentifiabilityReport(Coded, Shown):
     structure: StructuralAnalysis = field(default_factory=StructuralAnalysis, metadata=stored_as("structural"))
     misspecification: Misspecification = field(default_factory=Misspecification)
     experiments: FrozenMap[Contribution] = field(default_factory=FrozenMap)
-    recommended: Recommendation | None = field(default=None, metadata=WRITTEN_ONLY | stored_as("recommended_experiment"))
+    recommended: Recommendation | None = field(default=None, metadata=stored_as("recommended_experiment"))
     not_recommended: str = ""
     profiles: FrozenMap[Profile] = field(default_factory=FrozenMap)
     pair: PairProfile | None = None
-    sensitivities: LocalSensitivities | None = field(default=None, metadata=WRITTEN_ONLY)
     pilot: Pilot = field(default_factory=Pilot)
     notes: tuple[str, ...] = ()
     thresholds: FrozenMap[float] = field(default_factory=FrozenMap, metadata=NOT_STORED)
@@ -142,9 +139,9 @@ class IdentifiabilityReport(Coded, Shown):
             raise ComputationError(f"{parameter} has no profile", got=reason, hint="plot() shows every verdict")
         axes = ax if ax is not None else plt.subplots(layout="constrained")[1]
         if parameter is None:
-            draw_intervals(axes, plain(self.parameters))
+            draw_intervals(axes, self.parameters)
         else:
-            draw_profile(axes, parameter, plain(self.profiles[parameter]), plain(self.parameters[parameter]))
+            draw_profile(axes, self.profiles[parameter], self.parameters[parameter])
         return axes
 
     def _screen(self) -> Iterator[str | Table]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
@@ -32,21 +32,18 @@ LARGEST = 512
 
 
 @dataclass(frozen=True)
-class NuGap:
+class NuGap(Coded):
     """The nu-gap between two models: value in [0, 1], where the largest chordal distance is, and the winding condition.
 
     winding: the count that must be 0; where it is not, no controller that suits one model is sure to suit the other
     and the value is 1. distance: the largest chordal distance between the frequency responses.
     """
 
-    value: float
+    value: float = field(metadata=stored_as("nu_gap"))
     omega: float
     winding: int
-    distance: float
+    distance: float = field(metadata=stored_as("chordal_distance"))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the gap as plain numbers."""
-        return {"nu_gap": self.value, "omega": self.omega, "winding": self.winding, "chordal_distance": self.distance}
 
 
 def same_channels(first: LinearModel, second: LinearModel) -> None:
@@ -339,7 +336,7 @@ def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:
 
 
 @dataclass(frozen=True)
-class ModelDistance:
+class ModelDistance(Coded):
     """Distance of a second model from a first one, between the same inputs and outputs.
 
     nu_gap: in [0, 1], with its winding condition. gap: in [0, 1], None where it was not found. attainable: the largest
@@ -348,27 +345,14 @@ class ModelDistance:
     infinite. relative: that over the norm of the first, None where there is none. notes: why a number is missing.
     """
 
-    first: str
-    second: str
-    nu_gap: NuGap
+    first: str = field(metadata=stored_as("model"))
+    second: str = field(metadata=stored_as("other"))
+    nu_gap: NuGap = field(metadata=INLINE)
     gap: float | None
-    attainable: float | None
+    attainable: float | None = field(metadata=stored_as("attainable_margin"))
     difference: Peak | None
-    relative: float | None
+    relative: float | None = field(metadata=stored_as("relative_difference"))
     notes: tuple[str, ...] = ()
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the comparison as plain numbers."""
-        return {
-            "model": self.first,
-            "other": self.second,
-            **self.nu_gap.to_dict(),
-            "gap": self.gap,
-            "attainable_margin": self.attainable,
-            "difference": None if self.difference is None else self.difference.to_dict(),
-            "relative_difference": self.relative,
-            "notes": list(self.notes),
-        }
 
     def __str__(self) -> str:
         far = self.nu_gap

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import sympy as sp
 from numpy.typing import NDArray
 
+from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.expression import symbol, to_text
 from hvdc_ident.simulate import ModelEquations
 
@@ -36,14 +37,14 @@ Note = Callable[..., None]
 
 
 @dataclass(frozen=True)
-class Limit:
+class Limit(Coded):
     """A limit at a point. margin: from the expression to the level, in the signal's unit, negative when past it.
 
     active: whether the limiter holds the signal, so that small changes do not pass.
     """
 
     signal: str
-    kind: str
+    kind: str = field(metadata=stored_as("limit"))
     expression: str
     level: str
     margin: float
@@ -55,15 +56,6 @@ class Limit:
         side = {"lower": "at least", "upper": "at most", "branch": "against"}[self.kind]
         return f"{self.signal}: {self.expression} {side} {self.level}, margin {self.margin:.6g}"
 
-    def to_dict(self) -> dict[str, object]:
-        """Return the limit as plain text and numbers."""
-        return {
-            "signal": self.signal,
-            "limit": self.kind,
-            "expression": self.expression,
-            "level": self.level,
-            "margin": self.margin,
-        }
 
 
 def conditions(structure: ModelEquations) -> tuple[Condition, ...]:

@@ -7,13 +7,15 @@ parameter, followed by their eigenvectors, and the values at which stability cha
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.linalg
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.delayed_locus import crossings, followed
@@ -33,7 +35,7 @@ ON_AXIS = (1e-9, 1e-6)
 
 
 @dataclass(frozen=True, eq=False)
-class Mode:
+class Mode(Coded):
     """One eigenvalue in rad/s, with damping, participation, shape and kind.
 
     frequency_hz: of the oscillation, 0 for a real one. damping: -Re/|lambda|, 0 for a zero eigenvalue.
@@ -61,17 +63,6 @@ class Mode:
         """The state that takes part most."""
         return max(self.participation, key=lambda n: self.participation[n])
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the mode as plain numbers."""
-        pair = {n: [v.real, v.imag] for n, v in self.sensitivity.items()}
-        return {
-            "eigenvalue": [self.eigenvalue.real, self.eigenvalue.imag],
-            "frequency_hz": self.frequency_hz,
-            "damping": self.damping,
-            "participation": dict(self.participation),
-            "kind": self.kind,
-            **({"sensitivity": pair} if pair else {}),
-        }
 
 
 def poles(model: LinearModel) -> Array:
@@ -286,7 +277,7 @@ class StabilityLimit:
 
 
 @dataclass(frozen=True, eq=False)
-class RootLocus:
+class RootLocus(Coded):
     """Eigenvalues (points, modes) in rad/s along values of a parameter; column k is one mode throughout.
 
     limits: where stability is lost or won between the values. With delays, the columns are the rightmost roots of the exact
@@ -296,9 +287,9 @@ class RootLocus:
     parameter: str
     unit: str
     values: Array
-    eigenvalues: Array
+    eigenvalues: NDArray[np.complex128]
     limits: tuple[StabilityLimit, ...]
-    unstable: tuple[float | None, ...] | None = None
+    unstable: tuple[float | None, ...] | None = field(default=None, metadata=stored_as("unstable_roots", optional=True))
 
     @property
     def stable(self) -> Array:
@@ -313,21 +304,6 @@ class RootLocus:
 
         return locus(self, ax=ax)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the locus as plain lists, complex numbers as [re, im]."""
-        pairs = np.stack([self.eigenvalues.real, self.eigenvalues.imag], axis=-1).tolist()
-        limits = [
-            {"value": x.value, "eigenvalue": [x.eigenvalue.real, x.eigenvalue.imag], "direction": x.direction}
-            for x in self.limits
-        ]
-        return {
-            "parameter": self.parameter,
-            "unit": self.unit,
-            "values": self.values.tolist(),
-            "eigenvalues": pairs,
-            "limits": limits,
-            **({} if self.unstable is None else {"unstable_roots": list(self.unstable)}),
-        }
 
 
 def root_locus(

@@ -14,6 +14,7 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize_scalar
 
+from hvdc_ident.codec import Coded
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import default_omega, transfer
 from hvdc_ident.linearize.linear_model import LinearModel
@@ -288,15 +289,12 @@ def _residualised(a: Array, b: Array, c: Array, d: Array, count: int) -> tuple[A
 
 
 @dataclass(frozen=True)
-class Peak:
+class Peak(Coded):
     """The largest singular value over all frequencies and where it is, rad/s (0 and infinity are places)."""
 
     value: float
     omega: float
 
-    def to_dict(self) -> dict[str, float]:
-        """Return the peak as plain numbers."""
-        return {"value": self.value, "omega": self.omega}
 
 
 def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:

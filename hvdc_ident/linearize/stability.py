@@ -7,14 +7,14 @@ The equation falls into parts that act on one another only one way. Of each part
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import scipy.linalg
 from scipy.sparse.csgraph import connected_components
 
+from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.linearize.characteristic import NEUTRAL, Part, Undecided, spectral_radius
 from hvdc_ident.linearize.delays import Channel, DelayFreePart
 from hvdc_ident.linearize.sampling import multipliers
@@ -327,7 +327,7 @@ def _neutral(part: Part, direct: float) -> Roots:
 
 
 @dataclass(frozen=True, eq=False)
-class Stability:
+class Stability(Coded):
     """The verdict on a model's stability: without delays by its eigenvalues, with delays by its characteristic equation.
 
     verdict: "stable", "on the limit of stability", "unstable" or "not decided". unstable: roots right of the axis, None
@@ -336,7 +336,7 @@ class Stability:
     """
 
     verdict: str
-    unstable: float | None
+    unstable: float | None = field(metadata=stored_as("unstable_roots"))
     rightmost: complex | None
     reason: str = ""
     method: str = EIGENVALUES
@@ -351,15 +351,6 @@ class Stability:
         number = f"{self.unstable:.0f} root{'' if self.unstable == 1 else 's'} right of the imaginary axis"
         return f"at least {number}" if self.reason else number
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the verdict as plain text and numbers; the number of roots is infinite where that is so."""
-        return {
-            "verdict": self.verdict,
-            "unstable_roots": self.unstable,
-            "rightmost": [] if self.rightmost is None else [self.rightmost.real, self.rightmost.imag],
-            "method": self.method,
-            "reason": self.reason,
-        }
 
 
 def stability(equation: Characteristic) -> Stability:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 import sympy as sp
+from numpy.typing import NDArray
 
+from hvdc_ident.codec import Coded
 from hvdc_ident.errors import LinearizationError, require_known, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.linearize.loops import signal_values
@@ -300,13 +302,13 @@ def _deflate(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Arra
 
 
 @dataclass(frozen=True, eq=False)
-class TransferFunction:
+class TransferFunction(Coded):
     """gain * prod(s - zeros) / prod(s - poles), s in rad/s; cancelled: (pole, zero) pairs that were left out."""
 
     input: str
     output: str
-    zeros: Array
-    poles: Array
+    zeros: NDArray[np.complex128]
+    poles: NDArray[np.complex128]
     gain: float
     cancelled: tuple[tuple[complex, complex], ...] = ()
 
@@ -323,20 +325,6 @@ class TransferFunction:
             return float("inf")
         return float(self(0.0).real)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the transfer function as plain numbers, complex ones as [re, im]."""
-
-        def pairs(values: Array) -> list[list[float]]:
-            return [[float(v.real), float(v.imag)] for v in values]
-
-        return {
-            "input": self.input,
-            "output": self.output,
-            "zeros": pairs(self.zeros),
-            "poles": pairs(self.poles),
-            "gain": self.gain,
-            "cancelled": [[[p.real, p.imag], [z.real, z.imag]] for p, z in self.cancelled],
-        }
 
 
 def transfer_function(model: LinearModel, input: str, output: str) -> TransferFunction:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from hvdc_ident.fit.uncertainty import MOVED
-from hvdc_ident.next_step import TO_DO, Door, next_sentence
+from hvdc_ident.next_step import Door, NextStep, next_phrase, next_sentence
 from hvdc_ident.report.html import badge, estimate, number, prose, table, table_of, text, typeset
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
@@ -139,7 +139,7 @@ def _values(s: RunSummary, door: Door) -> tuple[str, str]:
     header = ["parameter, unit", "given", "value", name, "change", ""]
     if not any(p.interval for p in s.parameters):  # none is given where the model lacks something
         header, rows = [header[k] for k in (0, 1, 2, 4, 5)], [[row[k] for k in (0, 1, 2, 4, 5)] for row in rows]
-    not_fitted = prose(f"Not fitted: {TO_DO['fit'][door]} estimates them.")
+    not_fitted = prose(f"Not fitted: {next_phrase(NextStep('fit'), door)}.")
     which = " ".join(t for t in (text(which_values(s)) or not_fitted, text(condition(s))) if t)
     placed = [p for p in s.parameters if p.by_place]
     depend = "".join(f"<p>{text(p.name)} depends on the place: it is {text(by_place(p))}.</p>" for p in placed)
@@ -219,9 +219,10 @@ def _undiagnosed(s: RunSummary, door: Door) -> str:
         return "Not asked: a diagnosis needs parameters that may be fitted, in <code>[parameters]</code>."
     if s.verdict == "pass" and s.judged is not None and s.judged.on_noise.verdict:
         return "No sign of anything: what is left is noise."
-    return prose(
-        f"Not asked{' yet' if s.verdict == 'fail' else ''}. {capital(TO_DO['diagnose'][door])} looks for what is missing."
-    )
+    asked = f"Not asked{' yet' if s.verdict == 'fail' else ''}."
+    if any(step.kind == "diagnose" for step in s.next) and not advice(s):  # the tile on what to do next says how
+        return asked
+    return prose(f"{asked} {capital(next_phrase(NextStep('diagnose'), door))}.")
 
 
 def _next(s: RunSummary, door: Door) -> str:
@@ -235,5 +236,5 @@ def _next(s: RunSummary, door: Door) -> str:
     elif s.counting.name == "effect":
         why = "No recording is advised."
     else:
-        why = s.unadvised or ("" if s.next else f"No advice yet: {TO_DO['identify'][door]} says which recording would tell more.")
+        why = s.unadvised or ("" if s.next else f"No advice yet: {next_phrase(NextStep('identify'), door)}.")
     return prose(" ".join([why, *(next_sentence(step, door) for step in s.next)]).strip())

@@ -14,6 +14,7 @@ from pathlib import Path
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
 from hvdc_ident.fit.uncertainty import MOVED
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.report.html import badge, table_of, text
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
@@ -97,7 +98,7 @@ def letter_of(results: Results) -> Letter:
             "there is no diagnosis to write a letter about",
             where=str(results.folder),
             expected=f"{STAGE}.json",
-            hint="hvdc-ident diagnose STUDY",
+            next=(NextStep("diagnose"),),
         )
     sentences = (_missed(s), _consistent(s), _values_judged(s), gained_sentence(s))
     return Letter(tuple(t for t in sentences if t), _request(s), _next(s), tuple(_attached(results)))
@@ -183,7 +184,9 @@ def _values(s: RunSummary) -> str:
     """The one table: each parameter given, fitted and with the effect; and what the values that count rest on."""
     if not s.parameters:
         return ""
-    return table_of(values_table(s)) + (f"<p>{text(told)}</p>" if (told := condition(s, "The values")) else "")
+    subject = "The fitted values" if s.counting.name == "fit" else "The values"
+    told = condition(s, subject)
+    return table_of(values_table(s)) + (f"<p>{text(told)}</p>" if told else "")
 
 
 def _figure(results: Results) -> str:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from hvdc_ident.codec import Coded
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, axes_of, library
 from hvdc_ident.errors import ComputationError, StudyError
@@ -20,67 +21,87 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.sensitivity.local_sensitivities import bars
 from hvdc_ident.sensitivity.sweep_points import Samples
-from hvdc_ident.sensitivity.sweep_run import sweep
+from hvdc_ident.sensitivity.sweep_run import SweepResult, sweep
 
 if TYPE_CHECKING:
     import xarray
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ScreeningResult(Shown):
-    """Measures of a screening for the RMSE of each (output, experiment) of `series`.
+Measures = FrozenMap[FrozenMap[FrozenMap[FrozenMap[float]]]]
 
-    measures: (series, parameters) by name. Morris: mu_star, mu, sigma, mu_star_conf, in the output's unit over the
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ScreeningResult(Coded, Shown):
+    """Measures of a screening for the RMSE of each output in each experiment.
+
+    measures: by output, experiment, parameter and name. Morris: mu_star, mu, sigma, mu_star_conf, in the output's unit over the
     whole range. Sobol: S1, ST, S1_conf, ST_conf: shares of the variance. failed: points that failed; dropped: Morris
     trajectories left out because of them.
     """
 
-    method: str
-    parameters: tuple[str, ...]
-    series: tuple[tuple[str, str], ...]
-    measures: FrozenMap[Array]
+    method: Literal["morris", "sobol"]
     evaluations: int
-    failed: int = 0
-    dropped: int = 0
+    failed: int
+    dropped: int
+    measures: Measures
+
+    @property
+    def measure(self) -> str:
+        """The name of the measure of a parameter's whole effect."""
+        return "mu_star" if self.method == "morris" else "ST"
+
+    @property
+    def series(self) -> tuple[tuple[str, str], ...]:
+        """Every output with every experiment."""
+        return tuple((o, e) for o, line in self.measures.items() for e in line)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """The parameters that were screened."""
+        return tuple(next((p for line in self.measures.values() for p in line.values()), ()))
+
+    def of(self, output: str, experiment: str) -> FrozenMap[FrozenMap[float]]:
+        """Return the measures of one output in one experiment by parameter, the one that matters most first."""
+        found = self.measures[output][experiment]
+        return FrozenMap(sorted(found.items(), key=lambda line: -line[1][self.measure]))
+
+    def array(self, name: str) -> Array:
+        """Return one measure, (series, parameters)."""
+        return np.array([[line[name] for line in self.measures[o][e].values()] for o, e in self.series])
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        return MORRIS if self.method == "morris" else SOBOL
 
     def to_xarray(self) -> xarray.Dataset:
         """The measures over series ("OUTPUT.EXPERIMENT") and parameter."""
         import xarray
 
         axes = {"series": [f"{o}.{e}" for o, e in self.series], "parameter": list(self.parameters)}
-        data = {n: (tuple(axes), v) for n, v in self.measures.items()}
+        data = {n: (tuple(axes), self.array(n)) for n in self._names}
         return xarray.Dataset(data, coords=axes, attrs={"method": self.method})
-
-    def to_dict(self) -> dict[str, Any]:
-        """The measures by output, experiment, parameter and name as plain numbers."""
-        found: dict[str, dict[str, Any]] = {}
-        for i, (o, e) in enumerate(self.series):
-            found.setdefault(o, {})[e] = {
-                p: {n: float(v[i, k]) for n, v in self.measures.items()} for k, p in enumerate(self.parameters)
-            }
-        head = {"method": self.method, "evaluations": self.evaluations, "failed": self.failed, "dropped": self.dropped}
-        return {**head, "measures": found}
 
     def plot(self, ax: Any = None) -> Any:
         """Axes with a bar for every parameter and series: mu_star, or the total share of the variance."""
         axes = axes_of(ax)
-        name = "mu_star" if self.method == "morris" else "ST"
         labels = [f"{o} in {e}" for o, e in self.series]
-        heights, errors = (dict(zip(labels, self.measures[n], strict=True)) for n in (name, f"{name}_conf"))
+        heights, errors = (dict(zip(labels, self.array(n), strict=True)) for n in (self.measure, f"{self.measure}_conf"))
         bars(axes, self.parameters, heights, errors)
-        axes.set_ylabel(f"{name} of the RMSE")
+        axes.set_ylabel(f"{self.measure} of the RMSE")
         return axes
 
     def _screen(self) -> Iterator[str | Table]:
         yield f"Screening by the method of {self.method.capitalize()}: {self.evaluations} runs, {self.failed} failed"
         lines = (
-            (o, e, p, *(f"{v[i, k]:.4g}" for v in self.measures.values()))
-            for i, (o, e) in enumerate(self.series)
-            for k, p in enumerate(self.parameters)
+            (o, e, p, *(f"{m[n]:.4g}" for n in self._names))
+            for o, e in self.series
+            for p, m in self.measures[o][e].items()
         )
-        yield Table(("output", "experiment", "parameter", *self.measures), tuple(lines))
+        yield Table(("output", "experiment", "parameter", *self._names), tuple(lines))
 
 
+MORRIS = ("mu_star", "mu", "sigma", "mu_star_conf")
+SOBOL = ("S1", "ST", "S1_conf", "ST_conf")
 LEVELS = 4
 """Levels of Morris' grid."""
 
@@ -116,9 +137,8 @@ def morris(
     def effects(rmse: Array) -> Mapping[str, Any]:
         return analyse.analyze(problem, points.values[rows], rmse[rows], num_levels=LEVELS, seed=seed)
 
-    measures = _measures(("mu_star", "mu", "sigma", "mu_star_conf"), effects, swept.rmse)
-    failed, dropped = int((~good).sum()), int((~whole).sum())
-    return ScreeningResult("morris", tuple(ranges), swept.series, measures, len(points), failed, dropped)
+    measures = _measures(MORRIS, effects, swept, tuple(ranges))
+    return ScreeningResult("morris", len(points), int((~good).sum()), int((~whole).sum()), measures)
 
 
 def sobol(
@@ -155,8 +175,7 @@ def sobol(
     def indices(rmse: Array) -> Mapping[str, Any]:
         return analyse.analyze(problem, rmse, calc_second_order=False, seed=seed)
 
-    measures = _measures(("S1", "ST", "S1_conf", "ST_conf"), indices, swept.rmse)
-    return ScreeningResult("sobol", tuple(ranges), swept.series, measures, len(points))
+    return ScreeningResult("sobol", len(points), 0, 0, _measures(SOBOL, indices, swept, tuple(ranges)))
 
 
 def _problem(ranges: Mapping[str, tuple[float, float]], count: int) -> dict[str, Any]:
@@ -178,9 +197,16 @@ def _points(sample: Callable[..., Any], problem: Mapping[str, Any], count: int, 
         return Samples(tuple(problem["names"]), sample(problem, count, **options))
 
 
-def _measures(names: Sequence[str], analyse: Callable[[Array], Mapping[str, Any]], rmse: Array) -> FrozenMap[Array]:
-    """Return the measures of every series, (series, parameters) by name. rmse: (runs, series)."""
+def _measures(
+    names: Sequence[str], analyse: Callable[[Array], Mapping[str, Any]], swept: SweepResult, parameters: tuple[str, ...]
+) -> Measures:
+    """Return the measures of every series of a sweep, by output, experiment, parameter and name."""
+    found: dict[str, dict[str, FrozenMap[FrozenMap[float]]]] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        lines = [analyse(column) for column in rmse.T]
-    return FrozenMap({n: np.array([np.asarray(line[n], dtype=float) for line in lines]) for n in names})
+        for (output, experiment), column in zip(swept.series, swept.rmse.T, strict=True):
+            line = analyse(column)
+            rows = zip(*(np.asarray(line[n], dtype=float).tolist() for n in names), strict=True)
+            each = {p: FrozenMap(zip(names, row, strict=True)) for p, row in zip(parameters, rows, strict=True)}
+            found.setdefault(output, {})[experiment] = FrozenMap(each)
+    return FrozenMap({o: FrozenMap(line) for o, line in found.items()})

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.codec import Coded
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, axes_of
 from hvdc_ident.errors import LinearizationError, StudyError, require_known
@@ -77,7 +78,7 @@ def bars(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Sensitivities(Shown):
+class Sensitivities(Coded, Shown):
     """Derivatives of the outputs of some experiments by parameters.
 
     values: of the parameters. factors: what a derivative is multiplied by to be normalised, in the parameter's unit:
@@ -144,22 +145,6 @@ class Sensitivities(Shown):
         dims = tuple(axes)
         return xarray.Dataset({"rms": (dims, values[0]), "peak": (dims, values[1])}, coords=axes)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Values, factors, units, norms and notes as plain numbers; without the trajectories."""
-        return {
-            "model": self.model,
-            "parameters": {
-                p: {"value": self.values[p], "factor": self.factors[p], "unit": u}
-                for p, u in zip(self.parameters, self.parameter_units, strict=True)
-            },
-            "output_units": {o: r.trajectory.unit(o) for r in self.runs.values() for o in r.trajectory.names},
-            "norms": {
-                e: {o: {p: {"rms": r, "peak": k} for p, (r, k) in line.items()} for o, line in lines.items()}
-                for e, lines in self.table.items()
-            },
-            "notes": dict(self.notes),
-        }
-
     def plot(self, experiment: str | None = None, output: str | None = None, ax: Any = None) -> Any:
         """Axes with one output's normalised derivatives in one experiment (default: the first), a curve a parameter."""
         name = next(iter(self.runs)) if experiment is None else experiment
@@ -219,7 +204,7 @@ def trajectory_sensitivities(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SteadySensitivities(Shown):
+class SteadySensitivities(Coded, Shown):
     """Derivatives of a steady state by parameters: state_values by name; gradients (outputs, parameters) in units."""
 
     model: str
@@ -233,14 +218,6 @@ class SteadySensitivities(Shown):
         """The derivatives with labelled axes output, parameter; in units, or times the parameters' factors."""
         values = self.gradients * np.array([self.factors[p] for p in self.parameters]) if normalised else self.gradients
         return _labelled(values, "steady sensitivity", output=list(self.outputs), parameter=list(self.parameters))
-
-    def to_dict(self) -> dict[str, Any]:
-        """The steady values and derivatives, in units, as plain numbers."""
-        lines = {
-            o: dict(zip(self.parameters, row, strict=True))
-            for o, row in zip(self.outputs, self.gradients.tolist(), strict=True)
-        }
-        return {"model": self.model, "steady": dict(self.steady), "factors": dict(self.factors), "sensitivities": lines}
 
     def plot(self, ax: Any = None) -> Any:
         """Axes with a bar for every output and parameter: the derivative times the parameter's factor."""
@@ -281,7 +258,7 @@ def steady_sensitivities(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LinearSensitivities(Shown):
+class LinearSensitivities(Coded, Shown):
     """Derivatives of a linear model by k parameters, the shift of its operating point included.
 
     factors: what a derivative is multiplied by to be normalised, in the parameter's unit. eigenvalues: (m,) rad/s;
@@ -331,30 +308,6 @@ class LinearSensitivities(Shown):
         places = self.outputs.index(output), self.inputs.index(input), self.parameters.index(parameter)
         found = self.response_gradients[(slice(None), *places)]
         return np.asarray(found * self.factors[parameter] if normalised else found)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Eigenvalues with their derivatives, and of each channel the largest normalised derivative and where it is."""
-        rows = zip(self.eigenvalues.tolist(), self.eigenvalue_gradients.tolist(), strict=True)
-        return {
-            "factors": dict(self.factors),
-            "eigenvalues": [
-                {
-                    "eigenvalue": [value.real, value.imag],
-                    "sensitivity": {p: [d.real, d.imag] for p, d in zip(self.parameters, line, strict=True)},
-                }
-                for value, line in rows
-            ],
-            "response": {
-                o: {i: {p: self._peak(i, o, p) for p in self.parameters} for i in self.inputs} for o in self.outputs
-            },
-        }
-
-    def _peak(self, input: str, output: str, parameter: str) -> dict[str, float]:
-        size = np.abs(self.channel(input, output, parameter, normalised=True))
-        largest = float(np.abs(self.response[:, self.outputs.index(output), self.inputs.index(input)]).max())
-        at = int(np.argmax(size))
-        peak = float(size[at])
-        return {"peak": peak, "of_largest_gain": peak / largest if largest > 0 else 0.0, "omega": float(self.omega[at])}
 
     def plot(self, input: str | None = None, output: str | None = None, ax: Any = None) -> Any:
         """Axes with one channel's normalised derivatives over frequency (default: the first), a curve a parameter."""
@@ -419,7 +372,7 @@ def linear_sensitivities(
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LocalSensitivities(Shown):
+class LocalSensitivities(Coded, Shown):
     """Derivatives by the same parameters, in units and normalised by the same factors.
 
     trajectories: by experiment and output over time; None without an experiment. steady: of the steady state of the
@@ -430,15 +383,6 @@ class LocalSensitivities(Shown):
     steady: SteadySensitivities
     linear: LinearSensitivities | None
     why: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Norms of the trajectories' derivatives, the steady ones, those of the eigenvalues, peaks of the responses'."""
-        return {
-            "trajectories": self.trajectories.to_dict() if self.trajectories else None,
-            "steady": self.steady.to_dict(),
-            "linear": self.linear.to_dict() if self.linear else None,
-            "why": self.why,
-        }
 
     def plot(self, ax: Any = None) -> Any:
         """Axes with the first output's derivatives over time; of the steady state where there is no experiment."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.codec import read_fields
+from hvdc_ident.codec import Coded, read_fields
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.errors import ComputationError, require_known, unknown_name
@@ -97,7 +97,7 @@ def _axes_of(parameters: Mapping[str, _Swept], values: Array) -> tuple[Samples, 
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class SweepResult(Shown):
+class SweepResult(Coded, Shown):
     """A sweep's n points.
 
     axes: of the product. units: by parameter. series: (output, experiment) of the columns of rmse, with series_units.

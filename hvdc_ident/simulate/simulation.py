@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.codec import read_fields
+from hvdc_ident.codec import Coded, read_fields
 from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import require_known
@@ -56,7 +56,7 @@ class _Beside:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Simulation(Shown):
+class Simulation(Coded, Shown):
     """Simulated outputs and their exact derivatives.
 
     trajectory: the outputs at the experiment's times. parameters: names of the sensitivity parameters.

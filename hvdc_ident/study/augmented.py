@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hvdc_ident.codec import plain
 from hvdc_ident.discrepancy.result import FoundEffect, Rival
 from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.errors import ComputationError
@@ -16,6 +17,7 @@ from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.adequacy import adequacy, residual_tests
 from hvdc_ident.fit.noise import MISFIT, source_of, source_text
 from hvdc_ident.fit.residual import Curve
+from hvdc_ident.fit.result import Estimate
 from hvdc_ident.fit.uncertainty import estimates_of, uncertainty
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, read_card
@@ -45,19 +47,38 @@ def use_of(effect: FoundEffect | Rival) -> EffectUse:
     return EffectUse(effect.effect, effect.at, FrozenMap(sizes), source=effect.source, expression=expression)
 
 
-def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dict[str, Any], dict[str, str]]:
+def compared(study: Study, found: Diagnosis) -> tuple[dict[str, Any], dict[str, str]]:
     """Return what discrepancy.json says of the augmented model beside the recordings, and a CSV file of its curves by name.
 
-    fitted: the parameters that the diagnosis estimated. The JSON holds `judgement`, `rmse_after`, `estimates_after` and
-    `residual_tests_after`, as fit.json does of the fit. Experiments that the model cannot be run on are left out, and so are those
-    with unknowns of their own, whose values a diagnosis does not keep. Where no effect was put in there is the judgement alone, at the
-    given values.
+    The JSON holds `units` of the outputs, `judgement` and `rmse_after`, as fit.json does of the fit; where no effect was put in, no
+    errors but those at the given values.
     """
     sets = {"given": fitting.curves_at_given(study)}
+    units = {o: study.model.outputs[o].unit for e in study.experiments for o in e.outputs}
     if found.augmented is None:
-        return {"judgement": fitting.judgement_of(study, sets)}, {}
-    curves: dict[str, dict[str, Curve]] = {}
-    files: dict[str, str] = {}
+        return {"units": units, "judgement": fitting.judgement_of(study, sets)}, {}
+    curves = _curves(study, found)
+    files = {
+        f"discrepancy.{e.name}.csv": fitting.curves_csv(e, curves[e.name])
+        for e in study.experiments
+        if e.name in curves
+    }
+    rmse: dict[str, dict[str, float]] = {}
+    for name, line in curves.items():
+        for output, curve in line.items():
+            rmse.setdefault(output, {})[name] = curve.rmse
+    judgement = fitting.judgement_of(study, {**sets, "effect": curves})
+    return {"units": units, "rmse_after": rmse, "judgement": judgement}, files
+
+
+def _curves(study: Study, found: Diagnosis) -> dict[str, dict[str, Curve]]:
+    """Return the curves of the augmented model by experiment and output.
+
+    Experiments that it cannot be run on are left out, and so are those with unknowns of their own, whose values a diagnosis does not
+    keep.
+    """
+    assert found.augmented is not None
+    curves = {}
     for e in study.experiments:
         if e.nuisance or e.measured is None:
             continue
@@ -66,70 +87,47 @@ def compared(study: Study, found: Diagnosis, fitted: Sequence[str]) -> tuple[dic
         except ComputationError:  # its error is missing in `gap` too
             continue
         curves[e.name] = fitting.curves_of_run(e, run)
-        files[f"discrepancy.{e.name}.csv"] = fitting.curves_csv(e, curves[e.name])
-    rmse: dict[str, dict[str, float]] = {}
-    for name, line in curves.items():
-        for output, curve in line.items():
-            rmse.setdefault(output, {})[name] = curve.rmse
-    data = {
-        "rmse_after": rmse,
-        "judgement": fitting.judgement_of(study, {**sets, "effect": curves}),
-        **_estimates(study, found, fitted, curves),
-    }
-    return data, files
+    return curves
 
 
-def _estimates(
-    study: Study, found: Diagnosis, fitted: Sequence[str], curves: Mapping[str, Mapping[str, Curve]]
-) -> dict[str, Any]:
-    """Return the fitted parameters of the augmented model with 95 % intervals, at the values of the diagnosis, and the tests of
-    its residuals against noise.
+def with_estimates(study: Study, found: Diagnosis, fitted: Sequence[str]) -> Diagnosis:
+    """Return the diagnosis with the estimates of the augmented model's fitted parameters at its values, and tests of its residuals.
 
-    By the curvature of the cost there, widened for correlated residuals, and without intervals where what is left is more than noise, as
-    those of a fit are; the parameters of the effects are unknowns too. Both empty where an experiment has unknowns of its own.
+    fitted: the parameters that the diagnosis estimated. Their 95 % intervals are by the curvature of the cost there, widened for
+    correlated residuals, and without intervals where what is left is more than noise, as those of a fit are; the parameters of the
+    effects are unknowns too. Nothing is added where nothing was put in, and where an experiment has unknowns of its own.
     """
-    nothing: dict[str, Any] = {"estimates_after": {}, "residual_tests_after": {}}
     model = found.augmented
-    assert model is not None
-    if any(e.nuisance for e in study.experiments):
-        return nothing
+    if model is None or any(e.nuisance for e in study.experiments):
+        return found
     added = [n for n in model.parameters if n not in study.model.parameters]
     unknowns = [FitParameter.of(n, model.parameters[n]) for n in (*fitted, *added)]
     free = tuple(u for u in unknowns if not u.on_bound(u.start))
     if not any(u.name in fitted for u in free):
-        return nothing
-    problem = Problem(ModelSimulator(model), study.experiments, free, weights=FrozenMap(_misfit(study, curves)))
+        return found
+    problem = Problem(ModelSimulator(model), study.experiments, free, weights=FrozenMap(_misfit(study, found)))
     try:
         blocks = problem.blocks(problem.start)
     except ComputationError:
-        return nothing
+        return found
     sources = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
     spans = np.array([u.span for u in problem.unknowns])
     known = uncertainty(blocks, problem.names, spans, problem.noise_source, None, problem.noise_dof)
     known = known.widened(adequacy(problem, blocks, sources, known.effective, known.rho).widening)
     estimates = estimates_of(problem, problem.start, blocks, known, known, systematic=found.beyond_noise)
-    return {
-        "estimates_after": {n: _estimate(found, n, plain(estimates[n])) for n in fitted if n in estimates},
-        "residual_tests_after": residual_tests(blocks, problem.fitted_experiments),
-    }
-
-
-def _estimate(found: Diagnosis, name: str, estimate: dict[str, Any]) -> dict[str, Any]:
-    """Return an estimate; without a value where that depends on what is missing, with those by place instead."""
-    depend = plain(found.values_by_place.get(name, ()))
-    if not depend:
-        return estimate
     why = "it depends on which of the likely effects and places is the true one"
-    return estimate | {"value": None, "std": None, "ci95": None, "reason": why, "by_place": depend}
+    placed = {n: Estimate(math.nan, unit=estimates[n].unit, reason=why) for n in found.values_by_place if n in estimates}
+    return replace(
+        found,
+        estimates_after=FrozenMap({n: placed.get(n) or estimates[n] for n in fitted if n in estimates}),
+        residual_tests_after=residual_tests(blocks, problem.fitted_experiments),
+    )
 
 
-def _misfit(study: Study, curves: Mapping[str, Mapping[str, Curve]]) -> dict[str, float]:
+def _misfit(study: Study, found: Diagnosis) -> dict[str, float]:
     """Return the standard deviation of the misfit of every output whose noise is not known, over the fitted recordings."""
     fitted = tuple(e for e in study.experiments if e.role == "fit" and e.outputs)
-    found = {}
-    for output in dict.fromkeys(o for e in fitted for o in e.outputs):
-        if source_of(fitted, output) == MISFIT:
-            parts = [line[output].misfit for e in fitted if output in (line := curves.get(e.name, {}))]
-            if parts:
-                found[output] = float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
-    return found
+    outputs = [o for o in dict.fromkeys(o for e in fitted for o in e.outputs) if source_of(fitted, o) == MISFIT]
+    curves = _curves(study, found) if outputs else {}
+    misfits = {o: [line[o].misfit for e in fitted if o in (line := curves.get(e.name, {}))] for o in outputs}
+    return {o: float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) for o, parts in misfits.items() if parts}

@@ -11,6 +11,7 @@ from xml.sax.saxutils import quoteattr
 
 from hvdc_ident.errors import ComputationError, LinearizationError, StudyError
 from hvdc_ident.model import Model, read_card
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.report.letter import STAGE, Letterhead, write_letter
 from hvdc_ident.study.pipeline import Done, have_stage
 from hvdc_ident.study.schema import LetterTable
@@ -41,13 +42,14 @@ class Written:
     """A file that was written, and what is to be said of it.
 
     values, of: of a study, the name of the set of values that it holds, as it was asked for, and what they are: given, start,
-    fit or effect.
+    fit or effect. next: another set that may be meant.
     """
 
     path: Path
     note: str = ""
     values: str = ""
     of: str = ""
+    next: tuple[NextStep, ...] = ()
 
 
 def fmu_options(fmi: str | None, kind: str | None, source_only: bool) -> FmuOptions | None:
@@ -134,7 +136,8 @@ def write(
         written = Written(write_linear(_reduced(source, model) if reduced else model, path))
     if selected is None:
         return written
-    return Written(written.path, "; ".join(t for t in (written.note, selected.note) if t), selected.name, selected.of)
+    note = "; ".join(t for t in (written.note, selected.note) if t)
+    return Written(written.path, note, selected.name, selected.of, selected.next)
 
 
 def _reduced(source: Study | Model | LinearModel, whole: LinearModel) -> LinearModel:
@@ -201,7 +204,7 @@ def _dyr(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOpt
             "the study does not say which .dyr file its unit is from",
             where=f"{source.path.name}, model.dyr" if isinstance(source, Study) else "",
             expected='dyr = {file = "plant.dyr", bus = 101, machine = "1"} in [model]',
-            hint="`hvdc-ident new DIR --dyr plant.dyr --bus 101 --from event.csv` writes such a study",
+            next=(NextStep("new-unit"),),
         )
     file = read_dyr(source.path.parent / asked.file)
     fitted = dict(selected.values) if selected else {}
@@ -252,9 +255,12 @@ def _linear(source: Study | Model | LinearModel, selected: ValueSet | None) -> L
         except LinearizationError as e:
             if selected.model is None:
                 raise
-            hint = "--values fit is the linear model of the fit without the effect"
             raise LinearizationError(
-                f"with the effect that counts {e.what}", where=e.where, expected=e.expected, got=e.got, hint=hint
+                f"with the effect that counts {e.what}",
+                where=e.where,
+                expected=e.expected,
+                got=e.got,
+                next=(NextStep("values", "fit"),),
             ) from None
     return linearize(source) if isinstance(source, Model) else source
 

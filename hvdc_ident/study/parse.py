@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
 from typing import Any
 
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.formats import formats, list_signals
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.study.schema import StudyFile
 from hvdc_ident.toml_tables import decoded, parsed, require_schema, validated
 
@@ -44,17 +44,15 @@ def checked(table: dict[str, Any], where: str) -> StudyFile:
 
 def _refuse_other_kinds(path: Path) -> None:
     """Raise StudyError for an FMU and for a file of waveforms; a *.txt is one where its signals can be listed."""
-    ending, typed = path.suffix.lower(), shlex.quote(str(path))
+    ending, steps = path.suffix.lower(), tuple[NextStep, ...]()
     if ending == ".fmu":
-        what, hint = "an FMU", f"`hvdc-ident check {typed}` lists its variables; a study names it in [model] source"
+        what, steps = "an FMU", (NextStep("variables", str(path)),)
     elif any(ending in f.SUFFIXES for f in formats().values()) and (ending != ".txt" or _lists_signals(path)):
-        convert = f"`hvdc-ident convert {typed} --list ''` lists its signals"
-        made = f"`hvdc-ident new DIR --from {typed} --model MODEL` writes a study of it"
-        what, hint = "a file of waveforms", f"{convert}; {made}"
+        what, steps = "a file of waveforms", (NextStep("signals", str(path)), NextStep("new-from", str(path)))
     else:
         return
     raise StudyError(
-        f"this is {what}, not a study", where=path.name, expected="a study file (TOML)", got=f"'{ending}'", hint=hint
+        f"this is {what}, not a study", where=path.name, expected="a study file (TOML)", got=f"'{ending}'", next=steps
     )
 
 
@@ -67,5 +65,4 @@ def _lists_signals(path: Path) -> bool:
 
 def _toml(content: bytes, where: str) -> dict[str, Any]:
     text = decoded(content, "the study file", where, LARGEST, StudyError)
-    hint = "mend this line; `hvdc-ident new DIR` writes a study to compare it with"
-    return parsed(text, "the study file", where, StudyError, hint)
+    return parsed(text, "the study file", where, StudyError, "mend this line")

@@ -32,6 +32,7 @@ from hvdc_ident.errors import ComputationError, InputError
 from hvdc_ident.executor import Identified, Outcome, TolerantExecutor, in_order
 from hvdc_ident.files import digest, make_folder
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.next_step import NextStep
 
 FOLDER, FILE = ".store", "results.sqlite"
 MOST_KEYS = 500  # of one query
@@ -88,7 +89,8 @@ def _locked(folder: Path) -> int:
             "another run is at work in this folder",
             where=str(folder),
             expected="one run at a time in a folder of results",
-            hint="wait for it to end, end it, or give --out another folder",
+            hint="wait for it to end, or end it",
+            next=(NextStep("folder"),),
         ) from None
     except OSError:  # a file system without locks
         pass
@@ -154,14 +156,14 @@ class Store:
         try:
             yield
         except sqlite3.DatabaseError as e:
-            text = str(e)
+            text, hint, steps = str(e), "", tuple[NextStep, ...]()
             if "is full" in text or "disk I/O" in text:
                 hint = "free some space; what was kept is intact, and the same command goes on from there"
             elif "readonly" in text or "unable to open" in text:
-                hint = "a folder that can be written to, with --out DIR"
+                steps = (NextStep("folder"),)
             else:
                 hint = "remove this file: what it keeps can be computed again"
-            raise InputError(f"the store cannot be used: {text}", where=str(self.path), hint=hint) from None
+            raise InputError(f"the store cannot be used: {text}", where=str(self.path), hint=hint, next=steps) from None
 
     def execute(self, statement: str, values: Sequence[Any]) -> list[Any]:
         """Return the rows of an SQL statement. Raises InputError where the store cannot be used."""

@@ -12,7 +12,7 @@ import numpy as np
 from hvdc_ident.data import Experiment
 from hvdc_ident.display import Shown, Table, axes_of
 from hvdc_ident.effects import apply_effects
-from hvdc_ident.errors import StudyError, located, nearest, require_known, unknown_name
+from hvdc_ident.errors import StudyError, in_python, located, nearest, require_known, unknown_name
 from hvdc_ident.expression import parse
 from hvdc_ident.files import digest
 from hvdc_ident.fit import FitParameter
@@ -20,6 +20,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import MeasuredResponse
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.study import schema
 from hvdc_ident.study.checks import check_questions
 from hvdc_ident.study.measured_responses import read_responses
@@ -125,6 +126,7 @@ def without_letter(content: bytes) -> bytes:
     return b"".join(kept)
 
 
+@in_python
 def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float] | None = None) -> Study:
     """Return the study of a file. trust: whether a model that is Python code may be run.
 
@@ -189,8 +191,8 @@ def _read(file: Path) -> bytes:
     except FileNotFoundError:
         beside = [p.name for p in sorted(file.parent.glob("*.toml"))] if file.parent.is_dir() else []
         near = [str(file.with_name(n)) for n in nearest(file.name, beside)]
-        hint = f"{' or '.join(near)}?" if near else "'hvdc-ident new DIR' writes a study to start from"
-        raise StudyError("no such study file", where=str(file), hint=hint) from None
+        hint, steps = (f"{' or '.join(near)}?", ()) if near else ("", (NextStep("new"),))
+        raise StudyError("no such study file", where=str(file), hint=hint, next=steps) from None
     except OSError as e:
         raise StudyError(f"the study file cannot be read: {(e.strerror or str(e)).lower()}", where=str(file)) from None
 
@@ -243,7 +245,7 @@ def _source(name: str, file: Path, place: str) -> tuple[str | Path, dict[str, st
             f"no model file '{name}'",
             where=f"{file.name}, {place}",
             expected="a path from the study's folder, or a shipped model: " + ", ".join(shipped_models()),
-            hint=f"a path as seen from {file.parent}, or a name that `hvdc-ident models` lists",
+            hint=f"a path as seen from {file.parent}, or one of these names",
         )
     return source, {name: digest(source.read_bytes())}
 

@@ -54,8 +54,7 @@ def after_diagnosis(study: Study, folder: Path, data: Mapping[str, Any]) -> dict
 
 def _files(study: Study, found: StageResults, folder: Path) -> dict[str, str]:
     assert found.fit is not None
-    later = found.of_diagnosis.estimates_after
-    return value_files(study, found.fit, found.of_fit.derived, found.diagnosis, later, folder)
+    return value_files(study, found.fit, found.of_fit.derived, found.diagnosis, folder)
 
 
 def value_files(
@@ -63,17 +62,16 @@ def value_files(
     fit: FitResult,
     derived: Iterable[str],
     diagnosis: Diagnosis | None = None,
-    later: Mapping[str, Estimate] | None = None,
     folder: Path | None = None,
 ) -> dict[str, str]:
     """Return the text of each file by its name. Each says which set of values it holds.
 
-    derived: quantities that follow from the values. later: the estimates of the diagnosis; folder: where its files stand. Without a
+    derived: quantities that follow from the values. folder: where the files of the diagnosis stand. Without a
     diagnosis the values are the fit's.
     """
     from hvdc_ident.study.export import ssv
 
-    counts, estimates = counting_of(fit, diagnosis), estimates_that_count(fit, diagnosis, later or {})
+    counts, estimates = counting_of(fit, diagnosis), estimates_that_count(fit, diagnosis)
     model, uses = study.model, []
     values = {n: fit.values[n] for n in study.candidates if n in fit.values}
     if diagnosis is not None and counts.name == "effect":

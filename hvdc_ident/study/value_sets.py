@@ -40,7 +40,7 @@ class ValueSet:
     name: as it was asked for: given, start, fitted, effect or fit. of: what they are: given, start, fit or effect. note: what is
     to be said of them, in words that stand alone: where they come from, and why they are not the fitted ones where those might
     be expected. fit, diagnosis: the fingerprints of the results that they come from. model: that they hold in, where it has an
-    effect that the study's model lacks; None where it is the study's own.
+    effect that the study's model lacks; None where it is the study's own. next: another set that may be meant.
     """
 
     name: SetName
@@ -50,6 +50,7 @@ class ValueSet:
     fit: str = ""
     diagnosis: str = ""
     model: AnyModel | None = None
+    next: tuple[NextStep, ...] = ()
 
 
 def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> ValueSet:
@@ -82,7 +83,7 @@ def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> V
         return _asked(results, found, why)
     if found is not None and not why:
         return found
-    return _given(study, "" if why == NONE else why)
+    return _given(study, "" if why == NONE else why, (NextStep("values", "fitted"),) if found is not None else ())
 
 
 def fitted_values(study: Study, folder: Path) -> tuple[ValueSet | None, str]:
@@ -107,9 +108,9 @@ def _asked(results: _Results, found: ValueSet | None, why: str) -> ValueSet:
     )
 
 
-def _given(study: Study, why: str = "") -> ValueSet:
+def _given(study: Study, why: str = "", next: tuple[NextStep, ...] = ()) -> ValueSet:
     note = f"given values of study '{study.name}'" + (f"; {why}" if why else "")
-    return ValueSet("given", study.given, note, "given")
+    return ValueSet("given", study.given, note, "given", next=next)
 
 
 @dataclass(frozen=True)
@@ -156,8 +157,7 @@ class _Results:
             return None, self.no_fit
         found = self.with_effect("fitted") if self.counts.name == "effect" else self.of_fit("fitted")
         if self.fit is not None and self.fit.status in NOT_BY_ITSELF:
-            end = f"the fit in {self.folder} ended as {self.fit.status}: {self.fit.message}"
-            return found, f"{end}; --values fitted takes the best"
+            return found, f"the fit in {self.folder} ended as {self.fit.status}: {self.fit.message}"
         return found, ""
 
     def of_fit(self, name: Literal["fitted", "fit"]) -> ValueSet:
@@ -170,12 +170,10 @@ class _Results:
             note = f"fitted values of study '{study.name}' ({how})"
         else:
             note = f"{'fitted values' if name == 'fitted' else 'fit values'} of study '{study.name}', without an effect ({how})"
-        why = counts.doubt
-        if counts.added:
-            why += f"{'; ' if why else ''}--values effect takes those with {counts.added}"
-        note += f": {why}" if why else ""
+        why = [counts.doubt, f"with {counts.added} they are others" if counts.added else ""]
+        note += f": {'; '.join(filter(None, why))}" if any(why) else ""
         note += f"; {self.stale}" if self.stale else ""
-        return ValueSet(name, values, note, "fit", *self.marks)
+        return ValueSet(name, values, note, "fit", *self.marks, next=(NextStep("values", "effect"),) if counts.added else ())
 
     def with_effect(self, name: Literal["fitted", "effect"]) -> ValueSet:
         """Return the values fitted together with the effect, by that name, and the model that they hold in."""

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
 
+from hvdc_ident.fit.result import FitResult
 from hvdc_ident.fit.uncertainty import WIDER
 from hvdc_ident.next_step import TO_DO, Door
 from hvdc_ident.summary.run_summary import (
@@ -161,18 +161,18 @@ def note_text(p: ParameterSummary) -> str:
     return AT_BOUND if p.at_bound else f"held, {p.reason.split(':')[0]}" if p.reason else ""
 
 
-def remarks(fit: Mapping[str, Any]) -> dict[str, str]:
-    """Return by candidate why it is held, or what its interval rests on; nothing of one without a remark. fit: the JSON."""
+def remarks(fit: FitResult, candidates: Iterable[str]) -> dict[str, str]:
+    """Return by candidate why it is held, or what its interval rests on; nothing of one without a remark."""
     found = {}
-    for name in fit.get("candidates") or ():
-        own, why = (fit.get("estimates") or {}).get(name) or {}, (fit.get("held") or {}).get(name)
-        notes = [f"held: {why}"] if why else []
-        notes += ["on a bound, one-sided interval"] if own.get("method") == "one-sided" else []
-        notes += [f"estimated with {listed(own['conditional_on'])} held"] if own.get("conditional_on") else []
-        notes += [str(own["reason"]).rstrip(".")] if own.get("reason") else []
-        alone, ends = own.get("ci95_independent"), own.get("ci95")
-        if alone and ends and None not in ends and ends[1] - ends[0] > WIDER * (alone[1] - alone[0]):
-            notes.append(f"as if the residuals were independent: {interval_text(alone)}")
+    for name in candidates:
+        notes = [f"held: {fit.held[name]}"] if fit.held.get(name) else []
+        if (own := fit.estimates.get(name)) is not None:
+            notes += ["on a bound, one-sided interval"] if own.method == "one-sided" else []
+            notes += [f"estimated with {listed(own.conditional_on)} held"] if own.conditional_on else []
+            notes += [own.reason.rstrip(".")] if own.reason else []
+            alone, (low, high) = own.ci95_independent, own.ci95 or (None, None)
+            if alone and low is not None and high is not None and high - low > WIDER * (alone[1] - alone[0]):
+                notes.append(f"as if the residuals were independent: {interval_text(alone)}")
         if notes:
             found[name] = "; ".join(notes)
     return found
@@ -197,6 +197,8 @@ def why_conditional(s: RunSummary) -> str:
     fitted = s.sets.get("fitted")
     if s.counting.name == "fit" and s.counting.doubt and fitted is not None and fitted.verdict == "pass":
         return s.counting.doubt
+    if s.counting.name == "fit" and s.counting.added:
+        return f"without {s.counting.added} more than the noise remains"
     return "what remains is more than the noise"
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from hvdc_ident.data import Trajectory
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import csv_name
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.summary.run_summary import RunSummary
 from hvdc_ident.summary.stage_results import StageResults
 from hvdc_ident.summary.summarise import STAGES, judgements_of, lines_of, summarise
@@ -31,7 +32,7 @@ class Results:
         """The JSON files that have the heading of a result. Raises InputError for a broken one, or none at all."""
         if not self.folder.is_dir():
             raise InputError(
-                "no folder of results", where=str(self.folder), hint="run the study first: hvdc-ident run STUDY"
+                "no folder of results", where=str(self.folder), next=(NextStep("run"),)
             )
         found = {}
         for path in sorted(self.folder.glob("*.json")):
@@ -44,7 +45,7 @@ class Results:
                 found[path.stem] = data
         if not found:
             raise InputError(
-                "no results in the folder", where=str(self.folder), hint="run the study first: hvdc-ident run STUDY"
+                "no results in the folder", where=str(self.folder), next=(NextStep("run"),)
             )
         return found
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hvdc_ident.codec import Coded, stored_as
+from hvdc_ident.codec import Coded
 from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.errors import located
 from hvdc_ident.fit.judgement import Judgements
@@ -31,18 +31,11 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Advice:
-    """What to record next. text: in words."""
-
-    text: str = ""
-
-
-@dataclass(frozen=True)
 class Context(Coded):
     """What the JSON of a simulation, an identifiability analysis or a fit has beside its result, as far as a summary is made of it.
 
     candidates: by name. units: of the outputs. experiments: role, event, window, recording and status by name. judgement: of the
-    model with each set of values. derived: what follows from the estimates of a fit. advice: what to record next.
+    model with each set of values. derived: what follows from the estimates of a fit.
     """
 
     candidates: Mapping[str, Candidate] = field(default_factory=dict)
@@ -50,15 +43,14 @@ class Context(Coded):
     experiments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     judgement: Judgements = field(default_factory=Judgements)
     derived: Mapping[str, Any] = field(default_factory=dict)
-    advice: Advice | None = field(default=None, metadata=stored_as("recommended_experiment"))
 
 
 @dataclass(frozen=True)
 class DiagnosisContext(Coded):
-    """What the JSON of a diagnosis has beside it. judgement: of the model with each set of values. estimates_after: with what it put in."""
+    """What the JSON of a diagnosis has beside it. units: of the outputs. judgement: of the model with each set of values."""
 
+    units: Mapping[str, str] = field(default_factory=dict)
     judgement: Judgements = field(default_factory=Judgements)
-    estimates_after: Mapping[str, Estimate] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -127,16 +127,15 @@ def counting_of(fit: FitResult | None, diagnosis: Diagnosis | None) -> Counting:
     return Counting("" if fit is None or fit.status in NO_ESTIMATES else "fit", added, kind, doubt)
 
 
-def estimates_that_count(
-    fit: FitResult | None, diagnosis: Diagnosis | None, later: Mapping[str, Estimate]
-) -> dict[str, Estimate]:
-    """Return the estimates that count, by parameter. later: those of the diagnosis with what it put in.
+def estimates_that_count(fit: FitResult | None, diagnosis: Diagnosis | None) -> dict[str, Estimate]:
+    """Return the estimates that count, by parameter.
 
     With an effect, a parameter that was estimated without an interval has its value alone.
     """
     own = {} if fit is None else dict(fit.estimates)
     if diagnosis is None or counting_of(fit, diagnosis).name != "effect":
         return own
+    later = diagnosis.estimates_after
     fitted = (*later, *(fit.fitted if fit is not None else ()))
     return {n: later.get(n) or Estimate(v) for n, v in diagnosis.parameters_after.items() if n in fitted}
 
@@ -244,7 +243,7 @@ def _worst(judgement: Judgement, swing: Swing) -> Signal | None:
 def _signals(
     judgements: Mapping[str, Judgement], judged: str | None, limits: Yardstick, found: StageResults
 ) -> tuple[SignalSummary, ...]:
-    units = {**found.simulated.units, **found.of_fit.units}
+    units = {**found.of_diagnosis.units, **found.simulated.units, **found.of_fit.units}
     experiments = {**found.simulated.experiments, **found.of_fit.experiments}
     errors: dict[Signal, dict[str, SignalJudgement]] = {}
     for name, judgement in judgements.items():
@@ -279,8 +278,10 @@ def _parameters(found: StageResults, counting: Counting) -> tuple[ParameterSumma
     fit, diagnosis, identified = found.fit, found.diagnosis, found.identified
     lines = found.of_fit.candidates or found.of_identified.candidates or found.simulated.candidates
     if not lines and diagnosis is not None:
-        lines = {n: Candidate(given) for n, given in diagnosis.parameters_before.items()}
-    fitted, estimates, later = found.fitted, found.estimates, found.of_diagnosis.estimates_after
+        known = diagnosis.estimates_after
+        lines = {n: Candidate(v, unit=known[n].unit if n in known else "") for n, v in diagnosis.parameters_before.items()}
+    fitted, estimates = found.fitted, found.estimates
+    later: Mapping[str, Estimate] = {} if diagnosis is None else diagnosis.estimates_after
     bounds = {n: e for n, e in estimates.items() if fitted and n not in fitted and e.method == "one-sided"}
     after = diagnosis.parameters_after if diagnosis is not None and counting.kind else {}
     refitted = diagnosis.parameters_refitted if diagnosis is not None else {}
@@ -423,7 +424,7 @@ def _next(found: StageResults, parameters: tuple[ParameterSummary, ...]) -> tupl
         steps.append(NextStep("diagnose"))
     own = {} if found.estimates else found.identified.parameters
     known = bool(parameters) and all(p.determined or _closely(own.get(p.name)) for p in parameters)
-    wanted = found.of_identified.advice
+    wanted = found.identified.recommended
     if not added_to(diagnosis) and not known and wanted is not None and (advice := _advice(wanted.text)):
         steps.append(NextStep("narrow", advice))
     if found.estimates and not steps:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from hvdc_ident.display import Table
 from hvdc_ident.fit.judgement import Count
+from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.summary.phrases import (
     WORDS,
     by_place,
@@ -47,17 +45,15 @@ def values_table(s: RunSummary) -> Table:
     return Table(header, tuple(rows)).without_empty() if rows else Table(header, ())
 
 
-def verdicts_table(identified: Mapping[str, Any]) -> Table:
-    """Return each candidate's verdict with its value, intervals and reason. identified: the JSON of the identifiability."""
-    ratio = (identified.get("pilot") or {}).get("chi2_per_dof") if identified.get("misspecified") else None
+def verdicts_table(report: IdentifiabilityReport) -> Table:
+    """Return each candidate's verdict with its value, interval and reason."""
+    ratio = report.pilot.chi2_per_dof if report.misspecified else None
     name = "95 % interval" if ratio is None else f"95 % interval (χ²/dof {figures(ratio, 3)})"
-    rows = []
-    for parameter, v in (identified.get("parameters") or {}).items():
-        ends = (interval_text(v.get(k)) for k in ("ci95", "ci95_experiments"))
-        value = estimate_texts(v.get("value"), v.get("ci95"))[0]
-        rows.append((parameter, v.get("verdict", ""), value, *ends, v.get("unit", ""), v.get("reason", "")))
-    header = ("parameter", "verdict", "value", name, "experiments drawn anew", "unit", "why")
-    return Table(header, tuple(rows)).without_empty()
+    rows = [
+        (n, v.verdict, estimate_texts(v.value, v.ci95)[0], interval_text(v.ci95), v.unit, v.reason)
+        for n, v in report.parameters.items()
+    ]
+    return Table(("parameter", "verdict", "value", name, "unit", "why"), tuple(rows)).without_empty()
 
 
 def sets_table(s: RunSummary) -> Table:

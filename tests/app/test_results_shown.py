@@ -21,6 +21,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.next_step import NextStep, next_sentence
 from hvdc_ident.report.overlay import Overlay, overlay_of
 from hvdc_ident.summary import Results
+from hvdc_ident.summary.stage_results import diagnosis_of, identified_of
 from hvdc_ident.summary.tables import findings_table, sets_table, verdicts_table
 from tests.app.small_study import LATE
 
@@ -41,7 +42,7 @@ def overlay(study: hi.Study) -> Overlay:
 
 
 def test_the_best_model_has_the_plants_size_and_the_rivals_explain_the_record_as_well(study: hi.Study) -> None:
-    best, *rivals = suppositions(study, told(study, "discrepancy"), study.folder)
+    best, *rivals = suppositions(study, diagnosis_of(told(study, "discrepancy")), study.folder)
     (size,) = best.sizes
     assert best.model.parameters[size].value == pytest.approx(LATE, rel=0.2) and rivals
     (record, *_) = study.experiments
@@ -54,8 +55,8 @@ def test_the_best_model_has_the_plants_size_and_the_rivals_explain_the_record_as
 
 
 def test_without_a_finding_there_is_no_supposition(study: hi.Study, tmp_path: Path) -> None:
-    assert suppositions(study, {}, study.folder) == ()
-    assert suppositions(study, told(study, "discrepancy"), tmp_path) == ()  # the card is not there
+    assert suppositions(study, None, study.folder) == ()
+    assert suppositions(study, diagnosis_of(told(study, "discrepancy")), tmp_path) == ()  # the card is not there
 
 
 @pytest.mark.parametrize(
@@ -67,7 +68,7 @@ def test_without_a_finding_there_is_no_supposition(study: hi.Study, tmp_path: Pa
     ],
 )
 def test_a_move_is_read_as_it_was_told(move: Move) -> None:
-    again = Move.of(json.loads(json.dumps(move.to_dict())))
+    again = Move.from_dict(json.loads(json.dumps(move.to_dict())))
     t = np.linspace(0.0, 1.0, 101)
     assert again == move
     np.testing.assert_array_equal(again.signal(1.0)(t), move.signal(1.0)(t))
@@ -75,7 +76,7 @@ def test_a_move_is_read_as_it_was_told(move: Move) -> None:
 
 def test_the_first_experiment_is_the_one_that_is_recommended(study: hi.Study) -> None:
     """Of a wide interval of k, which a record of more noise leaves; the model of the plant, so that there is no misfit."""
-    best = suppositions(study, told(study, "discrepancy"), study.folder)[0].model
+    best = suppositions(study, diagnosis_of(told(study, "discrepancy")), study.folder)[0].model
     random = np.random.default_rng(7)
     noisy = [
         e.with_(measured=trajectory(e.time, {"y": e.measured["y"] + 0.2 * random.standard_normal(e.time.size)}), noise={"y": 0.2})
@@ -84,7 +85,7 @@ def test_the_first_experiment_is_the_one_that_is_recommended(study: hi.Study) ->
     ]
     identified = identifiability(best, noisy, study.candidates.values(), starts=1).to_dict()
     advice = identified["recommended_experiment"]
-    first, *others = planned_experiments(study, identified)
+    first, *others = planned_experiments(study, identified_of(identified))
     assert advice["text"].startswith(first.words) and others
     planned = first.experiment(study)
     (move, *_) = advice["moves"]
@@ -96,19 +97,18 @@ def test_the_first_experiment_is_the_one_that_is_recommended(study: hi.Study) ->
 def test_where_none_is_recommended_every_move_of_a_settable_input_can_be_looked_at(study: hi.Study) -> None:
     identified = told(study, "identifiability")
     assert identified["recommended_experiment"] is None and "by which a width is uncertain" in identified["not_recommended"]
-    found = planned_experiments(study, identified)
+    found = planned_experiments(study, identified_of(identified))
     assert {p.design.inputs for p in found} == {("u",)} and {p.design.kind for p in found} == {"step", "ramp", "multisine"}
     grid = {n: replace(i, settable=False) for n, i in study.model.inputs.items()}
-    assert planned_experiments(replace(study, model=replace(study.model, inputs=FrozenMap(grid))), identified) == ()
+    assert planned_experiments(replace(study, model=replace(study.model, inputs=FrozenMap(grid))), identified_of(identified)) == ()
 
 
 def test_a_profile_passes_its_level_at_the_ends_of_the_interval(study: hi.Study) -> None:
-    profile = told(study, "identifiability")["profiles"]["k"]
+    profile = identified_of(told(study, "identifiability")).profiles["k"]
     at, between, computed, level, ends = profile_columns(profile)
-    limits = [profile[side]["limit"] for side in ("lower", "upper")]
-    np.testing.assert_allclose(at[np.isfinite(ends)], limits)
+    np.testing.assert_allclose(at[np.isfinite(ends)], profile.ci95)
     np.testing.assert_allclose(between[np.isfinite(ends)], 1.0, atol=0.02)
-    assert (level == 1.0).all() and np.isfinite(computed).sum() == len(set(profile["values"]))
+    assert (level == 1.0).all() and np.isfinite(computed).sum() == len(set(profile.values.tolist()))
 
 
 def test_the_errors_drawn_are_those_that_the_fit_states(study: hi.Study) -> None:
@@ -123,7 +123,7 @@ def test_the_errors_drawn_are_those_that_the_fit_states(study: hi.Study) -> None
 
 def test_tables_hold_verdicts_findings_and_gaps(study: hi.Study) -> None:
     identified, diagnosis = told(study, "identifiability"), told(study, "discrepancy")
-    (row,) = verdicts_table(identified).rows
+    (row,) = verdicts_table(identified_of(identified)).rows
     assert row[:2] == ("k", identified["parameters"]["k"]["verdict"]) and "1/s" in row
     assert float(row[2]) == pytest.approx(identified["parameters"]["k"]["value"], rel=1e-3)
     assert len(findings_table(Results(study.folder).summary).rows) == len(diagnosis["findings"]) > 0

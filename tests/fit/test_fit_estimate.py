@@ -296,9 +296,10 @@ def test_a_method_that_stops_short_is_refined_before_anything_is_said():
 
 @pytest.mark.parametrize("status", ["not-converged", "at-bound", "two-optima", "failed"])
 def test_the_report_says_first_what_became_of_the_fit(status):
+    from hvdc_ident.fit import FitResult
     from hvdc_ident.report.sections.gains import STATUS, _outcome
 
-    words = _outcome({"status": status, "message": "why <it> is so"})
+    words = _outcome(FitResult(status, "why <it> is so"))
     assert STATUS[status] in words and f"({status})" in words
     assert "why &lt;it&gt; is so" in words
     assert "converged" not in words.replace("not-converged", "").replace("did not converge", "")

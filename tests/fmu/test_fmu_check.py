@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from hvdc_ident import load_model, simulate
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.fmu import read_capabilities, read_fmu
+from hvdc_ident.fmu import Capabilities, read_capabilities, read_fmu
 
 pytestmark = needs_compiler
 
@@ -42,7 +42,10 @@ def test_the_list_of_variables_is_grouped_and_cut(tmp_path):
 
 
 def test_json_has_every_variable_and_what_was_found(tmp_path):
-    result = run(build(spring(), tmp_path), "--json")
+    path = build(spring(), tmp_path)
+    described = read_capabilities(path)
+    assert Capabilities.from_dict(json.loads(json.dumps(described.to_dict(), allow_nan=False))) == described
+    result = run(path, "--json")
     found = json.loads(result.stdout)
     assert list(found["variables"]["parameters"]) == ["m", "d", "k", "b"]
     assert found["variables"]["parameters"]["k"]["also"] == ["stiffness"]

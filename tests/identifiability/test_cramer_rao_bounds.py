@@ -32,7 +32,7 @@ def test_what_is_told_apart_has_the_standard_deviation_of_linear_regression() ->
     columns = np.column_stack([TRUTH["b"] * T, np.ones_like(T)])
     expected = NOISE * np.sqrt(np.diag(np.linalg.inv(columns.T @ columns)))
     found = look("a", "c")
-    assert [found.std["a"], found.std["c"]] == pytest.approx(expected, rel=1e-6)
+    assert [found.parameters["a"].std, found.parameters["c"].std] == pytest.approx(expected, rel=1e-6)
     assert found.chi2_per_dof == pytest.approx(1.0, abs=0.4) and found.combinations == ()
 
 
@@ -40,11 +40,11 @@ def test_a_product_is_named_and_a_factor_is_told_with_the_other_held() -> None:
     found = look("a", "b", "c")
     (words,) = found.combinations
     assert "only a*b is seen" in words
-    (held,) = [n for n, s in found.std.items() if s is None]
+    (held,) = [n for n, p in found.parameters.items() if p.std is None]
     other = {"a": "b", "b": "a"}[held]
-    assert found.conditional_on == {other: (held,)}
+    assert found.parameters[other].conditional_on == (held,)
     alone = look(other, "c")
-    assert found.std[other] == pytest.approx(alone.std[other], rel=1e-6)
+    assert found.parameters[other].std == pytest.approx(alone.parameters[other].std, rel=1e-6)
     assert any("with" in line and "held" in line for line in found.lines)
 
 

@@ -8,6 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.identifiability.experiment_design import (
+    ExperimentDesign,
+    Move,
+    OptimalityCriteria,
+    RankedDesign,
+    Recommendation,
+)
+from hvdc_ident.immutable import FrozenMap
 from tests.report.judgements import judgement
 
 HEADING = {
@@ -128,6 +136,14 @@ def _fit(rmse: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def advice(input: str, words: str) -> dict[str, Any]:
+    """A step of an input, advised in these words."""
+    design = ExperimentDesign((Move(input, "step", 1.0, 1.05, 0.1),))
+    seen = OptimalityCriteria(1, 1.0, 0.0)
+    best, none = RankedDesign(design, OUTPUTS, (), seen), FrozenMap[Any]()
+    return Recommendation(best, next(iter(GAINS)), best, seen, none, none, none, (), 1, (), words).to_dict()
+
+
 def _identifiability() -> dict[str, Any]:
     parameters = {
         n: {
@@ -141,12 +157,11 @@ def _identifiability() -> dict[str, Any]:
         }
         for n, (_, f, _) in GAINS.items()
     }
-    advice = {"text": "Step Vdcref1 from 1 to 1.05, recording the same signals"}
     return {
         "stage": "identify",
         "parameters": parameters,
         "identifiable": list(GAINS),
-        "recommended_experiment": advice,
+        "recommended_experiment": advice("Vdcref1", "Step Vdcref1 from 1 to 1.05, recording the same signals"),
     }
 
 

@@ -288,9 +288,12 @@ def test_after_a_diagnosis_alone_the_letter_shows_before_and_after(tmp_path: Pat
     """Of a plant whose k lies beyond the bound of the study, and which is late by a lag that three places explain."""
     study = write_small_study(tmp_path)
     study.write_text(study.read_text().replace("k = {min = 0.5, max = 20}", "k = {min = 0.5, max = 4.2}"))
+    outputs = []
     for command in ("diagnose", "letter"):
         result = CliRunner().invoke(app, [command, str(study)])
         assert result.exit_code == 0, result.output
+        outputs.append(result.output)
+    assert re.search(r"^k +1/s ", outputs[0], re.MULTILINE), "with its unit"
     page = (tmp_path / "study-results" / "letter.html").read_text("utf-8")
     assert "recorded and simulated (given values and with the effect)" in page
     assert "at its bound" in page and "What would show more: lag: a step" in page

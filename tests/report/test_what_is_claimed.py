@@ -208,7 +208,7 @@ def test_an_optimum_of_one_start_alone_is_doubted_on_every_page(tmp_path: Path) 
     results = hydro(tmp_path, fit=fit, discrepancy=nothing)
     assert f"They may not be the best there are: {doubt}." in tile(first_screen(results), "values")
     page_of_letter = write_letter(tmp_path).read_text(encoding="utf-8")
-    assert f"The values may not be the best there are: {doubt}." in words(page_of_letter)
+    assert f"The fitted values may not be the best there are: {doubt}." in words(page_of_letter)
 
 
 MORE = {

@@ -41,9 +41,9 @@ def test_without_the_extra_the_message_names_it(monkeypatch):
 def test_a_linear_model_has_known_indices():
     pytest.importorskip("SALib")
     found = morris(MODEL, [REST], RANGES, against="base", trajectories=6)
-    assert np.allclose(found.measures["mu_star"], [[1, 0.5, 0]], atol=1e-6) and found.evaluations == 24
+    assert np.allclose(found.array("mu_star"), [[1, 0.5, 0]], atol=1e-6) and found.evaluations == 24
     shares = sobol(MODEL, [REST], RANGES, against="base", samples=256)
-    assert np.allclose(shares.measures["ST"], [[0.8, 0.2, 0]], atol=0.05)
+    assert np.allclose(shares.array("ST"), [[0.8, 0.2, 0]], atol=0.05)
     assert shares.to_dict()["measures"]["y"]["rest"]["c"]["ST"] == pytest.approx(0, abs=1e-9)
     assert found.to_xarray()["mu_star"].dims == ("series", "parameter")
     axes = found.plot()

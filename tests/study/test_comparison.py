@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 
 import hvdc_ident as hi
 from hvdc_ident.cli import app
-from hvdc_ident.study.comparison import distance, value_texts
+from hvdc_ident.study.comparison import ComparedValue, distance
 
 CARD = """\
 schema = 1
@@ -65,31 +65,32 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write_study(folder / "a", 5.0), second
 
 
-def estimate(value: float, std: float) -> dict[str, Any]:
-    return {"value": value, "ci95": [value - norm.isf(0.025) * std, value + norm.isf(0.025) * std]}
+def ends(value: float, std: float) -> tuple[float, float]:
+    return value - norm.isf(0.025) * std, value + norm.isf(0.025) * std
 
 
 def test_the_distance_of_equal_values_is_above_1_in_5_percent_of_cases() -> None:
     random = np.random.default_rng(5)
     draws = random.standard_normal((20_000, 2)) * (0.3, 0.7)
-    apart = [distance(estimate(a, 0.3), estimate(b, 0.7)) for a, b in draws]
+    apart = [distance((a, b), (ends(a, 0.3), ends(b, 0.7))) for a, b in draws]
     share = np.mean([a is not None and a > 1.0 for a in apart])
     assert share == pytest.approx(0.05, abs=4.0 * math.sqrt(0.05 * 0.95 / len(draws)))
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "apart"),
+    ("values", "intervals", "apart"),
     [
-        ({"value": 1.0, "ci95": [0.0, 1.3]}, {"value": 2.0, "ci95": [1.6, 9.0]}, 2.0),  # 3-4-5
-        ({"value": 2.0, "ci95": [1.6, 9.0]}, {"value": 1.0, "ci95": [0.0, 1.3]}, 2.0),
-        ({"value": 1.0, "ci95": [0.0, None]}, {"value": 2.0, "ci95": [1.6, 9.0]}, None),
-        ({"value": 1.0, "ci95": None}, {"value": 2.0, "ci95": [1.6, 9.0]}, None),
-        ({"value": 1.0, "ci95": [1.0, 1.0]}, {"value": 1.0, "ci95": [1.0, 1.0]}, 0.0),
-        ({"value": 1.0, "ci95": [1.0, 1.0]}, {"value": 2.0, "ci95": [2.0, 2.0]}, None),
+        ((1.0, 2.0), ((0.0, 1.3), (1.6, 9.0)), 2.0),  # 3-4-5
+        ((2.0, 1.0), ((1.6, 9.0), (0.0, 1.3)), 2.0),
+        ((1.0, 2.0), ((0.0, None), (1.6, 9.0)), None),
+        ((1.0, 2.0), (None, (1.6, 9.0)), None),
+        ((1.0, None), ((0.0, 1.3), None), None),
+        ((1.0, 1.0), ((1.0, 1.0), (1.0, 1.0)), 0.0),
+        ((1.0, 2.0), ((1.0, 1.0), (2.0, 2.0)), None),
     ],
 )
-def test_the_halves_that_face_each_other_count(first: Any, second: Any, apart: float | None) -> None:
-    assert distance(first, second) == (apart if apart is None else pytest.approx(apart))
+def test_the_halves_that_face_each_other_count(values: Any, intervals: Any, apart: float | None) -> None:
+    assert distance(values, intervals) == (apart if apart is None else pytest.approx(apart))
 
 
 @pytest.mark.parametrize(
@@ -104,8 +105,9 @@ def test_the_halves_that_face_each_other_count(first: Any, second: Any, apart: f
 )
 def test_values_below_ten_million_have_no_exponent(value: float, ci95: list[float | None], shown: str) -> None:
     """The figures of an interval end where two of its half are told."""
-    line = {"values": [value, value], "ci95": [ci95, ci95], "held": ["", ""]}
-    assert value_texts(line) == (shown, shown)
+    both, ends = (value, value), (ci95[0], ci95[1])
+    line = ComparedValue("k", "", both, both, (ends, ends), False, ("", ""), None, None, (None, None), (None, None))
+    assert line.texts == (shown, shown)
 
 
 def test_two_plants_are_told_apart(pair: tuple[Path, Path], tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from typer.testing import CliRunner
 import hvdc_ident as hi
 from hvdc_ident.cli import app
 from hvdc_ident.errors import StudyError
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.study.export import SSV
 from hvdc_ident.study.value_sets import value_set
 from hvdc_ident.summary import Results
@@ -244,7 +245,7 @@ def test_an_ambiguous_diagnosis_decides_nothing(study: Path, tmp_path: Path, res
         found = value_set(loaded, wanted, folder)
         assert (found.name, found.of, found.model) == ("fitted", "fit", None) and dict(found.values) == fit
         assert "without an effect" in found.note and "the diagnosis is ambiguous" in found.note
-        assert "--values effect takes those with lag at" in found.note
+        assert found.next == (NextStep("values", "effect"),) and "with lag at" in found.note
     asked = value_set(loaded, "effect", folder)
     assert asked.of == "effect" and "not certain: the diagnosis is ambiguous" in asked.note
     summary = Results(folder).summary

@@ -1,8 +1,9 @@
 """Every quantity has one value and every model one verdict, wherever a run of a study tells it.
 
-Four small plants, whose recordings scipy makes, play the parts of plants whose results were told wrongly: one with a wrong gain beside
-a missing delay, one whose missing lag may be at either of two places, one with a signal in MW that no profile has limits for, and one
-that lacks nothing. What was made by `new` and results as large as the demo's are read too.
+Six small plants, whose recordings scipy makes, play the parts of plants whose results were told wrongly: one with a wrong gain beside
+a missing delay, one whose missing lag may be at either of two places, one with a signal in MW that no profile has limits for, one
+that lacks nothing, a turbine whose gate is late, and a machine of wrong damping. What was made by `new` and results as large as the
+demo's are read too.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
 from hvdc_ident.report.letter import write_letter
 from hvdc_ident.report.page import write_report
-from hvdc_ident.summary import Results, RunSummary
+from hvdc_ident.summary import Results, RunSummary, summarise
 from hvdc_ident.summary.run_summary import ParameterSummary
 from tests.report.demo_like import demo_like
 
@@ -64,6 +66,37 @@ noise = {ya = 0.002, yb = 0.002}
 starts = 2
 [diagnose]
 effects = EFFECTS
+"""
+
+
+TW = 0.8
+TURBINE = """schema = 1
+name = "turbine"
+[parameters]
+Tg = {value = 0.2, unit = "s", min = 0.02, max = 2}
+Tw = {value = 1.0, unit = "s", min = 0.1, max = 4}
+[inputs]
+u = {value = 0.0, unit = "pu"}
+[states]
+g = {derivative = "(u - g)/Tg", unit = "pu"}
+x = {derivative = "2*(g - x)/Tw", unit = "pu"}
+[outputs]
+P = {value = "3*x - 2*g", unit = "pu"}
+"""
+MACHINE = """schema = 1
+name = "machine"
+[parameters]
+H = {value = 3.5, unit = "s", min = 1, max = 10}
+D = {value = 8.0, unit = "pu", min = 1, max = 50}
+[inputs]
+u = {value = 0.0, unit = "pu"}
+[states]
+d = {derivative = "314.159*w", unit = "rad", guess = 0.28}
+w = {derivative = "(0.5 + 0.1*u - Pe - D*w)/(2*H)", unit = "pu"}
+[signals]
+Pe = "1.8*sin(d)"
+[outputs]
+Pe = {value = "Pe", unit = "pu"}
 """
 
 
@@ -132,14 +165,48 @@ def told(folder: Path, screen: str) -> Told:
 
 def of_plant(folder: Path, name: str) -> Told:
     ya, yb, unit, effects = PLANTS[name]
+    study = STUDY.replace("NAME", name).replace("EFFECTS", effects)
+    return made(folder, CARD.replace("UNIT", unit), study, {"ya": ya, "yb": yb})
+
+
+def made(folder: Path, card: str, study: str, outputs: Mapping[str, np.ndarray]) -> Told:
+    """Run a study of a step of u, of which each output is recorded with noise."""
     random = np.random.default_rng(5)
-    noisy = [y + NOISE * random.standard_normal(TIME.size) for y in (ya, yb)]
-    np.savetxt(
-        folder / "step.csv", np.column_stack([TIME, STEP, *noisy]), delimiter=",", header="time,u,ya,yb", comments=""
-    )
-    (folder / "m.toml").write_text(CARD.replace("UNIT", unit), "utf-8")
-    (folder / "study.toml").write_text(STUDY.replace("NAME", name).replace("EFFECTS", effects), "utf-8")
+    noisy = [y + NOISE * random.standard_normal(TIME.size) for y in outputs.values()]
+    header = ",".join(["time", "u", *outputs])
+    np.savetxt(folder / "step.csv", np.column_stack([TIME, STEP, *noisy]), delimiter=",", header=header, comments="")
+    (folder / "m.toml").write_text(card, "utf-8")
+    (folder / "study.toml").write_text(study, "utf-8")
     return told(folder / "study-results", call("run", folder / "study.toml"))
+
+
+def of_turbine(folder: Path) -> Told:
+    """A gate and its penstock: the plant's gate is late too, and a fit without that finds another time of the water."""
+    gate = late(lagged(STEP, 0.2), 10)
+    power = lsim(([-TW, 1.0], [0.5 * TW, 1.0]), gate, TIME)[1]
+    study = _study("turbine", "Tg = {min = 0.02, max = 2}\nTw = {min = 0.1, max = 4}", ["P"], '["delay"]')
+    return made(folder, TURBINE, study, {"P": power})
+
+
+def of_machine(folder: Path) -> Told:
+    """A machine at an infinite bus whose damping is given wrongly, and that lacks nothing."""
+
+    def swing(t: float, x: np.ndarray) -> list[float]:
+        power = 0.5 + 0.1 * (t >= 0.5)
+        return [314.159 * x[1], (power - 1.8 * np.sin(x[0]) - 12.0 * x[1]) / (2 * 3.5)]
+
+    rest = [np.arcsin(0.5 / 1.8), 0.0]
+    run = solve_ivp(swing, (0.0, TIME[-1]), rest, t_eval=TIME, rtol=1e-9, atol=1e-12, max_step=0.01)
+    study = _study("machine", "H = {min = 1, max = 10}\nD = {min = 1, max = 50}", ["Pe"], '["lag"]')
+    return made(folder, MACHINE, study, {"Pe": 1.8 * np.sin(run.y[0])})
+
+
+def _study(name: str, parameters: str, outputs: list[str], effects: str) -> str:
+    """The study of another model and these outputs."""
+    text = STUDY.replace("NAME", name).replace("EFFECTS", effects)
+    text = text.replace("Ta = {min = 0.01, max = 3}\nKb = {min = 0.1, max = 5}", parameters)
+    noise = ", ".join(f"{o} = {NOISE}" for o in outputs)
+    return text.replace('["ya", "yb"]', json.dumps(outputs)).replace("{ya = 0.002, yb = 0.002}", f"{{{noise}}}")
 
 
 def of_new(folder: Path) -> Told:
@@ -153,6 +220,8 @@ def of_new(folder: Path) -> Told:
 
 MAKERS: dict[str, Callable[[Path], Told]] = {
     **{name: lambda folder, name=name: of_plant(folder, name) for name in PLANTS},  # type: ignore[misc]
+    "turbine": of_turbine,
+    "machine": of_machine,
     "new": of_new,
     "demo-like": lambda folder: told(demo_like(folder / "demo"), ""),
 }
@@ -300,8 +369,17 @@ def test_the_parts_that_were_told_wrongly(study_of: Callable[[str], Told]) -> No
     assert ta.by_place and ta.value is None and kb.moved
     assert {round(v.value, 1) for v in ta.by_place} == {0.1, 0.4} and "Your value of Ta" not in places.letter
     assert "wherever it is, the recordings ask for other values than you gave: Kb = 1.50" in places.letter
+    assert "The fitted values hold only if nothing else is missing: without lag at y" in places.letter
     mixed = found["mixed-units"]
     assert mixed.summary.sets["given"].in_limits.not_judged == 1 and "every signal it is less" not in mixed.letter
     assert "1 signal not judged: yb" in mixed.report
+    alone = summarise({"discrepancy": Results(mixed.folder).get("discrepancy")})
+    assert {x.output: x.unit for x in alone.signals} == {"ya": "pu", "yb": "MW"}, "as told after `diagnose` alone"
     right = found["right"].summary
     assert right.verdict == "pass" and not right.findings and not right.moved and not right.counting.kind
+    turbine = study_of("turbine").summary
+    water = next(p for p in turbine.parameters if p.name == "Tw")
+    assert turbine.counting.name == "effect" and water.interval[0] < TW < water.interval[1] and abs(water.fitted - TW) > 0.03
+    machine = study_of("machine").summary
+    assert machine.verdict == "pass" and not machine.counting.kind and [p.name for p in machine.moved] == ["D"]
+    assert machine.moved[0].value == pytest.approx(12.0, rel=0.03)

@@ -14,9 +14,9 @@ from hvdc_ident.colours import DARK, LIGHT
 from hvdc_ident.errors import InputError
 from hvdc_ident.summary import Results, RunSummary, summarise
 from hvdc_ident.text import estimate_text, estimate_texts, interval_text
-from tests.report.demo_like import HEADING, demo_like
+from tests.report.demo_like import HEADING, advice, demo_like
 
-ADVICE = {"recommended_experiment": {"text": "step u"}}
+ADVICE = {"recommended_experiment": advice("u", "step u")}
 
 
 def fit(half: float, verdict: str = "fits") -> dict[str, Any]:

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.colours import EFFECT, RECORDED, ROLES
+from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.report.drawing import figure, svg, visible
 from hvdc_ident.report.html import Section, captioned, folded, number, rows_of, table_of, text, typeset
 from hvdc_ident.report.overlay import Sheet
 from hvdc_ident.summary import Results, RunSummary
 from hvdc_ident.summary.phrases import by_place, gained_sentence
 from hvdc_ident.summary.tables import findings_table
-from hvdc_ident.text import estimate_text, form_of, listed, percentage, quantity, span, with_unit
+from hvdc_ident.text import capital, estimate_text, listed, percentage, quantity, span, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,20 +28,20 @@ SHOWN = 5e-3
 
 
 def _render(results: Results) -> str:
-    found = results.get("discrepancy")
-    if not found.get("verdict"):
+    found = results.objects.diagnosis
+    if found is None:
         return ""
     s = results.summary
-    notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.get("notes") or [])
+    notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.notes)
     compared = "For specialists: what else was tried, and how far behind it is on the scale of the Bayesian information criterion (BIC)."
     return "".join(
         [
-            _lead(found),
+            f"<p><strong>{text(capital(found.verdict))}.</strong> {text(found.text)}</p>",
             _effects(s),
             _findings(s),
             _curve(found),
             _gap(s, found),
-            _slider(found.get("sizes")),
+            _slider(results.get("discrepancy").get("sizes")),
             folded(
                 "Where model and recordings differ",
                 _where(s, found),
@@ -52,20 +53,15 @@ def _render(results: Results) -> str:
     )
 
 
-def _lead(found: dict[str, Any]) -> str:
-    verdict = str(found["verdict"])
-    return f"<p><strong>{text(verdict[:1].upper() + verdict[1:])}.</strong> {text(found.get('text', ''))}</p>"
-
-
-def _curve(found: dict[str, Any]) -> str:
+def _curve(found: Diagnosis) -> str:
     """The curve of what has no name, where one was found."""
-    other = found.get("fallback") or {}
+    other = found.fallback or {}
     if not other.get("curve"):
         return ""
     name = f"what is added to {other['at']} over {other['curve']['over']}"
     return captioned(
         svg(hidden_curve(other["at"], other["curve"]), name),
-        f"{text(name[:1].upper() + name[1:])}, with its 95 % band.",
+        f"{text(capital(name))}, with its 95 % band.",
     )
 
 
@@ -88,12 +84,12 @@ def _findings(s: RunSummary) -> str:
     return "<h3>What may be missing, and where</h3>" + table_of(findings_table(s))
 
 
-def _sets(found: dict[str, Any]) -> str:
+def _sets(found: Diagnosis) -> str:
     parts = []
-    for group in (g for g in found.get("ambiguity") or [] if len(g) > 1):
-        late = ["" if r.get("late") is None else quantity(r["late"], "s", 3) for r in group]
+    for group in (g for g in found.ambiguity if len(g) > 1):
+        late = ["" if r.late is None else quantity(r.late, "s", 3) for r in group]
         rows = [
-            (form_of(r), ", ".join(r["at"]), r.get("from") or "", delay, r["delta_bic"])
+            (r.name, ", ".join(r.at), r.source, delay, r.delta_bic)
             for r, delay in zip(group[:MOST], late, strict=False)
         ]
         more = f"<p class='small'>and {len(group) - MOST} more</p>" if len(group) > MOST else ""
@@ -102,12 +98,11 @@ def _sets(found: dict[str, Any]) -> str:
     return "".join(parts)
 
 
-def _gap(s: RunSummary, found: dict[str, Any]) -> str:
+def _gap(s: RunSummary, found: Diagnosis) -> str:
     """Figure of the pooled residual before and after, and a sentence on the held-out recordings."""
-    gap = found.get("gap") or {}
-    if not gap.get("pooled"):
+    if not found.gap.pooled:
         return ""
-    picture = svg(gap_bars(gap["pooled"]), "residual of the three models in noise units")
+    picture = svg(gap_bars(found.gap.pooled), "residual of the three models in noise units")
     caption = "Residual of all signals together in units of the noise, on fitted and on held-out recordings."
     gained = gained_sentence(s)
     line = f"<p>{text(gained)}</p>" if gained else ""
@@ -154,8 +149,8 @@ def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
     return drawn
 
 
-def _where(s: RunSummary, found: dict[str, Any]) -> str:
-    place = found.get("location") or {}
+def _where(s: RunSummary, found: Diagnosis) -> str:
+    place = found.location
     outputs, experiments = _shares(place.get("outputs")), _shares(place.get("experiments"))
     window, band, region = place.get("time_window"), place.get("band_hz"), place.get("region")
     parts = [f"Share of the gap by output: {outputs}; by experiment: {experiments}."] if outputs else []
@@ -176,12 +171,11 @@ def _shares(found: dict[str, float] | None) -> str:
     return ", ".join(f"{text(n)} {percentage(v)}" for n, v in list((found or {}).items())[:5] if v >= SHOWN)
 
 
-def _candidates(found: dict[str, Any]) -> str:
-    lines = [c for c in found.get("candidates") or [] if c.get("delta_bic") is not None][:MOST]
+def _candidates(found: Diagnosis) -> str:
+    lines = [c for c in found.candidates if c.delta_bic is not None][:MOST]
     if not lines:
         return ""
-    keys = ("score", "p", "delta_bic", "holdout_rmse")
-    rows = [(c["effect"], ", ".join(c["at"]), c.get("from") or "", *(c.get(k) for k in keys)) for c in lines]
+    rows = [(c.effect, ", ".join(c.at), c.source, c.score, c.p, c.delta_bic, c.holdout_rmse) for c in lines]
     header = ["effect", "at", "from", "score", "p", "gain in BIC", "held out, noise units"]
     note = (
         "<p class='small'>Score: how much of the residuals the effect's signature takes at its best size, in noise units "

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from hvdc_ident.fit import FitResult
 from hvdc_ident.report.html import Section, folded, number, rows_of, text
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.phrases import by_place, interval_name, remarks, why_conditional
 from hvdc_ident.summary.run_summary import Interval
+from hvdc_ident.summary.stage_results import Context
 from hvdc_ident.text import capital, change_text, estimate_texts, figures, interval_text, interval_words
 
 
 def _render(results: Results) -> str:
-    fit = results.get("fit")
-    candidates = fit.get("candidates") or {}
-    if not candidates:
+    fit, about = results.objects.fit, results.objects.of_fit
+    if fit is None or not about.candidates:
         return ""
-    held = fit.get("held") or {}
-    fixed = [n for n in held if n not in candidates]
+    fixed = [n for n in fit.held if n not in about.candidates]
     rest = f"<p class='small'>Not candidates, at the model's values: {text(', '.join(fixed))}.</p>" if fixed else ""
-    return _outcome(fit) + _by_name(results, fit) + _weights(fit) + rest + _more(fit)
+    return _outcome(fit) + _by_name(results, fit) + _weights(fit) + rest + _more(fit, about)
 
 
-def _by_name(results: Results, fit: dict[str, Any]) -> str:
+def _by_name(results: Results, fit: FitResult) -> str:
     """Table of every value that a parameter has, each column with its name."""
     s = results.summary
     rows = []
@@ -33,16 +31,17 @@ def _by_name(results: Results, fit: dict[str, Any]) -> str:
         rows.append((p.name, p.given, *alone, p.refitted if added else "", *with_it, p.unit))
     header = ["parameter", "given", "fitted", interval_name(s, "fitted"), "change", "refitted by the diagnosis"]
     header += ["with the effect", interval_name(s, "effect"), "change", "unit"]
+    conditions = ""
     if s.counting.name == "effect":
         counting = "these are the values that count"
+        conditions = f", if nothing else is missing: {text(why_conditional(s))}" if s.counts_conditional else ""
     else:
         counting = f"{text(s.counting.doubt)}, so exports take the fitted ones unless --values effect asks for these"
-    conditions = f", if nothing else is missing: {text(why_conditional(s))}" if s.counts_conditional else ""
     told = (
         "<p class='small'>Refitted by the diagnosis: all at once to the fitted recordings, with nothing added to the model. With the "
         f"effect: the same with the finding in the model; {counting}{conditions}.</p>"
     )
-    return rows_of(header, rows) + (told if s.counting.kind else "") + _notes(fit)
+    return rows_of(header, rows) + (told if s.counting.kind else "") + _notes(fit, results.objects.of_fit)
 
 
 def _cells(value: float | None, interval: Interval | None, given: float | None) -> tuple[str, str, str]:
@@ -52,9 +51,9 @@ def _cells(value: float | None, interval: Interval | None, given: float | None) 
     return estimate_texts(value, interval)[0], interval_text(interval) or "–", change_text(value, given)
 
 
-def _notes(fit: dict[str, Any]) -> str:
+def _notes(fit: FitResult, about: Context) -> str:
     """Why parameters are held, and on what the intervals rest."""
-    lines = "".join(f"<li><strong>{text(n)}</strong>: {text(said)}.</li>" for n, said in remarks(fit).items())
+    lines = "".join(f"<li><strong>{text(n)}</strong>: {text(said)}.</li>" for n, said in remarks(fit, about.candidates).items())
     return f"<ul class='small'>{lines}</ul>" if lines else ""
 
 
@@ -67,69 +66,61 @@ STATUS = {
 }
 
 
-def _outcome(fit: dict[str, Any]) -> str:
+def _outcome(fit: FitResult) -> str:
     """Paragraph on the status of the fit."""
-    status = str(fit.get("status", ""))
-    judged = fit.get("adequacy") or {}
-    word = "" if status == "converged" else f" ({text(status)})"
-    said = f"<p><strong>{text(STATUS.get(status, status))}</strong>{word}: {text(fit.get('message', ''))}.</p>"
-    said += f"<p>{text(capital(judged['text']))}.</p>" if judged.get("text") else ""
-    if fit.get("roughness"):
-        said += f"<p>{text(fit['roughness']['text'])}.</p>"
-    return said
+    word = "" if fit.status == "converged" else f" ({text(fit.status)})"
+    said = f"<p><strong>{text(STATUS.get(fit.status, fit.status))}</strong>{word}: {text(fit.message)}.</p>"
+    said += f"<p>{text(capital(fit.adequacy.text))}.</p>" if fit.adequacy is not None and fit.adequacy.text else ""
+    return said + (f"<p>{text(fit.roughness['text'])}.</p>" if fit.roughness else "")
 
 
-def _more(fit: dict[str, Any]) -> str:
+def _more(fit: FitResult, context: Context) -> str:
     """Derived quantities and nuisances; then, folded, bounds, correlations and fits one by one."""
     about = "For specialists: bounds, standard deviations, correlations, and each recording fitted alone."
-    special = _searched(fit) + _correlation(fit) + _one_by_one(fit)
-    return _derived(fit) + _nuisances(fit) + folded("How the estimates were found", special, about)
+    special = _searched(fit, context) + _correlation(fit) + _one_by_one(fit)
+    return _derived(context) + _nuisances(fit) + folded("How the estimates were found", special, about)
 
 
-def _searched(fit: dict[str, Any]) -> str:
+def _searched(fit: FitResult, context: Context) -> str:
     """Table of the estimates' standard deviations and of the bounds of the search."""
-    estimates, rows = fit.get("estimates") or {}, []
-    for name, line in fit["candidates"].items():
-        low, high = ("∞" if line.get(k) is None else figures(line[k]) for k in ("min", "max"))
-        std = (estimates.get(name) or {}).get("std")
-        rows.append((name, std, f"{'-' * (low == '∞')}{low} … {high}", line.get("start"), line.get("unit") or ""))
+    rows = []
+    for name, line in context.candidates.items():
+        low, high = ("∞" if end is None else figures(end) for end in (line.min, line.max))
+        std = fit.estimates[name].std if name in fit.estimates else None
+        rows.append((name, std, f"{'-' * (low == '∞')}{low} … {high}", line.start, line.unit))
     return rows_of(["parameter", "standard deviation", "bounds", "search began at", "unit"], rows)
 
 
-def _derived(fit: dict[str, Any]) -> str:
-    lines = fit.get("derived") or {}
-    rows = [(n, d["value"], d.get("std"), d.get("unit") or "", d["expression"]) for n, d in lines.items()]
+def _derived(context: Context) -> str:
+    lines = context.derived.items()
+    rows = [(n, d["value"], d.get("std"), d.get("unit") or "", d["expression"]) for n, d in lines]
     shown = rows_of(["parameter", "value", "std", "unit", "expression"], rows)
     return f"<h3>What follows from the estimates</h3>{shown}" if shown else ""
 
 
-def _nuisances(fit: dict[str, Any]) -> str:
+def _nuisances(fit: FitResult) -> str:
     rows = []
-    for experiment, line in (fit.get("nuisance") or {}).items():
+    for experiment, line in fit.nuisance.items():
         for name, e in line.items():
-            value, ends = estimate_texts(e["value"], e.get("ci95"))[0], interval_text(e.get("ci95")) or "–"
-            rows.append((experiment, name, value, e.get("std"), ends, e.get("unit") or "", e.get("reason") or ""))
-    words = interval_words(beyond_noise=(fit.get("adequacy") or {}).get("verdict") == "does-not-fit")
+            value, ends = estimate_texts(e.value, e.ci95)[0], interval_text(e.ci95) or "–"
+            rows.append((experiment, name, value, e.std, ends, e.unit, e.reason))
+    words = interval_words(beyond_noise=fit.adequacy is not None and fit.adequacy.verdict == "does-not-fit")
     shown = rows_of(["experiment", "unknown of it alone", "value", "std", words, "unit", "note"], rows)
     return f"<h3>Unknown in single experiments</h3>{shown}" if shown else ""
 
 
-def _correlation(fit: dict[str, Any]) -> str:
-    matrix = fit.get("correlation") or {}
-    names = [n for n in matrix if n in (fit.get("fitted") or [])]
+def _correlation(fit: FitResult) -> str:
+    names = [n for n in fit.correlation if n in fit.fitted]
     if len(names) < 2:
         return ""
-    rows = [(a, *(None if matrix[a].get(b) is None else figures(matrix[a][b], 2) for b in names)) for a in names]
+    lines = fit.correlation
+    rows = [(a, *(figures(lines[a][b], 2) if b in lines[a] else None for b in names)) for a in names]
     return "<h3>Correlation of the estimates</h3>" + rows_of(["", *names], rows)
 
 
-def _one_by_one(fit: dict[str, Any]) -> str:
-    known = fit.get("estimates") or {}  # a weak one has no value with a spread, here neither
-    lines = {
-        n: d
-        for n, d in (fit.get("per_experiment") or {}).items()
-        if d.get("std") is not None and (known.get(n) or {}).get("std") is not None
-    }
+def _one_by_one(fit: FitResult) -> str:
+    spread = {n for n, e in fit.estimates.items() if e.std is not None}  # a weak one has no value with a spread, here neither
+    lines = {n: d for n, d in fit.per_experiment.items() if d.get("std") is not None and n in spread}
     if not lines:
         return ""
     rows = []
@@ -144,16 +135,13 @@ def _one_by_one(fit: dict[str, Any]) -> str:
     return f"<h3>Experiment by experiment</h3>{rows_of(head, rows)}{told}"
 
 
-def _weights(fit: dict[str, Any]) -> str:
+def _weights(fit: FitResult) -> str:
     """Note on the origin of each output's standard deviation, which decides the intervals."""
-    sources = fit.get("noise_source") or {}
-    if not sources:
-        return ""
-    misfit = [o for o, s in sources.items() if str(s) == "misfit" or "misfit" in str(s)]
-    given = [o for o in sources if o not in misfit]
+    misfit = [o for o, source in fit.noise_source.items() if "misfit" in source]
+    given = [o for o in fit.noise_source if o not in misfit]
     parts = []
     if given:
-        chi2 = (fit.get("adequacy") or {}).get("chi2_per_dof")
+        chi2 = fit.adequacy.chi2_per_dof if fit.adequacy is not None else None
         beside = "" if chi2 is None else f", against which χ² per degree of freedom is {number(chi2, 3)}"
         parts.append(
             f"Intervals rest on the noise given or estimated before the event for {text(', '.join(given))}{beside}."
@@ -162,7 +150,7 @@ def _weights(fit: dict[str, Any]) -> str:
         parts.append(
             f"{text(', '.join(misfit))}: the noise is not known, so the standard deviation is that of the misfit."
         )
-    return f"<p class='small'>{' '.join(parts)}</p>"
+    return f"<p class='small'>{' '.join(parts)}</p>" if parts else ""
 
 
 SECTION = Section(

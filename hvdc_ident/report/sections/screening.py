@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hvdc_ident.report.html import Section, number, table, text
+from hvdc_ident.sensitivity import ScreeningResult
 from hvdc_ident.summary import Results
 
 COLUMNS = {
@@ -15,19 +16,18 @@ def _render(results: Results) -> str:
     data = results.get("screening")
     if not data.get("measures"):
         return ""
-    columns = COLUMNS[data["method"]]
-    first = next(iter(columns))
-    rows = []
-    for output, line in data["measures"].items():
-        for experiment, measures in line.items():
-            for p in sorted(measures, key=lambda n: -measures[n][first]):
-                values = [number(measures[p][n], 3) for n in columns]
-                rows.append([text(output), text(experiment), text(p), *values])
-    method = "Morris' elementary effects" if data["method"] == "morris" else "Sobol's indices"
+    found = ScreeningResult.from_dict(data)
+    columns = COLUMNS[found.method]
+    rows = [
+        [text(o), text(e), text(p), *(number(m[n], 3) for n in columns)]
+        for o, e in found.series
+        for p, m in found.of(o, e).items()
+    ]
+    method = "Morris' elementary effects" if found.method == "morris" else "Sobol's indices"
     against = "the recordings" if data["against"] == "data" else "the model's own run"
     head = (
-        f"<p>{method} of the RMSE against {against}, every parameter over its whole range; {data['evaluations']} runs, "
-        f"{data['failed']} failed.</p>"
+        f"<p>{method} of the RMSE against {against}, every parameter over its whole range; {found.evaluations} runs, "
+        f"{found.failed} failed.</p>"
     )
     return head + table(["output", "experiment", "parameter", *columns.values()], rows, words=(0, 1, 2))
 

@@ -11,6 +11,7 @@ from hvdc_ident.colours import MARK, SERIES
 from hvdc_ident.data import Array
 from hvdc_ident.report.drawing import bode_axes, draw_response, figure, svg
 from hvdc_ident.report.html import Section, captioned, number, table, text
+from hvdc_ident.sensitivity import SweepResult
 from hvdc_ident.summary import Results
 from hvdc_ident.text import with_unit
 
@@ -25,92 +26,69 @@ OTHERS = "#c4c4c4"
 
 
 def _render(results: Results) -> str:
-    found = results.get("sweep")
-    points, parameters = found.get("points") or [], found.get("parameters") or {}
-    if not points or not parameters:
+    data = results.get("sweep")
+    if not data.get("points") or not data.get("parameters"):
         return ""
-    names = ", ".join(text(p) for p in parameters)
-    against = {"data": "the recordings", "base": "the run at the base values"}.get(
-        str(found.get("against")), f"model {found.get('against')}"
-    )
-    lines = [f"<p>{len(points)} points of {names} against {text(against)}.</p>"]
-    failed = [p for p in points if p.get("status") == "failed"]
-    if failed:
-        reasons = list(dict.fromkeys(str(p.get("reason")) for p in failed))[:3]
-        lines.append(f"<p>{len(failed)} points failed: {'; '.join(map(text, reasons))}.</p>")
-    good = [p for p in points if p.get("status") == "done"]
-    if not good:
+    found = SweepResult.from_dict(data)
+    names = ", ".join(map(text, found.parameters))
+    against = {"data": "the recordings", "base": "the run at the base values"}.get(found.against, f"model {found.against}")
+    lines = [f"<p>{len(found)} points of {names} against {text(against)}.</p>"]
+    if found.failed:
+        reasons = list(dict.fromkeys(found.failed.values()))[:3]
+        lines.append(f"<p>{len(found.failed)} points failed: {'; '.join(map(text, reasons))}.</p>")
+    good = np.array([k for k in range(len(found)) if k not in found.failed], dtype=int)
+    if not good.size:
         return "".join(lines)
-    errors = _errors(good)
-    lines.append(_best(good, list(parameters), errors, found.get("units") or {}))
-    step = max(1, len(good) // MOST)
-    units, omega = found.get("units") or {}, found.get("omega") or []
-    lines += [_figures(p, parameters, good[::step], errors, step, units, omega) for p in parameters]
-    return "\n".join(lines)
+    rows = good[:: max(1, good.size // MOST)]
+    return "\n".join([*lines, _best(found), *(_figures(found, name, rows) for name in found.parameters)])
 
 
-def _errors(points: list[dict[str, Any]]) -> dict[tuple[str, str], Array]:
-    """The RMSE of each (output, experiment) over the points."""
-    series = [(o, e) for o, line in points[0]["rmse"].items() for e in line]
-    return {(o, e): np.array([p["rmse"][o][e] for p in points], dtype=float) for o, e in series}
-
-
-def _best(
-    points: list[dict[str, Any]], names: list[str], errors: dict[tuple[str, str], Array], units: dict[str, Any]
-) -> str:
+def _best(found: SweepResult) -> str:
     rows = []
-    for (output, experiment), values in errors.items():
-        extremes = [number(float(values.min()), 3), number(float(values.max()), 3)]
-        best = points[int(np.argmin(values))]["values"]
-        at = [
-            "–" if extremes[0] == extremes[1] else number(best[n], 5) for n in names
-        ]  # of a flat line none is the best
-        rows.append([text(output), text(experiment), *at, *extremes, text(units.get(output, ""))])
-    header = ["output", "experiment", *(f"best {text(n)}" for n in names), "smallest RMSE", "largest", "unit"]
+    for (output, experiment), unit in zip(found.series, found.series_units, strict=True):
+        errors = found.error(output, experiment)
+        extremes = [number(float(np.nanmin(errors)), 3), number(float(np.nanmax(errors)), 3)]
+        best = found.best(output, experiment)
+        flat = extremes[0] == extremes[1]  # of a flat line none is the best
+        at = ["–" if flat else number(v, 5) for v in best.values()]
+        rows.append([text(output), text(experiment), *at, *extremes, text(unit)])
+    header = ["output", "experiment", *(f"best {text(n)}" for n in found.parameters), "smallest RMSE", "largest", "unit"]
     return table(header, rows, words=(0, 1, len(header) - 1)) if rows else ""
 
 
-def _figures(
-    name: str,
-    parameters: dict[str, Any],
-    points: list[dict[str, Any]],
-    errors: dict[tuple[str, str], Array],
-    step: int,
-    units: dict[str, Any],
-    omega: list[float],
-) -> str:
-    values = np.array([p["values"][name] for p in points], dtype=float)
-    about = parameters[name]
-    curve = len(parameters) == 1
+def _figures(found: SweepResult, name: str, rows: Array) -> str:
+    """The figures over one parameter. rows: (n,) the points that are drawn."""
+    values = found.values(name)[rows]
+    curve = len(found.parameters) == 1
     order = np.argsort(values, kind="stable") if curve else np.arange(values.size)
     drawn = []
-    for unit in dict.fromkeys(str(units.get(o, "")) for o, _ in errors):
-        chosen = {f"{o}, {e}": v[::step][order] for (o, e), v in errors.items() if str(units.get(o, "")) == unit}
-        fig = sweep_errors(name, str(about.get("unit", "")), values[order], chosen, unit, about.get("base"), curve)
-        label = f"RMSE over {name}"
+    for unit in dict.fromkeys(found.series_units):
+        chosen = {
+            f"{o}, {e}": found.error(o, e)[rows][order]
+            for (o, e), own in zip(found.series, found.series_units, strict=True)
+            if own == unit
+        }
+        fig = sweep_errors(name, found.units[name], values[order], chosen, unit, found.base[name], curve)
         caption = f"Root mean square error over {text(name)}; the dotted line is the given value."
-        drawn.append(captioned(svg(fig, label), caption))
-    if points[0].get("poles"):
-        poles = np.array([p["poles"] for p in points], dtype=float)
-        fig = sweep_poles(name, values, poles[..., 0] + 1j * poles[..., 1])
+        drawn.append(captioned(svg(fig, f"RMSE over {name}"), caption))
+    if "poles" in found.wanted:
         caption = f"Poles over {text(name)}, those slower than 2000 1/s."
-        drawn.append(captioned(svg(fig, f"poles over {name}"), caption))
-    if points[0].get("bode"):
-        drawn += _bode(name, values, points, omega)
+        drawn.append(captioned(svg(sweep_poles(name, values, found.poles[rows]), f"poles over {name}"), caption))
+    if "bode" in found.wanted:
+        drawn += _bode(found, name, rows)
     return "\n".join(drawn)
 
 
-def _bode(name: str, values: Array, points: list[dict[str, Any]], omega: list[float]) -> list[str]:
+def _bode(found: SweepResult, name: str, rows: Array) -> list[str]:
     """One figure a channel, up to a few, with a curve for every so many points."""
-    rows = np.flatnonzero(np.array(omega) > 0)
-    some = np.unique(np.linspace(0, len(points) - 1, min(len(points), CURVES)).astype(int))
-    channels = [(o, i) for o, line in points[0]["bode"].items() for i in line][:CHANNELS]
+    positive = found.omega > 0
+    some = rows[np.unique(np.linspace(0, rows.size - 1, min(rows.size, CURVES)).astype(int))]
+    inputs, outputs = found.channels
     drawn = []
-    for output, source in channels:
-        pairs = np.array([points[k]["bode"][output][source] for k in some], dtype=float)
-        label = f"{output} over {source}"
-        responses = (pairs[..., 0] + 1j * pairs[..., 1])[:, rows]
-        fig = sweep_bode(name, values[some], np.array(omega)[rows], responses, label)
+    for b, a in [(b, a) for b in range(len(outputs)) for a in range(len(inputs))][:CHANNELS]:
+        label = f"{outputs[b]} over {inputs[a]}"
+        responses = found.response[some][:, positive, b, a]
+        fig = sweep_bode(name, found.values(name)[some], found.omega[positive], responses, label)
         caption = f"Frequency response of {text(label)} over {text(name)}, gain above phase."
         drawn.append(captioned(svg(fig, f"frequency response of {label} over {name}"), caption))
     return drawn

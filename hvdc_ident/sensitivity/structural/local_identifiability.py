@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hvdc_ident.codec import plain
+from hvdc_ident.codec import NOT_STORED, Coded
 from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SteadyStateError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
@@ -84,7 +84,7 @@ CLASSES = ("constant", "step", "ramp", "free")
 
 
 @dataclass(frozen=True, eq=False)
-class StructuralResult:
+class StructuralResult(Coded):
     """Structural identifiability of parameters from outputs, for one regime, input class and start.
 
     status: "decided" or "not decided"; then `reason` says why, and nothing is claimed: identifiable, unidentifiable and
@@ -106,25 +106,8 @@ class StructuralResult:
     combinations: tuple[Combination, ...] = ()
     rank: int = 0
     unseen: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    seconds: float = 0.0
+    seconds: float = field(default=0.0, metadata=NOT_STORED)
     out_of_reach: bool = False
-
-    def to_dict(self) -> dict[str, Any]:
-        """The result as plain values, without the time it took."""
-        return {
-            "parameters": list(self.parameters),
-            "outputs": list(self.outputs),
-            "inputs": dict(self.inputs),
-            "start": dict(self.start),
-            "regime": list(self.regime),
-            "status": self.status,
-            "reason": self.reason,
-            "method": self.method,
-            "identifiable": list(self.identifiable),
-            "unidentifiable": list(self.unidentifiable),
-            "combinations": [plain(c) for c in self.combinations],
-            "rank": self.rank,
-        }
 
     def __str__(self) -> str:
         if self.status != "decided":

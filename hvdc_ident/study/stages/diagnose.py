@@ -26,7 +26,7 @@ class NothingIdentified(ComputationError):
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
-    from hvdc_ident.identifiability import IdentifiabilityReport, gate
+    from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.model import Model
     from hvdc_ident.study.augmented import compared
     from hvdc_ident.study.pipeline import executor_of
@@ -45,7 +45,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         except NothingIdentified as e:
             return StageResult({"status": "failed", "message": str(e)}, failed=str(e))
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
-    beside, curves = compared(study, found, gate(report, diagnosis=True).fitted)
+    beside, curves = compared(study, found)
     data = {**found.to_dict(), "sizes": sizes, **beside}
     return StageResult(data, {**found.files, **curves})
 
@@ -73,11 +73,13 @@ def diagnosed(
     """
     from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
     from hvdc_ident.identifiability import gate
+    from hvdc_ident.study.augmented import with_estimates
     from hvdc_ident.study.schema import DiagnoseTable
 
     _need(study)
     asked = study.settings.diagnose or DiagnoseTable()
-    if not gate(report, diagnosis=True).fitted:
+    fitted = gate(report, diagnosis=True).fitted
+    if not fitted:
         raise NothingIdentified(
             "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own",
             next=(NextStep("identify"),),
@@ -95,6 +97,7 @@ def diagnosed(
         executor=executor,
         progress=progress,
     )
+    found = with_estimates(study, found, fitted)
     if not study.responses:
         return found
     names = ", ".join(r.name for r in study.responses)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
+    from hvdc_ident.summary.stage_results import Context
 
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
@@ -88,32 +89,35 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     from hvdc_ident.summary import summarise
     from hvdc_ident.summary.phrases import remarks
     from hvdc_ident.summary.screen import lines_of as screen
+    from hvdc_ident.summary.stage_results import Context, fit_of
     from hvdc_ident.text import capital
 
-    judged = (data.get("adequacy") or {}).get("text")
-    more = [f"{capital(judged)}."] if judged else []
-    more += [f"{data['roughness']['text']}."] if data.get("roughness") else []
-    more += [f"{n}: {remark}." for n, remark in remarks(data).items()] + _conditions(data)
-    more += [*response_lines(data.get("responses", ()), "fitted"), *_searched(data)]
-    return [f"{data['status']}: {data['message']}", "", *screen(summarise({"fit": data}), more=more)]
+    fit, about = fit_of(data), Context.from_dict(data)
+    if fit is None:
+        return []
+    more = [f"{capital(fit.adequacy.text)}."] if fit.adequacy is not None and fit.adequacy.text else []
+    more += [f"{fit.roughness['text']}."] if fit.roughness else []
+    more += [f"{n}: {remark}." for n, remark in remarks(fit, about.candidates).items()] + _conditions(fit, about)
+    more += [*response_lines(data.get("responses", ()), "fitted"), *_searched(fit, about)]
+    return [f"{fit.status}: {fit.message}", "", *screen(summarise({"fit": data}), more=more)]
 
 
-def _conditions(data: Mapping[str, Any]) -> list[str]:
+def _conditions(fit: FitResult, about: Context) -> list[str]:
     """The held parameters on whose values the estimates rest: those that these records do not tell, yet answer to."""
-    given = {n for e in data["estimates"].values() for n in e["conditional_on"]}
-    given |= {n for n, why in data["held"].items() if why.startswith(("practically-unidentifiable", "not-judged"))}
-    names = ", ".join(n for n in data["candidates"] if n in given and n in data["held"])
-    if not names or not data["fitted"]:
+    given = {n for e in fit.estimates.values() for n in e.conditional_on}
+    given |= {n for n, why in fit.held.items() if why.startswith(("practically-unidentifiable", "not-judged"))}
+    names = ", ".join(n for n in about.candidates if n in given and n in fit.held)
+    if not names or not fit.fitted:
         return []
     return [
         f"The estimates and their intervals hold for {names} as held: another value there may move them beyond these."
     ]
 
 
-def _searched(data: Mapping[str, Any]) -> list[str]:
+def _searched(fit: FitResult, about: Context) -> list[str]:
     """The range of each fitted parameter that has a bound missing: the results speak of what lies in it."""
-    rows = {n: c for n, c in data["candidates"].items() if n in data["fitted"] and None in (c["min"], c["max"])}
-    ranges = [f"{n} {c['searched'][0]:.4g} to {c['searched'][1]:.4g}" for n, c in rows.items() if c.get("searched")]
+    open_ended = {n: c.searched for n, c in about.candidates.items() if n in fit.fitted and None in (c.min, c.max)}
+    ranges = [f"{n} {s[0]:.4g} to {s[1]:.4g}" for n, s in open_ended.items() if s is not None]
     return [f"Without bounds of their own, starts were drawn from: {', '.join(ranges)}."] if ranges else []
 
 

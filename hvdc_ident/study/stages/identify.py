@@ -97,33 +97,35 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """
     from hvdc_ident.next_step import NextStep, next_sentence
     from hvdc_ident.summary import summarise
+    from hvdc_ident.summary.stage_results import identified_of
+    from hvdc_ident.text import capital
 
-    width = max(map(len, data["parameters"]), default=0)
-    doubt = (data.get("pilot") or {}).get("search_doubt")
-    lines = [f"{doubt[:1].upper()}{doubt[1:]}."] if doubt else []
+    report = identified_of(data)
+    width = max(map(len, report.parameters), default=0)
+    lines = [f"{capital(report.pilot.search_doubt)}."] if report.pilot.search_doubt else []
     beside = ""
-    if data["misspecified"]:
-        signs = "; ".join(data["misspecification"]["signs"])
+    if report.misspecified:
+        signs = "; ".join(report.misspecification.signs)
         lines.append(f"The model does not explain these data: {signs}. {next_sentence(NextStep('diagnose'))}")
-        ratio = (data.get("pilot") or {}).get("chi2_per_dof")
+        ratio = report.pilot.chi2_per_dof
         beside = "" if ratio is None else f" (chi2/dof {ratio:.3g})"
-    for name, v in data["parameters"].items():
-        lines.append(f"{name:{width}}  {v['verdict']}: {v['reason']}{beside if v['ci95'] else ''}")
-    lines += data["notes"]
-    lines += [data["not_recommended"]] if data.get("not_recommended") else []
+    lines += [f"{n:{width}}  {v.verdict}: {v.reason}{beside if v.ci95 else ''}" for n, v in report.parameters.items()]
+    lines += [*report.notes, *([report.not_recommended] if report.not_recommended else [])]
     lines += map(next_sentence, summarise({"identifiability": data}).next)
-    names = listed(data.get("identifiable") or ())
+    names = listed(report.identifiable)
     return [*lines, f"Next: `hvdc-ident fit STUDY` estimates {names}."] if names else lines
 
 
 def verdict(data: Mapping[str, Any]) -> str:
     """Return the candidates by their verdicts."""
+    from hvdc_ident.summary.stage_results import identified_of
+
+    report = identified_of(data)
     groups: dict[str, list[str]] = {}
-    for name, v in data["parameters"].items():
-        groups.setdefault(v["verdict"], []).append(name)
+    for name, v in report.parameters.items():
+        groups.setdefault(v.verdict, []).append(name)
     found = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
-    doubt = (data.get("pilot") or {}).get("search_doubt")
-    return f"{doubt}; {found}" if doubt else found
+    return f"{report.pilot.search_doubt}; {found}" if report.pilot.search_doubt else found
 
 
 STAGE = Stage(

@@ -58,28 +58,25 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
 
 def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The parameters of each output and experiment, the one that matters most first."""
-    name, text = ("mu_star", "mean effect") if data["method"] == "morris" else ("ST", "total share")
-    found = [f"{data['evaluations']} runs, {data['failed']} failed"]
-    for output, line in data["measures"].items():
-        for experiment, measures in line.items():
-            order = sorted(measures, key=lambda p: -measures[p][name])
-            unit = f" {data['units'][output]}".rstrip() if name == "mu_star" else ""
-            listed = ", ".join(f"{p} {measures[p][name]:.3g}{unit}" for p in order)
-            found.append(f"{output} in {experiment}, {text} on the RMSE: {listed}")
-    return found
+    from hvdc_ident.sensitivity import ScreeningResult
+
+    found = ScreeningResult.from_dict(data)
+    words = "mean effect" if found.method == "morris" else "total share"
+    lines = [f"{found.evaluations} runs, {found.failed} failed"]
+    for output, experiment in found.series:
+        unit = f" {data['units'][output]}".rstrip() if found.method == "morris" else ""
+        each = ", ".join(f"{p} {m[found.measure]:.3g}{unit}" for p, m in found.of(output, experiment).items())
+        lines.append(f"{output} in {experiment}, {words} on the RMSE: {each}")
+    return lines
 
 
 def verdict(data: Mapping[str, Any]) -> str:
     """Return the parameter that matters most to each output, by its mean over the experiments."""
-    name = "mu_star" if data["method"] == "morris" else "ST"
-    found = []
-    for output, line in data["measures"].items():
-        total: dict[str, float] = {}
-        for measures in line.values():
-            for parameter, m in measures.items():
-                total[parameter] = total.get(parameter, 0.0) + m[name]
-        found += [f"{max(total, key=lambda p: total[p])} moves {output} most"] if total else []
-    return ", ".join(found)
+    from hvdc_ident.sensitivity import ScreeningResult
+
+    found = ScreeningResult.from_dict(data)
+    total = {o: {p: sum(m[p][found.measure] for m in line.values()) for p in found.parameters} for o, line in found.measures.items()}
+    return ", ".join(f"{max(each, key=lambda p: each[p])} moves {o} most" for o, each in total.items())
 
 
 STAGE = Stage(
