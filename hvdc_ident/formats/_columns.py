@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array, Trajectory
-from hvdc_ident.errors import WaveformError
+from hvdc_ident.errors import WaveformError, one_line
 from hvdc_ident.formats import MAX_BYTES, check_times, once
 from hvdc_ident.parallel import ChildEndedError, call
 
@@ -19,6 +19,8 @@ TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds", "zeit", "temps", "tie
 """Names of a time vector, lower case, in the order of preference."""
 START = 20.0  # s for a process to begin and a small file to be read
 RATE = 5e6  # bytes a second, at least
+MEMORY = 3 * MAX_BYTES
+"""Bytes for reading a file that holds a table of the largest size: the file's numbers, the table, and what is handed over."""
 
 
 def own_names(labels: Sequence[str]) -> tuple[str, ...]:
@@ -43,18 +45,25 @@ def time_name(names: Sequence[str]) -> str | None:
 
 
 def guarded(read: Callable[[Path], Trajectory], path: Path) -> Trajectory:
-    """What a reader of this folder returns, read in a process of its own: some damaged files end HDF5's library, or it never ends.
+    """What a reader of this folder returns, read in a process of its own: damaged files end the libraries for HDF5 and MATLAB,
+    or hold them up, or let them take all memory.
 
-    Raises WaveformError: its own, or where the process ends or hangs.
+    Raises WaveformError: its own, or where the file cannot be read, or its process ends or hangs.
     """
     deadline = START + path.stat().st_size / RATE
     try:
-        found: Trajectory = call(read, path, seconds=deadline)
+        found: Trajectory = call(read, path, seconds=deadline, memory=MEMORY)
+    except WaveformError:
+        raise
     except TimeoutError:
         raise damaged(path, f"the file could not be read within {deadline:.0f} s") from None
+    except MemoryError:
+        raise damaged(path, "reading the file takes too much memory", f"at most {MEMORY / 1e9:.1f} GB") from None
     except ChildEndedError as ended:
         said = ended.printed.rpartition("\n")[2]
         raise damaged(path, "reading the file ended the reader", got=said[:200] or str(ended)) from None
+    except Exception as error:  # what a library raises over a damaged file may be anything
+        raise damaged(path, f"the file cannot be read: {one_line(error)}") from None
     return found
 
 

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
-from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
 from hvdc_ident.formats._columns import check_size, checked, damaged, guarded, joined, package, time_name
 
@@ -55,7 +54,6 @@ def sample(path: Path) -> None:
 
 
 def _waveforms(path: Path) -> Trajectory:
-    package("h5py", path)
     return guarded(waveforms_unguarded, path)
 
 
@@ -63,21 +61,7 @@ def waveforms_unguarded(path: Path) -> Trajectory:
     """All waveforms of the file, read in this process, which a damaged file may hang or end."""
     with open(path, "rb") as file:
         newest = file.read(8) == _HDF5
-    try:
-        parts = _hdf5(path) if newest else _netcdf3(path)
-    except WaveformError:
-        raise
-    except (
-        OSError,
-        RuntimeError,
-        LookupError,
-        ValueError,
-        TypeError,
-        ArithmeticError,
-        AttributeError,
-        MemoryError,
-    ) as error:
-        raise damaged(path, f"the file cannot be read: {error}") from None
+    parts = _hdf5(path) if newest else _netcdf3(path)
     if not parts:
         raise damaged(path, "no waveforms", expected="a data set 'time' and others of as many rows")
     return joined([checked(part, path) for part in parts], path)

@@ -181,14 +181,53 @@ def test_a_broken_date_is_named_with_its_line(tmp_path: Path) -> None:
         read_waveforms(tmp_path / "pmu.csv")
 
 
+def element(kind: int, content: bytes) -> bytes:
+    """An element of a MATLAB 5 file: its kind, its length, and its bytes up to a multiple of 8."""
+    return struct.pack("<II", kind, len(content)) + content.ljust(-(-len(content) // 8) * 8, b"\0")
+
+
 def test_matlab_objects_are_refused_with_the_way_out(tmp_path: Path) -> None:
     """A file of one variable of class 17, as a timeseries is saved, laid out by hand."""
-    flags = struct.pack("<IIII", 6, 8, 17, 0)
-    body = flags + struct.pack("<II", 1, 2) + b"ts".ljust(8, b"\0")
-    content = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 14, len(body)) + body
-    (tmp_path / "s.mat").write_bytes(content)
-    with pytest.raises(WaveformError, match="Structure with time"):
+    inner = element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 1, 2)) + element(1, b"")
+    inner += element(6, struct.pack("<II", 1, 2))
+    names = b"".join(element(1, name) for name in (b"ts", b"MCOS", b"timeseries"))
+    body = element(6, struct.pack("<II", 17, 0)) + names + element(14, inner)
+    (tmp_path / "s.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + element(14, body))
+    with pytest.raises(WaveformError, match=r"'ts' is a MATLAB object.*Structure with time"):
         read_waveforms(tmp_path / "s.mat")
+
+
+@pytest.mark.parametrize("version", ["4", "5"])
+def test_complex_numbers_are_two_signals(tmp_path: Path, version: str) -> None:
+    from scipy.io import savemat
+
+    savemat(tmp_path / "s.mat", {"t": TIME, "v": Y + 2j * TIME}, format=version)
+    found = read_waveforms(tmp_path / "s.mat")
+    np.testing.assert_array_equal(found["v.real"], Y)
+    np.testing.assert_array_equal(found["v.imag"], 2 * TIME)
+
+
+def test_a_file_that_unpacks_to_more_than_memory_may_take_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "s.mat", "w", userblock_size=512) as file:
+        file.create_dataset("t", (10**10,), "f8", chunks=(10**6,), fillvalue=0.0)
+    with open(tmp_path / "s.mat", "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512))
+    with pytest.raises(WaveformError, match="too much memory"):
+        read_waveforms(tmp_path / "s.mat")
+
+
+@pytest.mark.parametrize("name", ["parabola", "some_functions"])
+def test_matlab_functions_beside_waveforms_do_not_refuse_a_file(tmp_path: Path, name: str) -> None:
+    """Files of MATLAB's own that scipy is tested with; here a time and a signal stand before what they hold."""
+    import scipy
+    from scipy.io import savemat
+
+    path = Path(scipy.__file__).parent / "io/matlab/tests/data" / f"{name}.mat"
+    if not path.is_file():
+        pytest.skip("scipy is installed without its tests")
+    savemat(tmp_path / "s.mat", {"t": TIME, "y": Y})
+    (tmp_path / "s.mat").write_bytes((tmp_path / "s.mat").read_bytes() + path.read_bytes()[128:])
+    np.testing.assert_array_equal(read_waveforms(tmp_path / "s.mat", ["y"])["y"], Y)
 
 
 @pytest.mark.parametrize("compressed", [False, True])
