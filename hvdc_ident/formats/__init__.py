@@ -51,6 +51,7 @@ _WRITTEN_AT_ONCE = 20_000  # rows
 LONGEST = 1e8
 """Seconds beyond which a time is a date, counted since 1970."""
 _YEAR_2100 = 4.1e9  # s since 1970
+_TICKS = (1.2591e17, 1.5747e17), (6.3082e17, 6.6238e17)  # 100 ns, of the years 2000 to 2100
 
 
 class Format(Protocol):
@@ -132,7 +133,12 @@ def _from_first_row(found: Trajectory) -> Trajectory:
 
 
 def unit_since_1970(number: float) -> float:
-    """The unit in s of a time since 1970 that a file states no unit of: the largest of s, ms, us and ns before 2100."""
+    """The unit in s of a time that a file states no unit of: the largest of s, ms, us and ns since 1970 before 2100.
+
+    Whole tenths of a microsecond since 1601 and since the year 1, as Windows and .NET count them, are told by the years 2000 to 2100.
+    """
+    if any(low <= number < high for low, high in _TICKS):
+        return 1e-7
     return next((s for s in (1.0, 1e-3, 1e-6) if number * s < _YEAR_2100), 1e-9)
 
 

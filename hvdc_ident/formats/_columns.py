@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hvdc_ident.data import Array, Trajectory
+from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError, one_line
-from hvdc_ident.formats import MAX_BYTES, check_times, once
+from hvdc_ident.formats import LONGEST, MAX_BYTES, check_times, once, unit_since_1970
 from hvdc_ident.parallel import ChildEndedError, call
 
 TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds", "zeit", "temps", "tiempo", "tempo", "time_s", "t_s")
@@ -98,6 +99,21 @@ def checked(record: Trajectory, path: Path) -> Trajectory:
     return once(record)
 
 
+def instants(values: NDArray[Any], unit: str, path: Path) -> tuple[Array, str]:
+    """Times in s and the unit that the file says, "date" for whole numbers since 1970: they count from the first, for of nanoseconds
+    a double has not all digits.
+
+    Raises WaveformError for a unit that is none of time.
+    """
+    length = seconds_of(unit)
+    if length is None:
+        raise damaged(path, "the time is in a unit that is none of time", expected="s, ms, us, min, h", got=f"'{unit}'")
+    if values.dtype.kind in "iu" and values.size and float(values[0]) * length >= LONGEST:
+        counts = values.astype(np.int64)
+        return scaled((counts - counts[0]).astype(float), length if unit else unit_since_1970(float(counts[0]))), "date"
+    return scaled(values.astype(float), length), unit
+
+
 def check_size(rows: int, columns: int, path: Path) -> None:
     """Raise WaveformError where so many numbers do not fit in the memory a table may take."""
     size = rows * columns * 8
@@ -120,14 +136,6 @@ def package(name: str, path: Path) -> Any:
             where=str(path),
             hint="pip install 'hvdc_ident[formats]', or export the file as CSV",
         ) from None
-
-
-def decoded(content: bytes) -> str:
-    """Return text of bytes in UTF-8, else in the code page of Western Europe."""
-    try:
-        return content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
 
 
 def damaged(path: Path, what: str, expected: str = "", got: str = "") -> WaveformError:

@@ -15,6 +15,7 @@ TIME_WORDS = (
 )  # fmt: skip
 """Names of a column of times, lower case, where it is not the first."""
 
+_DATE_NAME = re.compile(r"dat(?:e|um|a (?:e )?ora|enum)|fecha|stamp|stempel|horodat|дата|日期|日時", re.IGNORECASE)
 _BRACKETS = re.compile(r"(?P<name>.*\S)\s*\[(?P<unit>[^\[\]]*)\]", re.DOTALL)
 _ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]*)\)", re.DOTALL)
 _IN = re.compile(r"(?P<name>.*\S)\s+in\s+(?P<unit>\S.*)", re.DOTALL)
@@ -68,6 +69,11 @@ def time_column(labels: Sequence[str]) -> int:
     """The place of the column of times: the first, or the first that is called so where the first is not."""
     called = [name_and_unit(label)[0].strip().lower() in TIME_WORDS for label in labels]
     return called.index(True) if any(called) else 0
+
+
+def is_date_name(label: str) -> bool:
+    """Return whether a column of this name holds dates."""
+    return _DATE_NAME.search(label) is not None
 
 
 def _joined(cells: Sequence[str]) -> str:

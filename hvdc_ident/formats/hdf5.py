@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
+from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, damaged, guarded, joined, package, time_name
+from hvdc_ident.formats._columns import checked, damaged, guarded, instants, joined, package, time_name
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
@@ -69,44 +69,35 @@ def waveforms_unguarded(path: Path) -> Trajectory:
 
 def _hdf5(path: Path) -> list[Trajectory]:
     with package("h5py", path).File(path, "r") as file:
-        return list(_group(file, "", None, path, 0))
+        return list(_group(file, "", (None, ""), path, 0))
 
 
-def _group(group: Any, prefix: str, above: Any, path: Path, depth: int) -> Iterator[Trajectory]:
-    """The records of a group and of those inside it. above: the time of the groups around it."""
+def _group(group: Any, prefix: str, above: tuple[Array | None, str], path: Path, depth: int) -> Iterator[Trajectory]:
+    """The records of a group and of those inside it. above: time and unit of the groups around it."""
     if depth > _MAX_DEPTH or len(group) > _MAX_SETS:
         raise damaged(path, f"too many data sets in '{prefix or '/'}', or groups too deep")
     kinds = {name: group.get(name, getclass=True, getlink=True) for name in group}
     local = [name for name, kind in kinds.items() if kind is not None and kind.__name__ == "HardLink"]  # none outside
     sets = {n: group[n] for n in local if hasattr(group[n], "shape") and group[n].dtype.kind in "fiub"}
     name = time_name(list(sets))
-    clock = above
+    clock, counted = above
     if name is not None:
-        check_size(1, sets[name].size, path)
-        clock = _in_seconds(np.asarray(sets[name], dtype=float).ravel(), _unit(sets[name]), path)
+        clock, counted = instants(np.asarray(sets[name]).ravel(), _unit(sets[name]).split(" since ")[0], path)
     columns, units = {}, []
     for other, item in sets.items():
         if other == name or clock is None or item.ndim not in (1, 2) or clock.size not in item.shape:
             continue
-        check_size(clock.size, item.size // max(1, clock.size), path)
         values = np.asarray(item, dtype=float)
         values = (values if item.shape[0] == clock.size else values.T).reshape(clock.size, -1)
         for i, column in enumerate(values.T):
             columns[prefix + other + (f"({i + 1})" if values.shape[1] > 1 else "")] = column
             units.append(_unit(item))
-    if columns:
-        yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), tuple(units))
+    if columns and clock is not None:
+        origin = Origin(time_unit=counted)
+        yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), tuple(units), origin)
     for inner in local:
         if hasattr(group[inner], "keys"):
-            yield from _group(group[inner], f"{prefix}{inner}/", clock, path, depth + 1)
-
-
-def _in_seconds(clock: Array, unit: str, path: Path) -> Array:
-    """A time vector in s; netCDF writes its units as `milliseconds since 2026-01-01`."""
-    length = seconds_of(unit.split(" since ")[0])
-    if length is None:
-        raise damaged(path, "the time is in a unit that is none of time", expected="s, ms, us, min, h", got=f"'{unit}'")
-    return scaled(clock, length)
+            yield from _group(group[inner], f"{prefix}{inner}/", (clock, counted), path, depth + 1)
 
 
 def _unit(item: Any) -> str:
@@ -125,10 +116,10 @@ def _netcdf3(path: Path) -> list[Trajectory]:
         name = time_name(list(sets))
         if name is None:
             return []
-        unit = getattr(sets[name], "units", "")
-        clock = _in_seconds(np.array(sets[name].data, dtype=float).ravel(), _text(unit), path)
+        unit = _text(getattr(sets[name], "units", ""))
+        clock, counted = instants(np.array(sets[name].data).ravel(), unit.split(" since ")[0], path)
         columns = {k: np.array(v.data, dtype=float) for k, v in sets.items() if k != name and v.shape == clock.shape}
         units = tuple(_text(getattr(sets[k], "units", "")) for k in columns)
     if not columns:
         return []
-    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), units)]
+    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), units, Origin(time_unit=counted))]

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hvdc_ident.data import Array, Trajectory
+from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, guarded, joined, package, time_name
+from hvdc_ident.formats._columns import check_size, checked, guarded, instants, joined, package, time_name
 from hvdc_ident.formats.dymola_mat import recognises as is_result_file
 from hvdc_ident.formats.dymola_mat import starts_as_version_4
 
@@ -134,7 +135,7 @@ def _from_hdf5(item: Any, file: Any, path: Path, depth: int) -> Any:
     values = np.asarray(item) if item.dtype.kind in "fiub" or item.dtype.names == ("real", "imag") else None
     if values is None:
         return None
-    values = values["real"] + 1j * values["imag"] if values.dtype.names else values.astype(float)
+    values = values["real"] + 1j * values["imag"] if values.dtype.names else values
     return np.squeeze(values.T) if not _empty(item) else np.empty(0)
 
 
@@ -145,7 +146,7 @@ def _empty(item: Any) -> bool:
 def _parts(found: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
     """The records among the variables, each with a time of its own."""
     structures = {k: v for k, v in found.items() if isinstance(v, dict)}
-    arrays = {k: np.asarray(v, dtype=float) for k, v in found.items() if _numeric(v)}
+    arrays = {k: np.asarray(v) for k, v in found.items() if _numeric(v)}
     for name, structure in structures.items():
         yield from _structure(name, structure, path)
     time = time_name(list(arrays))
@@ -160,7 +161,7 @@ def _parts(found: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
                 yield Trajectory(upright[:, 0], upright[:, 1:], labels)
 
 
-def _upright(table: Array) -> Array | None:
+def _upright(table: NDArray[Any]) -> NDArray[Any] | None:
     """The matrix with the time in its first column; None where neither its first column nor its first row is one.
 
     To File blocks save one row a signal, logged arrays one column a signal: the time is what increases. Where both
@@ -177,7 +178,7 @@ def _upright(table: Array) -> Array | None:
 
 def _no_time(found: Mapping[str, Any], path: Path) -> WaveformError:
     """The error for a file without a time, which names the variable that may be it."""
-    arrays = {k: np.asarray(v, dtype=float) for k, v in found.items() if _numeric(v)}
+    arrays = {k: np.asarray(v) for k, v in found.items() if _numeric(v)}
     opaque = next((name for name, value in found.items() if isinstance(value, _Object)), None)
     if opaque is not None and not arrays:
         return WaveformError(
@@ -208,36 +209,40 @@ def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[
         if other is not None:
             yield _beside(other, numeric, path, prefix=f"{name}.")
         return
-    clock = np.atleast_1d(np.asarray(time, dtype=float))
+    clock, counted = instants(np.atleast_1d(np.asarray(time)).ravel(), "", path)
     if listed is None:
         yield _beside("time", _flat(structure), path, prefix=f"{name}.")
         return
-    columns: dict[str, Array] = {}
+    columns: dict[str, NDArray[Any]] = {}
     for i, signal in enumerate(_list(listed)):
         if not isinstance(signal, dict) or not _numeric(signal.get("values")):
             continue
         label = signal.get("label")
         shown = label if isinstance(label, str) and label else f"{name}.{i + 1}"
-        _add(columns, shown, np.asarray(signal["values"], dtype=float), clock.size)
+        _add(columns, shown, np.asarray(signal["values"]), clock.size)
     if columns:
-        yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
+        yield _record(clock, columns, counted)
 
 
-def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, Array]:
+def _record(clock: Array, columns: Mapping[str, NDArray[Any]], counted: str) -> Trajectory:
+    return Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), origin=Origin(time_unit=counted))
+
+
+def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, NDArray[Any]]:
     """The arrays of numbers in a structure and the structures inside it, those under `inner.name`."""
-    found: dict[str, Array] = {}
+    found: dict[str, NDArray[Any]] = {}
     for key, value in structure.items():
         if _numeric(value):
-            found[prefix + key] = np.asarray(value, dtype=float)
+            found[prefix + key] = np.asarray(value)
         elif isinstance(value, dict):
             found |= _flat(value, f"{prefix}{key}.")
     return found
 
 
-def _beside(time: str, arrays: Mapping[str, Array], path: Path, prefix: str = "") -> Trajectory:
+def _beside(time: str, arrays: Mapping[str, NDArray[Any]], path: Path, prefix: str = "") -> Trajectory:
     """A time vector and every array of as many rows."""
-    clock = np.atleast_1d(arrays[time]).ravel()
-    columns: dict[str, Array] = {}
+    clock, counted = instants(np.atleast_1d(arrays[time]).ravel(), "", path)
+    columns: dict[str, NDArray[Any]] = {}
     for name, values in arrays.items():
         if name != time:
             _add(columns, prefix + name, values, clock.size)
@@ -252,10 +257,10 @@ def _beside(time: str, arrays: Mapping[str, Array], path: Path, prefix: str = ""
             got=shapes or "nothing else",
             hint="save signals and their time at the same instants",
         )
-    return Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
+    return _record(clock, columns, counted)
 
 
-def _add(columns: dict[str, Array], name: str, values: Array, rows: int) -> None:
+def _add(columns: dict[str, NDArray[Any]], name: str, values: NDArray[Any], rows: int) -> None:
     """Put a vector, or each column of a matrix, of so many rows among the columns; anything else is no signal."""
     if values.ndim == 1 and values.size == rows:
         columns[name] = values
@@ -282,5 +287,6 @@ def _numeric(value: Any) -> bool:
     return isinstance(value, np.ndarray | float | int) and np.asarray(value).dtype.kind in "fiub"
 
 
-def _increases(values: Array) -> bool:
+def _increases(values: NDArray[Any]) -> bool:
+    values = values.astype(float)  # differences of whole numbers without a sign never fall
     return bool(values.size > 1 and np.isfinite(values).all() and (np.diff(values) >= 0).all() and np.ptp(values) > 0)

@@ -15,6 +15,7 @@ from hvdc_ident import formats as catalogue
 from hvdc_ident.data import Trajectory, trajectory
 from hvdc_ident.errors import UnknownNameError, WaveformError
 from hvdc_ident.formats import convert, csv_text, list_signals, read_waveforms, write_csv
+from hvdc_ident.formats._clock import Clock
 
 DIALECTS = {
     "comma": "time,a,b\n0,1.5,-2\n0.5,1e-3,+4\n",
@@ -48,7 +49,7 @@ def test_dialects(tmp_path: Path, text: str) -> None:
     assert found.values.tolist() == [[1.5, -2.0], [1e-3, 4.0]]
     layout = csv_text._layout(path)
     assert csv_text._fast(layout, [0, 1, 2]) is not None
-    assert np.array_equal(csv_text._careful(layout, [0, 1, 2]), np.column_stack([found.time, found.values]))
+    assert np.array_equal(csv_text._careful(layout, [0, 1, 2], Clock()), np.column_stack([found.time, found.values]))
 
 
 def test_names_and_units(tmp_path: Path) -> None:
@@ -234,7 +235,7 @@ def test_both_readers_agree_on_many_rows(tmp_path: Path) -> None:
     layout = csv_text._layout(tmp_path / "x.csv")
     fast = csv_text._fast(layout, [0, 2])
     assert fast is not None
-    assert np.array_equal(fast, csv_text._careful(layout, [0, 2]))
+    assert np.array_equal(fast, csv_text._careful(layout, [0, 2], Clock()))
 
 
 def write(folder: Path, text: str) -> Path:
