@@ -116,7 +116,16 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
     found = _format_of(file).read(file, wanted)
     _check(found, file)
     found = found if found.origin.rows else replace(found, origin=replace(found.origin, rows=len(found)))
-    return _from_first_row(found)
+    units = _units(list(zip(found.names, found.units, strict=True)))
+    return _from_first_row(replace(found, units=tuple(unit for _, unit in units)))
+
+
+def _units(signals: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Names and units, those that the file does not state as the names say them."""
+    from hvdc_ident.formats._labels import unit_in_name
+
+    names = [name for name, _ in signals]
+    return [(name, unit or unit_in_name(name, names)) for name, unit in signals]
 
 
 def _from_first_row(found: Trajectory) -> Trajectory:
@@ -162,7 +171,7 @@ def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[s
         fits = re.compile(pattern, re.IGNORECASE | re.DOTALL).fullmatch
     else:
         fits = re.compile(re.escape(search), re.IGNORECASE).search
-    return [(name, unit) for name, unit in _format_of(file).signals(file) if fits(name)]
+    return [(name, unit) for name, unit in _units(_format_of(file).signals(file)) if fits(name)]
 
 
 def convert(

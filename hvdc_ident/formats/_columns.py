@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError, one_line
 from hvdc_ident.formats import LONGEST, MAX_BYTES, check_times, once, unit_since_1970
+from hvdc_ident.formats._labels import unit_in_name
 from hvdc_ident.parallel import ChildEndedError, call
 
-TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds", "zeit", "temps", "tiempo", "tempo", "time_s", "t_s")
+TIME_NAMES = ("time", "t", "tout", "timestamp", "seconds", "zeit", "temps", "tiempo", "tempo",
+              *(f"{name}_{unit}" for name in ("time", "t") for unit in ("s", "ms", "us", "ns")))  # fmt: skip
 """Names of a time vector, lower case, in the order of preference."""
 START = 20.0  # s for a process to begin and a small file to be read
 RATE = 5e6  # bytes a second, at least
@@ -99,12 +101,13 @@ def checked(record: Trajectory, path: Path) -> Trajectory:
     return once(record)
 
 
-def instants(values: NDArray[Any], unit: str, path: Path) -> tuple[Array, str]:
-    """Times in s and the unit that the file says, "date" for whole numbers since 1970: they count from the first, for of nanoseconds
-    a double has not all digits.
+def instants(values: NDArray[Any], name: str, unit: str, path: Path) -> tuple[Array, str]:
+    """Times in s, and the unit that the file, or the name, says; "date" for whole numbers since 1970.
 
+    These count from the first, for a double has not all digits of nanoseconds since 1970.
     Raises WaveformError for a unit that is none of time.
     """
+    unit = unit or unit_in_name(name, ())
     length = seconds_of(unit)
     if length is None:
         raise damaged(path, "the time is in a unit that is none of time", expected="s, ms, us, min, h", got=f"'{unit}'")

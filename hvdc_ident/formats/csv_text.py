@@ -25,7 +25,7 @@ from hvdc_ident.data import Array, Origin, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import LONGEST, event_rows, once, pick, unit_since_1970
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
-from hvdc_ident.formats._labels import is_date_name, merged, names_and_units, time_column
+from hvdc_ident.formats._labels import is_date_name, merged, names_and_units, time_column, unit_in_name
 from hvdc_ident.formats._text import WIDE, encoding_of
 
 NAME = "csv"
@@ -174,6 +174,8 @@ def _layout(path: Path) -> _Layout:
         labels[0] = "row"  # the index that some packages write first and without a name
     _check_labels(labels, path, number)
     names, units = names_and_units(labels)
+    if not units[time] and (unit := unit_in_name(labels[time], labels)):
+        units = (*units[:time], unit, *units[time + 1 :])
     cells = [c.strip(' "') for c in _split(row, separator)]
     absolute, date = False, -1
     if len(cells) >= len(labels) > 1:

@@ -82,7 +82,7 @@ def _group(group: Any, prefix: str, above: tuple[Array | None, str], path: Path,
     name = time_name(list(sets))
     clock, counted = above
     if name is not None:
-        clock, counted = instants(np.asarray(sets[name]).ravel(), _unit(sets[name]).split(" since ")[0], path)
+        clock, counted = instants(np.asarray(sets[name]).ravel(), name, _unit(sets[name]).split(" since ")[0], path)
     columns, units = {}, []
     for other, item in sets.items():
         if other == name or clock is None or item.ndim not in (1, 2) or clock.size not in item.shape:
@@ -117,7 +117,7 @@ def _netcdf3(path: Path) -> list[Trajectory]:
         if name is None:
             return []
         unit = _text(getattr(sets[name], "units", ""))
-        clock, counted = instants(np.array(sets[name].data).ravel(), unit.split(" since ")[0], path)
+        clock, counted = instants(np.array(sets[name].data).ravel(), name, unit.split(" since ")[0], path)
         columns = {k: np.array(v.data, dtype=float) for k, v in sets.items() if k != name and v.shape == clock.shape}
         units = tuple(_text(getattr(sets[k], "units", "")) for k in columns)
     if not columns:

@@ -209,7 +209,7 @@ def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[
         if other is not None:
             yield _beside(other, numeric, path, prefix=f"{name}.")
         return
-    clock, counted = instants(np.atleast_1d(np.asarray(time)).ravel(), "", path)
+    clock, counted = instants(np.atleast_1d(np.asarray(time)).ravel(), "time", "", path)
     if listed is None:
         yield _beside("time", _flat(structure), path, prefix=f"{name}.")
         return
@@ -241,7 +241,7 @@ def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, NDArray[A
 
 def _beside(time: str, arrays: Mapping[str, NDArray[Any]], path: Path, prefix: str = "") -> Trajectory:
     """A time vector and every array of as many rows."""
-    clock, counted = instants(np.atleast_1d(arrays[time]).ravel(), "", path)
+    clock, counted = instants(np.atleast_1d(arrays[time]).ravel(), time, "", path)
     columns: dict[str, NDArray[Any]] = {}
     for name, values in arrays.items():
         if name != time:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.data import (
     FEWEST_QUIET,
@@ -45,6 +46,8 @@ from hvdc_ident.study import schema
 from hvdc_ident.toml_tables import check_names
 
 TIME_SHIFT = "time-shift"
+SETTLED = 3.0
+"""Time constants after which a low pass has forgotten 95 %."""
 
 
 @dataclass(frozen=True)
@@ -126,12 +129,13 @@ def read_experiments(
 
 
 def with_noise(
-    experiment: Experiment, stated: Mapping[str, float] | None = None
+    experiment: Experiment, stated: Mapping[str, float] | None = None, means: Mapping[str, float] = FrozenMap()
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     """Return the experiment with its event and the noise of its outputs where they are not stated, and their sources.
 
     stated: standard deviations by output, 0 allowed; left out, the experiment's. The noise is estimated before the event,
-    and where there is none the fit's residual tells.
+    and where there is none the fit's residual tells. means: by output the length in s of a mean that smoothed it, whose rows tell
+    of noise only where they are so far apart.
     """
     e = experiment
     stated = e.noise if stated is None else stated
@@ -141,8 +145,10 @@ def with_noise(
     table = e.measured
     notes, dof, told_by = {}, {}, {}
     for o in e.outputs:
-        told = o not in stated and int(before_event(e.time, table[o], event).sum()) >= FEWEST_QUIET
-        found = noise_estimate(e.time, table[o], event) if told else NoiseEstimate()
+        rows = _apart(e.time, means.get(o, 0.0))
+        time, values = e.time[rows], table[o][rows]
+        told = o not in stated and int(before_event(time, values, event).sum()) >= FEWEST_QUIET
+        found = noise_estimate(time, values, event) if told else NoiseEstimate()
         notes[o] = _noise(stated.get(o), found, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
         if notes[o].source == "estimated":
             dof[o], told_by[o] = max(1.0, found.freedom), found.source
@@ -150,6 +156,14 @@ def with_noise(
     profile = {o: v for o, v in e.noise_profile.items() if o in noise}
     known = {"noise_dof": e.noise_dof | dof, "noise_from": e.noise_from | told_by}
     return e.with_(event=event, noise=noise, **known, noise_profile=profile), FrozenMap(notes)
+
+
+def _apart(time: Array, length: float) -> NDArray[np.intp]:
+    """The rows that are so far apart, in s, the first so far from the start; all of them for 0."""
+    if not length:
+        return np.arange(time.size)
+    ends = np.arange(time[0] + length, time[-1], length)
+    return np.unique(np.searchsorted(time, ends))
 
 
 def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> None:
@@ -199,7 +213,7 @@ def _experiment(
     table: schema.ExperimentTable, model: AnyModel, data: Trajectory, place: str
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     columns = dict(_channels(table))
-    data = with_derived(table, data, place)
+    data = with_derived(table.phases, table.phasors, data, place)
     time = _time(table, data, place)
     mappings = {s: _mapping(table, model, s, c, data, place) for s, c in columns.items()}
     mapped = {s: scaled(data[c], mappings[s][0]) for s, c in columns.items()}
@@ -219,6 +233,8 @@ def _experiment(
     }
     stated = {o: n for o, n in table.noise.items() if isinstance(n, float | int)}
     stated |= {o: float(np.sqrt(np.nanmean(d**2))) for o, d in deviations.items()}
+    lengths = smoothed(table.phases, table.phasors)
+    means = {s: lengths[c] for s, c in columns.items() if c in lengths}
     units = tuple(model.outputs[o].unit for o in outputs)
     converted = tuple(_conversion_words(table, model, s, c, data, mappings[s]) for s, c in columns.items())
     origin = replace(
@@ -236,14 +252,14 @@ def _experiment(
         measured=measured,
         # 1 where nothing is recorded, which nobody looks at
         noise_profile={o: np.where(np.isnan(d), 1.0, d / stated[o]) for o, d in deviations.items()},
-        event=_event(table, time, place),
+        event=_event(table, time, inputs, means, place),
         window=_window(table, time, place),
         role=table.role,
         drive=tuple(table.drive),
         instrument=instrument,
         nuisance=tuple(dict.fromkeys(table.nuisance)),
     )
-    experiment, notes = with_noise(experiment, stated)
+    experiment, notes = with_noise(experiment, stated, means)
     return (_trimmed(experiment, table, mapped) if table.trim else experiment), notes
 
 
@@ -387,7 +403,10 @@ def _time_unit(table: schema.ExperimentTable, origin: Origin) -> str:
     return line.unit or (f"{line.scale:g} s" if line.scale is not None else "")
 
 
-def _event(table: schema.ExperimentTable, time: Array, place: str) -> float | None:
+def _event(
+    table: schema.ExperimentTable, time: Array, inputs: Mapping[str, InputSignal], means: Mapping[str, float], place: str
+) -> float | None:
+    """The event as stated, or of inputs that are made of phases or phasors; None where the inputs themselves show it."""
     if table.event is not None and not time[0] <= table.event <= time[-1]:
         raise StudyError(
             "the event lies outside the record",
@@ -395,7 +414,24 @@ def _event(table: schema.ExperimentTable, time: Array, place: str) -> float | No
             expected=f"{time[0]:g} to {time[-1]:g} s",
             got=f"{table.event:g} s",
         )
-    return table.event
+    return table.event if table.event is not None or not means.keys() & inputs.keys() else event_time(inputs, means)
+
+
+def smoothed(phases: Sequence[schema.PhasesTable], phasors: Sequence[schema.PhasorsTable] = ()) -> dict[str, float]:
+    """Return by column that is made of phases or phasors the time in s within which its noise is the same: of one that is not filtered
+    a cycle, within which it ripples."""
+    lengths: dict[str, float] = {}
+    for line in phases:
+        kept = {"mean": _window_of(line), "lowpass": SETTLED * _window_of(line), "none": 1.0 / line.frequency}
+        lengths |= dict.fromkeys(line.gives, kept[line.filter])
+    for phasor in phasors:
+        lengths |= {name: phasor.window for name, quantity in phasor.gives.items() if quantity == "f"}
+    return {name: length for name, length in lengths.items() if length > 0.0}
+
+
+def _window_of(line: schema.PhasesTable) -> float:
+    """The length of the filter in s: one cycle where it is not stated."""
+    return line.window if line.window is not None else 1.0 / line.frequency
 
 
 def _window(table: schema.ExperimentTable, time: Array, place: str) -> tuple[float, float] | None:
@@ -463,20 +499,20 @@ def raw_columns(table: schema.ExperimentTable, columns: Sequence[str]) -> list[s
     return list(dict.fromkeys([*(c for c in columns if c not in made), *phases, *phasors, *map(str, references)]))
 
 
-def with_derived(table: schema.ExperimentTable, data: Trajectory, place: str) -> Trajectory:
-    """The recording with the columns its phases and phasors give; the same object where none are asked for."""
+def with_derived(
+    phases: Sequence[schema.PhasesTable], phasors: Sequence[schema.PhasorsTable], data: Trajectory, place: str
+) -> Trajectory:
+    """The recording with the columns that phases and phasors give; the same object where none are asked for."""
     found = data
-    for number, line in enumerate(table.phases, 1):
+    for number, line in enumerate(phases, 1):
         found = _added(found, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"))
-    for number, phasors in enumerate(table.phasors, 1):
-        made = _of_phasors(phasors, data, f"{place}.phasors, line {number}")
-        found = _added(found, phasors.gives, made)
+    for number, phasor in enumerate(phasors, 1):
+        found = _added(found, phasor.gives, _of_phasors(phasor, data, f"{place}.phasors, line {number}"))
     return found
 
 
 def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajectory:
     _check_new(line.gives, data, where)
-    window = line.window if line.window is not None else 1.0 / line.frequency  # one cycle
     with located(where):
         return phase_quantities(
             data,
@@ -484,7 +520,7 @@ def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajec
             line.current,
             list(line.gives.values()),
             frequency=line.frequency,
-            smoothing=PhaseFilter(line.filter, window),
+            smoothing=PhaseFilter(line.filter, _window_of(line)),
         )
 
 

@@ -74,6 +74,19 @@ def test_units_that_tell_columns_apart_stay_in_the_name(tmp_path: Path) -> None:
     ]
 
 
+def test_units_behind_an_underscore(tmp_path: Path) -> None:
+    """Only of what the name begins with, for seconds and hours are seldom meant by V_s and I_h; I_A, I_B, I_C are phases."""
+    units = {
+        "P_W": "W", "f_Hz": "Hz", "Q_Mvar": "Mvar", "Vdc_kV": "kV", "id_A": "A", "n_rpm": "rpm", "theta_deg": "deg", "y_pu": "pu",
+        "I_A": "", "I_B": "", "I_C": "", "V_s": "", "I_h": "", "P_m": "", "P_g": "", "T_m": "", "U_U": "", "U_V": "", "U_W": "", "P_N": "",
+    }  # fmt: skip
+    path = write(tmp_path, ",".join(["time_ms", *units]) + "\n" + "\n".join(["0" + ",1" * len(units), "5" + ",1" * len(units)]))
+    assert dict(list_signals(path)) == units
+    found = read_waveforms(path)
+    assert dict(zip(found.names, found.units, strict=True)) == units
+    assert found.time.tolist() == [0.0, 0.005] and found.origin.time_unit == "ms"
+
+
 def test_units_between_blanks(tmp_path: Path) -> None:
     assert list_signals(write(tmp_path, 'time a [kV] "b c" d (A)\n0 1 2 3\n1 1 2 3\n')) == [
         ("a", "kV"),
