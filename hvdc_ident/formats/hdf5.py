@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array, Origin, Trajectory
-from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import checked, damaged, guarded, instants, joined, package, time_name
+from hvdc_ident.formats._columns import checked, chosen, damaged, guarded, instants, joined, package, time_name
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
@@ -39,9 +38,8 @@ def signals(path: Path) -> list[tuple[str, str]]:
 
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
-    """The signals, all or those named in that order; several rates are joined over the finest."""
-    found = _waveforms(path)
-    return found.select([found.names[i] for i in pick(path, signals, found.names)])
+    """The signals, all or those named in that order; records of several rates stand at their own rows."""
+    return chosen(_waveforms(path), signals, path)
 
 
 def sample(path: Path) -> None:
@@ -64,25 +62,25 @@ def waveforms_unguarded(path: Path) -> Trajectory:
     parts = _hdf5(path) if newest else _netcdf3(path)
     if not parts:
         raise damaged(path, "no waveforms", expected="a data set 'time' and others of as many rows")
-    return joined([checked(part, path) for part in parts], path)
+    return joined([checked(part, path) for part in parts])
 
 
 def _hdf5(path: Path) -> list[Trajectory]:
     with package("h5py", path).File(path, "r") as file:
-        return list(_group(file, "", (None, ""), path, 0))
+        return list(_group(file, "", (None, Origin()), path, 0))
 
 
-def _group(group: Any, prefix: str, above: tuple[Array | None, str], path: Path, depth: int) -> Iterator[Trajectory]:
-    """The records of a group and of those inside it. above: time and unit of the groups around it."""
+def _group(group: Any, prefix: str, above: tuple[Array | None, Origin], path: Path, depth: int) -> Iterator[Trajectory]:
+    """The records of a group and of those inside it. above: time of the groups around it, and its origin."""
     if depth > _MAX_DEPTH or len(group) > _MAX_SETS:
         raise damaged(path, f"too many data sets in '{prefix or '/'}', or groups too deep")
     kinds = {name: group.get(name, getclass=True, getlink=True) for name in group}
     local = [name for name, kind in kinds.items() if kind is not None and kind.__name__ == "HardLink"]  # none outside
     sets = {n: group[n] for n in local if hasattr(group[n], "shape") and group[n].dtype.kind in "fiub"}
     name = time_name(list(sets))
-    clock, counted = above
+    clock, origin = above
     if name is not None:
-        clock, counted = instants(np.asarray(sets[name]).ravel(), name, _unit(sets[name]).split(" since ")[0], path)
+        clock, origin = instants(np.asarray(sets[name]).ravel(), name, _unit(sets[name]).split(" since ")[0], path)
     columns, units = {}, []
     for other, item in sets.items():
         if other == name or clock is None or item.ndim not in (1, 2) or clock.size not in item.shape:
@@ -93,11 +91,10 @@ def _group(group: Any, prefix: str, above: tuple[Array | None, str], path: Path,
             columns[prefix + other + (f"({i + 1})" if values.shape[1] > 1 else "")] = column
             units.append(_unit(item))
     if columns and clock is not None:
-        origin = Origin(time_unit=counted)
         yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), tuple(units), origin)
     for inner in local:
         if hasattr(group[inner], "keys"):
-            yield from _group(group[inner], f"{prefix}{inner}/", (clock, counted), path, depth + 1)
+            yield from _group(group[inner], f"{prefix}{inner}/", (clock, origin), path, depth + 1)
 
 
 def _unit(item: Any) -> str:
@@ -117,9 +114,9 @@ def _netcdf3(path: Path) -> list[Trajectory]:
         if name is None:
             return []
         unit = _text(getattr(sets[name], "units", ""))
-        clock, counted = instants(np.array(sets[name].data).ravel(), name, unit.split(" since ")[0], path)
+        clock, origin = instants(np.array(sets[name].data).ravel(), name, unit.split(" since ")[0], path)
         columns = {k: np.array(v.data, dtype=float) for k, v in sets.items() if k != name and v.shape == clock.shape}
         units = tuple(_text(getattr(sets[k], "units", "")) for k in columns)
     if not columns:
         return []
-    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), units, Origin(time_unit=counted))]
+    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), units, origin)]

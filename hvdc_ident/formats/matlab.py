@@ -2,8 +2,8 @@
 
 Three layouts are understood, each either way round: a vector called time, t, tout, Zeit or temps with vectors or
 matrices of as many rows beside it; a matrix whose first column or row is the time, which increases; Simulink's
-"structure with time" (fields `time` and `signals`, each with `values` and `label`). Several structures are several
-rates, joined over the finest. Complex numbers are two signals, `y.real` and `y.imag`. Objects (timeseries, Dataset) are
+"structure with time" (fields `time` and `signals`, each with `values` and `label`). Several structures are
+records of their own rates. Complex numbers are two signals, `y.real` and `y.imag`. Objects (timeseries, Dataset) are
 stored in a form MathWorks does not publish: they are refused with the way out.
 """
 
@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, guarded, instants, joined, package, time_name
+from hvdc_ident.formats._columns import check_size, checked, chosen, guarded, instants, joined, package, time_name
 from hvdc_ident.formats.dymola_mat import recognises as is_result_file
 from hvdc_ident.formats.dymola_mat import starts_as_version_4
 
@@ -57,9 +56,7 @@ def signals(path: Path) -> list[tuple[str, str]]:
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     """The signals, all or those named in that order. An instant with more than two rows keeps its first and last."""
-    found = _waveforms(path)
-    wanted = pick(path, signals, found.names)
-    return found.select([found.names[i] for i in wanted])
+    return chosen(_waveforms(path), signals, path)
 
 
 def sample(path: Path) -> None:
@@ -82,7 +79,7 @@ def waveforms_unguarded(path: Path) -> Trajectory:
     parts = list(_parts(found, path))
     if not parts:
         raise _no_time(found, path)
-    return joined([checked(part, path) for part in parts], path)
+    return joined([checked(part, path) for part in parts])
 
 
 def _until_version_7(path: Path) -> dict[str, Any]:
@@ -209,7 +206,7 @@ def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[
         if other is not None:
             yield _beside(other, numeric, path, prefix=f"{name}.")
         return
-    clock, counted = instants(np.atleast_1d(np.asarray(time)).ravel(), "time", "", path)
+    clock, origin = instants(np.atleast_1d(np.asarray(time)).ravel(), "time", "", path)
     if listed is None:
         yield _beside("time", _flat(structure), path, prefix=f"{name}.")
         return
@@ -221,11 +218,11 @@ def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[
         shown = label if isinstance(label, str) and label else f"{name}.{i + 1}"
         _add(columns, shown, np.asarray(signal["values"]), clock.size)
     if columns:
-        yield _record(clock, columns, counted)
+        yield _record(clock, columns, origin)
 
 
-def _record(clock: Array, columns: Mapping[str, NDArray[Any]], counted: str) -> Trajectory:
-    return Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), origin=Origin(time_unit=counted))
+def _record(clock: Array, columns: Mapping[str, NDArray[Any]], origin: Origin) -> Trajectory:
+    return Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), origin=origin)
 
 
 def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, NDArray[Any]]:
@@ -241,7 +238,7 @@ def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, NDArray[A
 
 def _beside(time: str, arrays: Mapping[str, NDArray[Any]], path: Path, prefix: str = "") -> Trajectory:
     """A time vector and every array of as many rows."""
-    clock, counted = instants(np.atleast_1d(arrays[time]).ravel(), time, "", path)
+    clock, origin = instants(np.atleast_1d(arrays[time]).ravel(), time, "", path)
     columns: dict[str, NDArray[Any]] = {}
     for name, values in arrays.items():
         if name != time:
@@ -257,7 +254,7 @@ def _beside(time: str, arrays: Mapping[str, NDArray[Any]], path: Path, prefix: s
             got=shapes or "nothing else",
             hint="save signals and their time at the same instants",
         )
-    return _record(clock, columns, counted)
+    return _record(clock, columns, origin)
 
 
 def _add(columns: dict[str, NDArray[Any]], name: str, values: NDArray[Any], rows: int) -> None:

@@ -105,7 +105,7 @@ def columns_of(
         values = record[name]
         if not np.isnan(values).all():
             level, noise, quiet = _rest(record.time, values, event)
-            found.append(Column(name, unit, level, noise, int(np.isnan(values).sum()), quiet, counted.get(name, "")))
+            found.append(Column(name, unit, level, noise, record.gaps(name), quiet, counted.get(name, "")))
     return tuple(found)
 
 
@@ -185,7 +185,7 @@ def _rest(time: Array, values: Array, event: float | None) -> tuple[float | None
     before = before_event(time, values, event)
     if int(before.sum()) < FEWEST_QUIET:
         return (float(values[known][0]) if known.any() else None), 0.0, False
-    return float(values[before].mean()), noise_estimate(time, values, event).std, True
+    return float(values[before].mean()), noise_estimate(time[known], values[known], event).std, True
 
 
 def _candidate(target: Target, column: Column) -> Match | None:

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hvdc_ident.data import Experiment, Trajectory, event_time, input_signal, scaled
+import numpy as np
+
+from hvdc_ident.data import Array, Experiment, Trajectory, event_time, input_signal, scaled
 from hvdc_ident.data.three_phase import PHASE_QUANTITIES
 from hvdc_ident.display import Shown
 from hvdc_ident.errors import ComputationError, InputError, located
@@ -175,10 +177,10 @@ def matched(
     ways = ways_to_count(phases)
     named = match_names(columns_of(record, None, ways), targets_of(model, {}))
     moved = [m for m in named.values() if m.target.kind == "input" and not m.column.gaps]  # in whatever unit
-    signals = {m.column.name: input_signal(record.time, _values(record, m)) for m in moved}
+    signals = {m.column.name: input_signal(*_values(record, m)) for m in moved}
     event = event_time(signals, smoothed(phases))
     inputs = [m for m in moved if usable(m) and not is_ambiguous(m)]
-    levels, why = _levels(model, {m.target.name: float(_values(record, m)[0]) for m in inputs})
+    levels, why = _levels(model, {m.target.name: float(_values(record, m)[1][0]) for m in inputs})
     return matching(columns_of(record, event, ways), targets_of(model, levels), model.parameters), why
 
 
@@ -202,10 +204,11 @@ def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
     return Mapped(name, file, data, found, why, experiment, notes[name], phases)
 
 
-def _values(record: Trajectory, match: Match) -> Any:
-    """The values of a column in the signal's unit."""
+def _values(record: Trajectory, match: Match) -> tuple[Array, Array]:
+    """The instants of a column in s, and its values in the signal's unit."""
     scale, offset = match.column.converted(match.target.unit) or (1.0, 0.0)
-    return scaled(record[match.column.name], scale) + offset
+    rows = np.isfinite(record[match.column.name])
+    return record.time[rows], scaled(record[match.column.name][rows], scale) + offset
 
 
 def _levels(model: AnyModel, inputs: Mapping[str, float]) -> tuple[dict[str, float], str]:

@@ -145,7 +145,8 @@ def with_noise(
     table = e.measured
     notes, dof, told_by = {}, {}, {}
     for o in e.outputs:
-        rows = _apart(e.time, means.get(o, 0.0))
+        recorded = np.flatnonzero(np.isfinite(table[o]))
+        rows = recorded[_apart(e.time[recorded], means.get(o, 0.0))]
         time, values = e.time[rows], table[o][rows]
         told = o not in stated and int(before_event(time, values, event).sum()) >= FEWEST_QUIET
         found = noise_estimate(time, values, event) if told else NoiseEstimate()
@@ -214,11 +215,15 @@ def _experiment(
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     columns = dict(_channels(table))
     data = with_derived(table.phases, table.phasors, data, place)
+    data = _within_inputs(data, [columns[s] for s in (*table.inputs, *table.drive)], place)
     time = _time(table, data, place)
     mappings = {s: _mapping(table, model, s, c, data, place) for s, c in columns.items()}
     mapped = {s: scaled(data[c], mappings[s][0]) for s, c in columns.items()}
     mapped |= {s: mapped[s] + offset for s, (_, offset) in mappings.items() if offset != 0.0}
-    inputs = {s: _input(table, s, columns[s], time, mapped[s], place) for s in (*table.inputs, *table.drive)}
+    inputs = {}
+    for s in (*table.inputs, *table.drive):
+        rows = data.own_rows(columns[s])
+        inputs[s] = _input(table, s, columns[s], time[rows], mapped[s][rows], place)
     outputs = tuple(table.outputs)
     if empty := [o for o in outputs if np.isnan(mapped[o]).all()]:
         raise StudyError(
@@ -241,6 +246,7 @@ def _experiment(
         data.origin,
         time_unit=_time_unit(table, data.origin),
         converted=(*data.origin.converted, *(line for line in converted if line)),
+        records=tuple(tuple(s for s, c in columns.items() if c in record) for record in data.origin.records),
     )
     measured = Trajectory(time, np.column_stack([mapped[o] for o in outputs]), outputs, units, origin)
     instrument = {o: line.model_dump(by_alias=True, exclude_none=True) for o, line in table.instrument.items()}
@@ -263,6 +269,25 @@ def _experiment(
     return (_trimmed(experiment, table, mapped) if table.trim else experiment), notes
 
 
+def _within_inputs(data: Trajectory, columns: Sequence[str], place: str) -> Trajectory:
+    """The rows within the records of all inputs, where those have several rates: outside, an input is not known."""
+    if not data.origin.records or not columns:
+        return data
+    spans = [data.time[data.own_rows(column)][[0, -1]] for column in columns]
+    low, high = max(span[0] for span in spans), min(span[1] for span in spans)
+    inside = (data.time >= low) & (data.time <= high)
+    if int(inside.sum()) < 2:
+        raise StudyError(
+            "the records of the inputs share no time",
+            where=place,
+            expected="records that overlap",
+            got=", ".join(f"{c} {a:g} to {b:g} s" for c, (a, b) in zip(columns, spans, strict=True)),
+            hint="take inputs of one record",
+        )
+    dropped = data.origin.dropped + int(np.count_nonzero(~inside))
+    return replace(data.rows(inside), origin=replace(data.origin, dropped=dropped))
+
+
 def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapping[str, Array]) -> Experiment:
     """Return the experiment whose start stands at the levels before the event, of the outputs to be met and of the inputs played in.
 
@@ -271,7 +296,8 @@ def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapp
     levels = {n: level_before(experiment.time, v, experiment.event) for n, v in mapped.items()}
     inputs = {n: i.begun_at(levels[n]) for n, i in experiment.inputs.items()}
     values = {n: levels[o] for n, o in table.trim.items()}
-    noise = {n: input_noise(experiment.time, mapped[n], experiment.event) for n in inputs}
+    known = {n: np.isfinite(mapped[n]) for n in inputs}
+    noise = {n: input_noise(experiment.time[k], mapped[n][k], experiment.event) for n, k in known.items()}
     return experiment.with_(
         inputs=inputs,
         values=experiment.values | values,
@@ -505,14 +531,15 @@ def with_derived(
     """The recording with the columns that phases and phasors give; the same object where none are asked for."""
     found = data
     for number, line in enumerate(phases, 1):
-        found = _added(found, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"))
+        found = _added(found, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"), line.voltage[0])
     for number, phasor in enumerate(phasors, 1):
-        found = _added(found, phasor.gives, _of_phasors(phasor, data, f"{place}.phasors, line {number}"))
+        found = _added(found, phasor.gives, _of_phasors(phasor, data, f"{place}.phasors, line {number}"), phasor.voltage.magnitude[0])
     return found
 
 
-def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajectory:
-    _check_new(line.gives, data, where)
+def _of_phases(line: schema.PhasesTable, whole: Trajectory, where: str) -> Trajectory:
+    _check_new(line.gives, whole, where)
+    data = whole.rows(whole.own_rows(line.voltage[0]))
     with located(where):
         return phase_quantities(
             data,
@@ -524,8 +551,9 @@ def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajec
         )
 
 
-def _of_phasors(line: schema.PhasorsTable, data: Trajectory, where: str) -> Trajectory:
-    _check_new(line.gives, data, where)
+def _of_phasors(line: schema.PhasorsTable, whole: Trajectory, where: str) -> Trajectory:
+    _check_new(line.gives, whole, where)
+    data = whole.rows(whole.own_rows(line.voltage.magnitude[0]))
     how = PhasorSettings(line.frequency, line.window, line.magnitudes or "", line.reference or "")
     current = _columns(line.current) if line.current is not None else None
     with located(where):
@@ -549,11 +577,15 @@ def _check_new(gives: Mapping[str, str], data: Trajectory, where: str) -> None:
         raise StudyError(f"a column '{taken[0]}' is already there", where=where, expected="a new name in gives")
 
 
-def _added(found: Trajectory, gives: Mapping[str, str], made: Trajectory) -> Trajectory:
+def _added(found: Trajectory, gives: Mapping[str, str], made: Trajectory, of: str) -> Trajectory:
+    """The recording with columns made of the one called `of`, at the rows of its record."""
+    values = np.full((len(found), len(gives)), np.nan)
+    values[found.own_rows(of)] = made.values
+    records = tuple((*r, *gives) if of in r else r for r in found.origin.records)
     return Trajectory(
         found.time,
-        np.column_stack([found.values, made.values]),
+        np.column_stack([found.values, values]),
         (*found.names, *gives),
         (*found.units, *made.units),
-        replace(found.origin, converted=(*found.origin.converted, *made.origin.converted)),
+        replace(found.origin, converted=(*found.origin.converted, *made.origin.converted), records=records),
     )

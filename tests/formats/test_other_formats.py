@@ -40,18 +40,55 @@ def test_a_matrix_with_time_first_either_way_round(tmp_path: Path, rows: str) ->
     np.testing.assert_array_equal(found.values[:, 1], 2 * Y)
 
 
-def test_structures_of_two_rates_are_joined_over_the_finer(tmp_path: Path) -> None:
+FAST = np.array([0.0, 0.05, 0.1, 0.15000000000000002, 0.2, 0.2, 0.25, 0.30000000000000004])
+"""Two rows at 0.2 s, and instants that differ from those of TIME by their rounding."""
+
+
+def test_structures_of_two_rates_stand_at_their_own_rows(tmp_path: Path) -> None:
     from scipy.io import savemat
 
-    fast = np.linspace(0.0, 0.3, 31)
-    savemat(
-        tmp_path / "s.mat",
-        {"a": {"time": fast, "x": fast**2}, "b": {"time": TIME, "y": Y}},
-    )
+    savemat(tmp_path / "s.mat", {"a": {"time": FAST, "x": np.arange(8.0)}, "b": {"time": TIME, "y": Y, "z": -Y}})
     found = read_waveforms(tmp_path / "s.mat")
-    assert found.names == ("a.x", "b.y")
-    np.testing.assert_array_equal(found.time, fast)
-    np.testing.assert_allclose(found["b.y"], np.interp(fast, TIME, Y))
+    assert found.names == ("a.x", "b.y", "b.z") and found.origin.records == (("a.x",), ("b.y", "b.z"))
+    np.testing.assert_allclose(found.time, FAST, rtol=1e-15)
+    np.testing.assert_array_equal(found["a.x"], np.arange(8.0))
+    nan = np.nan
+    np.testing.assert_array_equal(found["b.y"], [Y[0], nan, Y[1], nan, nan, Y[2], nan, Y[3]])  # after the jump at 0.2 s
+    assert found.gaps("b.y") == 0 and found.own_rows("b.z").sum() == 4
+    assert "each at its own instants: 8 rows of a.x, 4 rows of b.y" in found.origin.notes[0]
+
+
+def test_the_signals_of_one_record_alone_have_its_rows(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    savemat(tmp_path / "s.mat", {"a": {"time": FAST, "x": np.arange(8.0)}, "b": {"time": TIME, "y": Y, "z": -Y}})
+    found = read_waveforms(tmp_path / "s.mat", ["b.z"])
+    np.testing.assert_array_equal(found.time, TIME)
+    np.testing.assert_array_equal(found["b.z"], -Y)
+    assert found.origin.records == () and found.origin.notes == ()
+    convert(tmp_path / "s.mat", tmp_path / "s.csv")
+    assert (tmp_path / "s.csv").read_text().splitlines()[2] == "0.05,1.0,,"
+
+
+def test_records_that_share_no_time_and_gaps_of_their_own(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["one/time"], file["one/P"], file["one/Q"] = [0.0, 1.0], [1.0, np.nan], [2.0, 2.5]
+        file["two/time"], file["two/P"] = [5.0, 6.0], [3.0, 4.0]
+    found = read_waveforms(tmp_path / "a.h5")
+    assert found.time.tolist() == [0.0, 1.0, 5.0, 6.0]
+    assert {name: found.gaps(name) for name in found.names} == {"one/P": 1, "one/Q": 0, "two/P": 0}
+
+
+def test_records_since_1970_keep_the_time_between_their_starts(tmp_path: Path) -> None:
+    start = 1_732_440_000_123_456_789
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, first, step in (("fast", start + 2_000, 1_000), ("slow", start, 3_000)):
+            file[f"{name}/time"] = first + step * np.arange(3)
+            file[f"{name}/time"].attrs["units"] = "ns"
+            file[f"{name}/u"] = np.arange(3.0)
+    found = read_waveforms(tmp_path / "a.h5")
+    np.testing.assert_allclose(found.time, [0.0, 2e-6, 3e-6, 4e-6, 6e-6], rtol=1e-9)
+    assert found["fast/u"][1:4].tolist() == [0.0, 1.0, 2.0]
 
 
 def test_version_7_3(tmp_path: Path) -> None:
@@ -134,8 +171,8 @@ def test_hdf5_groups_without_a_time_use_the_one_above(tmp_path: Path) -> None:
         file["away"] = h5py.ExternalLink("/etc/passwd", "/")
     found = read_waveforms(tmp_path / "a.h5")
     assert set(found.names) == {"left/P", "right/Q"}
-    np.testing.assert_allclose(found["right/Q"], [1.0, 1.25, 1.5])
-    assert found.time[-1] == pytest.approx(0.2)  # what both cover
+    np.testing.assert_array_equal(found["right/Q"], [Y[0], np.nan, Y[2], np.nan])
+    np.testing.assert_array_equal(found.time, TIME)
 
 
 def test_parquet_written_by_another_package_with_time_stamps(tmp_path: Path) -> None:
