@@ -352,7 +352,7 @@ def convert(
         }
     )  # fmt: skip
     rows = f"{len(written)} rows" if len(written) == total else f"{len(written)} of {total} rows"
-    dropped = f" ({omitted} of the file dropped: a third of one instant, or outside another record)" if omitted else ""
+    dropped = f" ({omitted} of the file dropped: a third of one instant)" if omitted else ""
     console.say(f"{to}: {rows}{dropped}, {start:g} to {end:g} s, {len(written.names)} signals")
     console.say(*(f"{name}: {number} of {len(written)} rows not recorded" for name, number in gaps.items()))
     console.say(*written.origin.notes)

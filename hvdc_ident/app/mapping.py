@@ -176,7 +176,8 @@ def columns_with_derived(mapping: RecordingMap, record: Trajectory, where: str) 
     """Return the recording with the columns that the experiment's phases and phasors give."""
     if not mapping.kept.get("phases") and not mapping.kept.get("phasors"):
         return record
-    return with_derived(mapping.table(where), record, where)
+    table = mapping.table(where)
+    return with_derived(table.phases, table.phasors, record, where)
 
 
 def experiment_of(

@@ -218,7 +218,7 @@ def recording_lines(recording: Mapping[str, Any]) -> list[str]:
         lines.append(f"{n} instant{'s' if n > 1 else ''} with two rows: a jump, both kept")
     if (n := recording["dropped"]) > 0:
         lines.append(
-            f"{n} row{'s' if n > 1 else ''} of the file dropped: a third of one instant, or outside another record"
+            f"{n} row{'s' if n > 1 else ''} of the file dropped: a third of one instant, or outside the record of an input"
         )
     lines += [f"{o}: {n} of {rows} rows not recorded" for o, n in recording["not_recorded"].items()]
     return lines

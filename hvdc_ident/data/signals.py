@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hvdc_ident.data.trajectory import Array
 from hvdc_ident.errors import WaveformError
+from hvdc_ident.immutable import FrozenMap
 
 Interpolation = Literal["hold", "linear"]
 
@@ -27,6 +28,10 @@ MAX_CORNERS = 64
 
 MAD_TO_STD = 1.482602218505602
 """Standard deviation over median absolute deviation, of a normal distribution."""
+FEWEST_MEANS = 3
+"""Means from which their scatter is known, if poorly."""
+RARE = 1e-4
+"""Chance that noise is taken for a change, of a mean."""
 DEPARTURE = 6.0
 """A noisy input has left its level when it is so many times its scatter off."""
 
@@ -265,14 +270,47 @@ def _joined(t: Array, v: Array) -> InputSignal:
     return InputSignal(t[kept], v[kept], np.unique(breaks))
 
 
-def event_time(inputs: Mapping[str, InputSignal]) -> float | None:
+def event_time(inputs: Mapping[str, InputSignal], means: Mapping[str, float] = FrozenMap()) -> float | None:
     """Return the instant of the first change of any input in s; None where none changes.
 
     Noise of a recorded input is no change: without a break in it, the signal has to leave its first level by six times
-    the scatter from point to point.
+    the scatter from point to point. means: by name the length in s of the mean that an input was smoothed by, as what is made of
+    phases is: its noise is the same from point to point, and only values so far apart tell how large it is.
     """
-    instants = [t for t in map(_first_change, inputs.values()) if t is not None]
+    found = [_mean_leaves(s, means[n]) if n in means else _first_change(s) for n, s in inputs.items()]
+    instants = [t for t in found if t is not None]
     return min(instants) if instants else None
+
+
+def _mean_leaves(signal: InputSignal, window: float) -> float | None:
+    """Return the instant at which a smoothed signal leaves the level it has had, by more than noise does once in ten thousand windows.
+
+    Each mean is held against those before it: a quantile of Student's t, for the noise is known from these few. A mean answers what
+    happens with a ramp: the line through once and twice the limit leads back to its begin.
+    """
+    from scipy.special import stdtrit
+
+    ends = np.arange(signal.times[0] + window, signal.times[-1], window)
+    means, floor = signal(ends), MERGE_TOLERANCE * float(np.ptp(signal.values))
+    for k in range(FEWEST_MEANS, ends.size):
+        level, scatter = float(means[:k].mean()), max(float(means[:k].std(ddof=1)), floor)
+        limit = scatter * float(stdtrit(k - 1.0, 1.0 - 0.5 * RARE)) * np.sqrt(1.0 + 1.0 / k)
+        if abs(means[k] - level) > limit:
+            once, twice = (_first_beyond(signal, level, m * limit, ends[k - 1], window) for m in (1.0, 2.0))
+            return once if twice is None or once is None else max(2.0 * once - twice, float(ends[k - 1] - window))
+    return None
+
+
+def _first_beyond(signal: InputSignal, level: float, limit: float, start: float, window: float) -> float | None:
+    """The instant within two windows from the start at which a signal is so far from a level; None where it is not."""
+    inside = signal.times[(signal.times > start) & (signal.times < start + 2.0 * window)]
+    t = np.concatenate([[start], inside, [start + 2.0 * window]])
+    off = np.abs(signal(t) - level)
+    k = int(np.argmax(off >= limit))
+    if off[k] < limit:
+        return None
+    share = (limit - off[k - 1]) / (off[k] - off[k - 1]) if k and off[k] > off[k - 1] else 1.0
+    return float(t[max(k - 1, 0)] + min(max(share, 0.0), 1.0) * (t[k] - t[max(k - 1, 0)]))
 
 
 def _first_change(signal: InputSignal) -> float | None:

@@ -27,9 +27,9 @@ PHASE_QUANTITIES = {
     "p": "active power",
     "q": "reactive power, positive where the current lags",
     "v": "magnitude of the positive-sequence voltage, phase to ground, peak",
-    "v-rms": "the same as line-to-line rms",
+    "v-rms": "magnitude of the positive-sequence voltage, line to line, rms",
     "i": "magnitude of the positive-sequence current, peak",
-    "i-rms": "the same as rms",
+    "i-rms": "magnitude of the positive-sequence current, rms",
     "vd": "voltage along the positive-sequence voltage, peak",
     "vq": "voltage across it",
     "id": "current along the positive-sequence voltage, peak",
@@ -78,7 +78,7 @@ class PhaseFilter:
     window: float
 
     def __call__(self, time: Array, values: Complex) -> Complex:
-        """Return the (n,) values smoothed, causally; before the record its first value is taken to hold."""
+        """Return the (n,) values smoothed, causally; a mean is that of the first whole window until this has passed."""
         if self.kind == "none" or self.window == 0:
             return values
         return _mean(time, values, self.window) if self.kind == "mean" else _lowpass(time, values, self.window)
@@ -103,7 +103,7 @@ def phase_quantities(
     for name in wanted:
         if name not in PHASE_QUANTITIES:
             raise unknown_name("quantity of three phases", name, PHASE_QUANTITIES)
-        if current is None and _needs_current(name):
+        if current is None and needs_current(name):
             raise WaveformError(
                 f"'{name}' needs the currents", expected='current = ["IA", "IB", "IC"] beside the voltages'
             )
@@ -124,8 +124,8 @@ def phase_quantities(
             hint="use the recorder's own P, Q and magnitudes",
         )
     turn = np.exp(-2j * np.pi * frequency * time)
-    v = _space_vector(record, voltage)
-    i = _space_vector(record, current) if current else v
+    v = space_vector(record, voltage)
+    i = space_vector(record, current) if current else v
     positive = smoothing(time, v * turn)
     if not np.abs(positive).all():
         raise WaveformError("the positive-sequence voltage is zero somewhere", got="no direction for d and q")
@@ -151,24 +151,26 @@ def phase_quantities(
     return Trajectory(time, np.column_stack([quantity(name) for name in wanted]), tuple(wanted), units)
 
 
-def _space_vector(record: Trajectory, phases: Sequence[str]) -> Complex:
+def space_vector(record: Trajectory, phases: Sequence[str]) -> Complex:
     """Return the (n,) space vector of three phases, amplitude invariant."""
     a, b, c = (record[n] for n in phases)
     return np.asarray((a + _TURN * b + _TURN**2 * c) * (2.0 / 3.0))
 
 
 def _mean(time: Array, values: Complex, window: float) -> Complex:
-    """Return the (n,) mean over the last `window` seconds of the polygon through the values."""
+    """Return the (n,) mean over the last `window` seconds of the polygon through the values; before the first whole window its mean."""
+    length = min(window, float(time[-1] - time[0]))
     area = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(time))])
-    start = time - window
-    before = np.minimum(start - time[0], 0.0)  # the first value holds before the record
-    inside = np.maximum(start, time[0])
-    k = np.clip(np.searchsorted(time, inside, side="right") - 1, 0, time.size - 2)
-    width = time[k + 1] - time[k]
-    share = np.where(width > 0, (inside - time[k]) / np.where(width > 0, width, 1.0), 0.0)
-    at = values[k] + share * (values[k + 1] - values[k])
-    area_start = area[k] + 0.5 * (values[k] + at) * (inside - time[k])
-    return np.asarray((area - area_start - before * values[0]) / window)
+
+    def until(instants: Array) -> Complex:
+        k = np.clip(np.searchsorted(time, instants, side="right") - 1, 0, time.size - 2)
+        width = time[k + 1] - time[k]
+        share = np.where(width > 0, (instants - time[k]) / np.where(width > 0, width, 1.0), 0.0)
+        at = values[k] + share * (values[k + 1] - values[k])
+        return np.asarray(area[k] + 0.5 * (values[k] + at) * (instants - time[k]))
+
+    end = np.maximum(time, time[0] + length)
+    return np.asarray((until(end) - until(end - length)) / length)
 
 
 def _lowpass(time: Array, values: Complex, constant: float) -> Complex:
@@ -225,7 +227,7 @@ def phasor_quantities(
     for name in wanted:
         if name not in PHASOR_QUANTITIES:
             raise unknown_name("quantity of phasors", name, PHASOR_QUANTITIES)
-        if current is None and _needs_current(name):
+        if current is None and needs_current(name):
             raise WaveformError(f"'{name}' needs the current", expected="current = {magnitude = ..., angle = ...}")
         if name == "f" and settings.frequency is None:
             raise WaveformError("'f' needs the nominal frequency", expected="frequency = 50 or 60")
@@ -327,7 +329,8 @@ def _radians(record: Trajectory, column: str, stated: str) -> Array:
     return record[column] * factor[0]
 
 
-def _needs_current(name: str) -> bool:
+def needs_current(name: str) -> bool:
+    """Return whether a quantity of phases or phasors is made of currents too."""
     return name in ("p", "q") or (name.startswith("i") and name != "imag")
 
 
@@ -347,6 +350,6 @@ def _units(wanted: Sequence[str], record: Trajectory, voltage: str, current: str
             return "Hz"
         if name in ("p", "q"):
             return "" if power is None else f"{power}{'W' if name == 'p' else 'var'}"
-        return amperes if _needs_current(name) else volts
+        return amperes if needs_current(name) else volts
 
     return tuple(unit(name) for name in wanted)

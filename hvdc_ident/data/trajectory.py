@@ -29,9 +29,11 @@ class Origin:
     """Origin of the rows of a trajectory in a file.
 
     rows: number in the file; 0 where there is none. dropped: number left out, the third and later rows of an instant and
-    those that only some records of several rates cover. time_unit: as the file states it, "" where it does not; times are in
+    those outside the records of the inputs. time_unit: as the file states it, "" where it does not; times are in
     s in any case. time_column: the column that the time came from, where it was not the first. converted: the signals whose
-    unit was changed to the model's, in words. notes: what else a reader has to tell, in words.
+    unit was changed to the model's, in words. notes: what else a reader has to tell, in words. records: the names of signals that
+    were recorded together, where several records of other instants make up the rows; () where all stand at all rows. since: ns since
+    1970 of the first row, where the file counts times so in whole numbers, else 0.
     """
 
     rows: int = 0
@@ -40,6 +42,8 @@ class Origin:
     time_column: str = ""
     converted: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    records: tuple[tuple[str, ...], ...] = ()
+    since: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +115,17 @@ class Trajectory(Coded, Shown):
         """Return the rows where the mask holds."""
         return Trajectory(self.time[mask], self.values[mask], self.names, self.units, self.origin)
 
+    def own_rows(self, name: str) -> NDArray[np.bool_]:
+        """Return (n,) the rows of the record that the signal stands in: those at which any signal of that has a value."""
+        record = next((r for r in self.origin.records if name in r), None)
+        if record is None:
+            return np.ones(len(self), dtype=bool)
+        columns = [k for k, other in enumerate(self.names) if other in record]
+        return np.asarray(np.isfinite(self.values[:, columns]).any(axis=1))
+
     def gaps(self, name: str) -> int:
-        """Return the number of rows at which the signal was not recorded."""
-        return int(np.count_nonzero(np.isnan(self[name])))
+        """Return the number of rows of its record at which the signal was not recorded."""
+        return int(np.count_nonzero(self.own_rows(name) & np.isnan(self[name])))
 
     def plot(self, names: str | Iterable[str] | None = None, ax: Any = None) -> Any:
         """Return axes with the signals over time, all or those named."""

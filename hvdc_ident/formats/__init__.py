@@ -51,6 +51,7 @@ _WRITTEN_AT_ONCE = 20_000  # rows
 LONGEST = 1e8
 """Seconds beyond which a time is a date, counted since 1970."""
 _YEAR_2100 = 4.1e9  # s since 1970
+_TICKS = (1.2591e17, 1.5747e17), (6.3082e17, 6.6238e17)  # 100 ns, of the years 2000 to 2100
 
 
 class Format(Protocol):
@@ -115,7 +116,16 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
     found = _format_of(file).read(file, wanted)
     _check(found, file)
     found = found if found.origin.rows else replace(found, origin=replace(found.origin, rows=len(found)))
-    return _from_first_row(found)
+    units = _units(list(zip(found.names, found.units, strict=True)))
+    return _from_first_row(replace(found, units=tuple(unit for _, unit in units)))
+
+
+def _units(signals: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Names and units, those that the file does not state as the names say them."""
+    from hvdc_ident.formats._labels import unit_in_name
+
+    names = [name for name, _ in signals]
+    return [(name, unit or unit_in_name(name, names)) for name, unit in signals]
 
 
 def _from_first_row(found: Trajectory) -> Trajectory:
@@ -132,7 +142,12 @@ def _from_first_row(found: Trajectory) -> Trajectory:
 
 
 def unit_since_1970(number: float) -> float:
-    """The unit in s of a time since 1970 that a file states no unit of: the largest of s, ms, us and ns before 2100."""
+    """The unit in s of a time that a file states no unit of: the largest of s, ms, us and ns since 1970 before 2100.
+
+    Whole tenths of a microsecond since 1601 and since the year 1, as Windows and .NET count them, are told by the years 2000 to 2100.
+    """
+    if any(low <= number < high for low, high in _TICKS):
+        return 1e-7
     return next((s for s in (1.0, 1e-3, 1e-6) if number * s < _YEAR_2100), 1e-9)
 
 
@@ -156,7 +171,7 @@ def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[s
         fits = re.compile(pattern, re.IGNORECASE | re.DOTALL).fullmatch
     else:
         fits = re.compile(re.escape(search), re.IGNORECASE).search
-    return [(name, unit) for name, unit in _format_of(file).signals(file) if fits(name)]
+    return [(name, unit) for name, unit in _units(_format_of(file).signals(file)) if fits(name)]
 
 
 def convert(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
-from hvdc_ident.data import is_unit
+from hvdc_ident.data import conversion, is_unit
+from hvdc_ident.data.phase_sets import LETTERS
 from hvdc_ident.formats import FORMULA_START
 
 TIME_WORDS = (
@@ -15,6 +16,12 @@ TIME_WORDS = (
 )  # fmt: skip
 """Names of a column of times, lower case, where it is not the first."""
 
+_DATE_NAME = re.compile(r"dat(?:e|um|a (?:e )?ora|enum)|fecha|stamp|stempel|horodat|дата|日期|日時", re.IGNORECASE)
+_KINDS = {
+    "W": "p", "var": "q", "VA": "s", "V": "[uve]", "A": "i", "Hz": "f", "rad/s": "[wnωΩ]|om|sp", "rad": "[δθφϕ]|a|d|th|ph",
+    "N.m": "t|m", "K": "t|th", "s": "t(?:ime)?_", "pu": "",
+}  # fmt: skip
+"""By unit what a name of such a quantity begins with."""
 _BRACKETS = re.compile(r"(?P<name>.*\S)\s*\[(?P<unit>[^\[\]]*)\]", re.DOTALL)
 _ROUND = re.compile(r"(?P<name>.*[^\s(])\s*\((?P<unit>[^()]*)\)", re.DOTALL)
 _IN = re.compile(r"(?P<name>.*\S)\s+in\s+(?P<unit>\S.*)", re.DOTALL)
@@ -48,6 +55,22 @@ def _split(label: str) -> tuple[str, str]:
     return label, ""
 
 
+def unit_in_name(name: str, names: Collection[str]) -> str:
+    """The unit behind the last underscore of a name, as in `P_MW` and `f_Hz`; "" where that may be something else.
+
+    It has to be a unit of what the name begins with: a power for P, a voltage for V, U and E, and so on, for `V_s` and `I_h` are no
+    seconds and hours. Nor is A an ampere where `I_B` stands beside `I_A`. names: all of the file.
+    """
+    stem, _, unit = name.rpartition("_")
+    if not stem or not is_unit(unit) or not any(
+        conversion(unit, kind) is not None and re.match(letters, name, re.IGNORECASE) for kind, letters in _KINDS.items()
+    ):
+        return ""
+    phases = [other for letters in LETTERS if unit.lower() in letters for other in letters if other != unit.lower()]
+    beside = {other.lower() for other in names}
+    return "" if any(f"{stem}_{letter}".lower() in beside for letter in phases) else unit
+
+
 def names_and_units(labels: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names and units of the header cells; a cell keeps its unit in the name where two would be the same without."""
     parts = [name_and_unit(label) for label in labels]
@@ -68,6 +91,11 @@ def time_column(labels: Sequence[str]) -> int:
     """The place of the column of times: the first, or the first that is called so where the first is not."""
     called = [name_and_unit(label)[0].strip().lower() in TIME_WORDS for label in labels]
     return called.index(True) if any(called) else 0
+
+
+def is_date_name(label: str) -> bool:
+    """Return whether a column of this name holds dates."""
+    return _DATE_NAME.search(label) is not None
 
 
 def _joined(cells: Sequence[str]) -> str:

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
 
-WRAP = 2.0**32
-"""Number of the time stamps that four bytes hold: a count that goes on begins again at 0."""
+WRAPS = 2.0**16, 2.0**32
+"""Numbers of the time stamps that two and four bytes hold: a count that goes on begins again at 0."""
 
 _NAMED = 3  # pauses named in a remark
 
@@ -32,8 +32,10 @@ def placed(rates: Array, stamps: Array, unit: float) -> tuple[Array, tuple[str, 
     periods, turned = _nearest_periods(rates, unit * counts, known)
     time = np.concatenate([[0.0], np.cumsum(periods)]) if turned else plain
     expected, period = np.diff(time[known]), periods[known[1:] - 1]
-    again = (counts < 0) & (np.abs(unit * (counts + WRAP) - expected) < np.maximum(0.5 * period, unit))
-    steps = unit * np.where(again, counts + WRAP, counts)
+    steps = unit * counts
+    for wrap in WRAPS:
+        again = (counts < 0) & (np.abs(unit * (counts + wrap) - expected) < np.maximum(0.5 * period, unit))
+        steps = np.where(again, unit * (counts + wrap), steps)
     for resolution in (unit, unit * _common_divisor(counts)):
         rounded = _rounded_periods(steps, expected, period, unit) if resolution == unit else np.zeros(steps.size, bool)
         pause = _pauses(steps, np.where(rounded, steps, expected), period, resolution)

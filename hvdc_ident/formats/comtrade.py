@@ -25,9 +25,10 @@ import numpy as np
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, damaged, decoded, own_names, package
+from hvdc_ident.formats._columns import check_size, damaged, own_names, package
 from hvdc_ident.formats._comtrade_header import Range, plain_header, ranges
 from hvdc_ident.formats._stamps import placed
+from hvdc_ident.formats._text import decoded
 
 NAME = "comtrade"
 SUMMARY = "COMTRADE 1991, 1999 and 2013 of recorders and relays, ASCII, binary, float32, or all in one .cff"
@@ -38,7 +39,7 @@ _MAX_CHANNELS = 100_000
 _BYTES = {"BINARY": 2, "BINARY32": 4, "FLOAT32": 4}
 _NO_STAMP = 2**32 - 1  # all bits set
 _COUNTS = re.compile(r"\s*(\d{1,6})\s*,\s*(\d{1,6})\s*A\s*,\s*(\d{1,6})\s*D\s*", re.IGNORECASE)
-_SECTION = re.compile(rb"^[ \t]*---[ \t]*file type:[ \t]*(\w+)(?:[ \t]+(\w+))?[ \t]*(?::[ \t]*(\d+))?[^\n]*---[ \t]*\r?$",
+_SECTION = re.compile(rb"^[ \t]*---?[ \t]*file type[ \t]*:?[ \t]*(\w+)(?:[ \t]+(\w+))?[ \t]*(?::[ \t]*(\d+))?[^\n]*---[ \t]*\r?$",
                       re.IGNORECASE | re.MULTILINE)  # fmt: skip
 _REFUSALS = (ValueError, TypeError, IndexError, KeyError, AttributeError, OverflowError, struct.error)
 

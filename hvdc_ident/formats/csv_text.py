@@ -9,7 +9,6 @@ column that is wrong or, where only columns nobody asked for are, reads around t
 
 from __future__ import annotations
 
-import codecs
 import csv
 import math
 import re
@@ -26,7 +25,8 @@ from hvdc_ident.data import Array, Origin, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import LONGEST, event_rows, once, pick, unit_since_1970
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
-from hvdc_ident.formats._labels import merged, names_and_units, time_column
+from hvdc_ident.formats._labels import is_date_name, merged, names_and_units, time_column, unit_in_name
+from hvdc_ident.formats._text import WIDE, encoding_of
 
 NAME = "csv"
 SUMMARY = (
@@ -38,8 +38,17 @@ _MAX_COLUMNS = 100_000
 _MAX_LINE = 32 * 1024**2  # characters
 _SEPARATORS = (";", "\t", ",")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_THOUSANDS = re.compile(r"([+-]?[0-9]{1,3}(?:['’\u00a0\u2009\u202f][0-9]{3})+)(?![0-9'’\u00a0\u2009\u202f])(.*)")
+"""Pattern of a number whose thousands are set apart as in Switzerland, or by a blank that breaks no line."""
 _DATED = re.compile(r":|[^\W\d_]{3}.*\d|\d[-/ ]\w+[-/ ]\d|\d{1,2}\.\d{1,2}\.\d{2,4}\b|\d{8}[T ]\d")
 """Pattern of a date or time of day, in whatever order."""
+_SERIAL_UNIT, _SERIAL = 86400.0, ((20_000.0, 80_000.0), (700_000.0, 780_000.0))
+"""s in a day, and the days between 1954 and 2119 as spreadsheets count them, since 1899-12-30, and MATLAB, since the year 0."""
+_SERIAL_NOTE = "the time is taken for dates as a spreadsheet counts them, in days"
+_MAYBE_SERIAL = (
+    'the time may be dates as a spreadsheet counts them, in days, and is taken as s: name the column "date", or its unit "d", if it is'
+)
+_SHORT_STEP = 1e-3  # d, 86 s: dates of a spreadsheet lie closer, and a clock of seconds seldom begins at half a day
 _DATES = "as in 2026-11-21 10:15:00.020, 21/11/2026 10:15:00 or 21-Nov-2026 10:15:00"
 _MISSING = {
     "", "nan", "-nan", "+nan", "na", "n/a", "#n/a", "#na", "#nv", "#n/d", "null", "none", "<na>", "1.#qnan", "-1.#qnan",
@@ -59,8 +68,8 @@ class _Layout:
 
     units: the time's included, as the header says them. time: the column of times; scale: s in its unit. date: the
     column of dates beside it, -1 where there is none. absolute: whether its times are dates or times of day. since: where
-    the times are numbers counted since 1970, that of the first row, which the readers take off before a double is made:
-    1.7e18 ns has more digits than a double.
+    the times are numbers counted since 1970, or days as spreadsheets count them, that of the first row, which the readers take
+    off before a double is made: 1.7e18 ns has more digits than a double. notes: what is not certain about them.
     """
 
     path: Path
@@ -76,6 +85,7 @@ class _Layout:
     date: int = -1
     absolute: bool = False
     since: Decimal | None = None
+    notes: tuple[str, ...] = ()
 
     def column(self, i: int) -> str:
         return f"column {i + 1} ('{_short(self.labels[i])}')"
@@ -92,7 +102,7 @@ def recognises(path: Path) -> bool:
         return False
     with open(path, "rb") as file:
         top = file.read(65536)
-    return top.startswith(_WIDE) or b"\0" not in top
+    return top.startswith(WIDE) or b"\0" not in top
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -112,21 +122,20 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     known = layout.signals
     wanted = pick(path, signals, [layout.names[i] for i in known], [layout.labels[i] for i in known])
     columns = [layout.time] + [known[i] for i in wanted]
+    clock = Clock()
     table = None if layout.absolute else _fast(layout, columns)
     if table is None:
-        table = _careful(layout, columns)
+        table = _careful(layout, columns, clock)
     if len(table) < 2:
         raise WaveformError("too few rows", where=str(path), expected="at least 2 rows of numbers", got=f"{len(table)}")
     _check_times(layout, table[:, 0])
     names = tuple(signals) if signals is not None else tuple(layout.names[i] for i in known)
     dated = layout.absolute or layout.since is not None
     unit = "date" if dated else layout.units[layout.time]
-    origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "")
-    scale = layout.scale
-    if layout.since is not None and not layout.units[layout.time]:
-        scale = unit_since_1970(float(layout.since))
+    notes = (*layout.notes, *clock.notes, *([_MAYBE_SERIAL] if not unit and _may_be_serial(table[:, 0]) else []))
+    origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "", notes=notes)
     time = table[:, 0] - table[0, 0] if dated else table[:, 0]
-    time = scaled(time, scale)
+    time = scaled(time, layout.scale)
     return once(Trajectory(time, table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]), origin))
 
 
@@ -165,6 +174,8 @@ def _layout(path: Path) -> _Layout:
         labels[0] = "row"  # the index that some packages write first and without a name
     _check_labels(labels, path, number)
     names, units = names_and_units(labels)
+    if not units[time] and (unit := unit_in_name(labels[time], labels)):
+        units = (*units[:time], unit, *units[time + 1 :])
     cells = [c.strip(' "') for c in _split(row, separator)]
     absolute, date = False, -1
     if len(cells) >= len(labels) > 1:
@@ -184,16 +195,46 @@ def _layout(path: Path) -> _Layout:
             got=f"'{_short(labels[time])}'",
             hint="put the column of times first, or name it 'time [s]'",
         )
-    since = None if absolute or len(cells) <= time else _since_1970(cells[time], scale)
+    since, notes = None, tuple[str, ...]()
+    if not absolute and len(cells) > time:
+        since, scale, notes = _epoch(cells[time], labels[time], units[time], scale)
     return _Layout(
-        path, encoding, number, separator, trailing, tuple(labels), names, units, time, scale, date, absolute, since
+        path, encoding, number, separator, trailing, tuple(labels), names, units, time, scale, date, absolute, since, notes
     )
 
 
-def _since_1970(cell: str, scale: float) -> Decimal | None:
-    """The time of a cell where it is a number counted since 1970, else None. scale: s in its unit."""
-    text = cell if "." in cell else cell.replace(",", ".", 1)
-    return Decimal(text) if _NUMBER.fullmatch(text) and float(text) * scale >= LONGEST else None
+def _epoch(cell: str, label: str, unit: str, scale: float) -> tuple[Decimal | None, float, tuple[str, ...]]:
+    """The first time where it is a number counted since 1970, or the number of a day, else None; s in its unit; remarks.
+
+    scale: s in the unit that the header says, 1 where it says none.
+    """
+    text = _plain(cell if "." in cell else cell.replace(",", ".", 1))
+    if not _NUMBER.fullmatch(text):
+        return None, scale, ()
+    if not unit and is_date_name(label) and _is_serial(float(text)):
+        return Decimal(text), _SERIAL_UNIT, (_SERIAL_NOTE,)
+    if float(text) * scale >= LONGEST:
+        return Decimal(text), scale if unit else unit_since_1970(float(text)), ()
+    return None, scale, ()
+
+
+def _is_serial(number: float) -> bool:
+    return any(low <= number < high for low, high in _SERIAL)
+
+
+def _may_be_serial(time: Array) -> bool:
+    """Return whether times without a unit may be days. time: (n,) as in the file."""
+    steps = np.diff(time)
+    return _is_serial(time[0]) and _is_serial(time[-1]) and 0.0 < float(np.median(steps)) < _SHORT_STEP
+
+
+def _plain(cell: str) -> str:
+    """The number of a cell without marks between its thousands, and with a plain minus."""
+    if cell.isascii() and "'" not in cell:
+        return cell
+    text = cell.replace("\u2212", "-")
+    grouped = _THOUSANDS.fullmatch(text)
+    return re.sub(r"[^0-9+-]", "", grouped[1]) + grouped[2] if grouped else text
 
 
 def _is_row(line: str) -> bool:
@@ -203,25 +244,14 @@ def _is_row(line: str) -> bool:
         if len(cells) > 1 or (separator is None and not any(s in line for s in _SEPARATORS)):
             tops = cells[:2] if cells[0] == "" or is_date(cells[0]) else cells[:1]
             decimal = "," if separator == "," else "."
-            if any(_NUMBER.fullmatch(c.replace(",", decimal, 1)) or is_clock(c) or is_date(c) for c in tops):
+            if any(_NUMBER.fullmatch(_plain(c).replace(",", decimal, 1)) or is_clock(c) or is_date(c) for c in tops):
                 return True
     return False
 
 
-_WIDE = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-
-
 def _encoding(path: Path) -> str:
-    """UTF-8, UTF-16 where the file says so, else the code page of Western Windows."""
     with open(path, "rb") as file:
-        top = file.read(65536)
-    if top.startswith(_WIDE):
-        return "utf-16"
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(top)
-    except UnicodeDecodeError:
-        return "cp1252"
-    return "utf-8-sig"
+        return encoding_of(file.read(65536))
 
 
 def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:
@@ -398,10 +428,9 @@ def _rows(layout: _Layout) -> Iterator[str]:
         raise ValueError("no rows")
 
 
-def _careful(layout: _Layout, columns: list[int]) -> Array:
+def _careful(layout: _Layout, columns: list[int], clock: Clock) -> Array:
     """(n, columns) the numbers, read cell by cell; WaveformError with line and column at the first that is wrong."""
     found = []
-    clock = Clock()
     width = len(layout.labels)
     comma_line = point_line = 0
     for number, line in _lines(layout.path, layout.encoding):
@@ -417,6 +446,7 @@ def _careful(layout: _Layout, columns: list[int]) -> Array:
                 dated = f"{cells[layout.date]} {cell}" if layout.date >= 0 else cell
                 row.append(_clock_time(clock, dated, layout, number))
                 continue
+            cell = _plain(cell)
             if layout.separator != "," or "," in cell:
                 comma_line, point_line = comma_line or number * ("," in cell), point_line or number * ("." in cell)
                 if "," in cell and "." not in cell:

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.formats import event_rows, pick
-from hvdc_ident.formats._columns import check_size, damaged, decoded
+from hvdc_ident.formats._columns import check_size, damaged
+from hvdc_ident.formats._text import decoded
 
 NAME = "dymola-mat"
 SUMMARY = "result files of Dymola and OpenModelica (MATLAB v4)"

@@ -12,10 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import Array, Trajectory, scaled, seconds_of
-from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, damaged, guarded, joined, package, time_name
+from hvdc_ident.data import Array, Origin, Trajectory
+from hvdc_ident.formats._columns import checked, chosen, damaged, guarded, instants, joined, package, time_name
 
 NAME = "hdf5"
 SUMMARY = "HDF5 and netCDF: data sets over the `time` of their group"
@@ -40,9 +38,8 @@ def signals(path: Path) -> list[tuple[str, str]]:
 
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
-    """The signals, all or those named in that order; several rates are joined over the finest."""
-    found = _waveforms(path)
-    return found.select([found.names[i] for i in pick(path, signals, found.names)])
+    """The signals, all or those named in that order; records of several rates stand at their own rows."""
+    return chosen(_waveforms(path), signals, path)
 
 
 def sample(path: Path) -> None:
@@ -55,7 +52,6 @@ def sample(path: Path) -> None:
 
 
 def _waveforms(path: Path) -> Trajectory:
-    package("h5py", path)
     return guarded(waveforms_unguarded, path)
 
 
@@ -63,66 +59,42 @@ def waveforms_unguarded(path: Path) -> Trajectory:
     """All waveforms of the file, read in this process, which a damaged file may hang or end."""
     with open(path, "rb") as file:
         newest = file.read(8) == _HDF5
-    try:
-        parts = _hdf5(path) if newest else _netcdf3(path)
-    except WaveformError:
-        raise
-    except (
-        OSError,
-        RuntimeError,
-        LookupError,
-        ValueError,
-        TypeError,
-        ArithmeticError,
-        AttributeError,
-        MemoryError,
-    ) as error:
-        raise damaged(path, f"the file cannot be read: {error}") from None
+    parts = _hdf5(path) if newest else _netcdf3(path)
     if not parts:
         raise damaged(path, "no waveforms", expected="a data set 'time' and others of as many rows")
-    return joined([checked(part, path) for part in parts], path)
+    return joined([checked(part, path) for part in parts])
 
 
 def _hdf5(path: Path) -> list[Trajectory]:
     with package("h5py", path).File(path, "r") as file:
-        return list(_group(file, "", None, path, 0))
+        return list(_group(file, "", (None, Origin()), path, 0))
 
 
-def _group(group: Any, prefix: str, above: Any, path: Path, depth: int) -> Iterator[Trajectory]:
-    """The records of a group and of those inside it. above: the time of the groups around it."""
+def _group(group: Any, prefix: str, above: tuple[Array | None, Origin], path: Path, depth: int) -> Iterator[Trajectory]:
+    """The records of a group and of those inside it. above: time of the groups around it, and its origin."""
     if depth > _MAX_DEPTH or len(group) > _MAX_SETS:
         raise damaged(path, f"too many data sets in '{prefix or '/'}', or groups too deep")
     kinds = {name: group.get(name, getclass=True, getlink=True) for name in group}
     local = [name for name, kind in kinds.items() if kind is not None and kind.__name__ == "HardLink"]  # none outside
     sets = {n: group[n] for n in local if hasattr(group[n], "shape") and group[n].dtype.kind in "fiub"}
     name = time_name(list(sets))
-    clock = above
+    clock, origin = above
     if name is not None:
-        check_size(1, sets[name].size, path)
-        clock = _in_seconds(np.asarray(sets[name], dtype=float).ravel(), _unit(sets[name]), path)
+        clock, origin = instants(np.asarray(sets[name]).ravel(), name, _unit(sets[name]).split(" since ")[0], path)
     columns, units = {}, []
     for other, item in sets.items():
         if other == name or clock is None or item.ndim not in (1, 2) or clock.size not in item.shape:
             continue
-        check_size(clock.size, item.size // max(1, clock.size), path)
         values = np.asarray(item, dtype=float)
         values = (values if item.shape[0] == clock.size else values.T).reshape(clock.size, -1)
         for i, column in enumerate(values.T):
             columns[prefix + other + (f"({i + 1})" if values.shape[1] > 1 else "")] = column
             units.append(_unit(item))
-    if columns:
-        yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), tuple(units))
+    if columns and clock is not None:
+        yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), tuple(units), origin)
     for inner in local:
         if hasattr(group[inner], "keys"):
-            yield from _group(group[inner], f"{prefix}{inner}/", clock, path, depth + 1)
-
-
-def _in_seconds(clock: Array, unit: str, path: Path) -> Array:
-    """A time vector in s; netCDF writes its units as `milliseconds since 2026-01-01`."""
-    length = seconds_of(unit.split(" since ")[0])
-    if length is None:
-        raise damaged(path, "the time is in a unit that is none of time", expected="s, ms, us, min, h", got=f"'{unit}'")
-    return scaled(clock, length)
+            yield from _group(group[inner], f"{prefix}{inner}/", (clock, origin), path, depth + 1)
 
 
 def _unit(item: Any) -> str:
@@ -141,10 +113,10 @@ def _netcdf3(path: Path) -> list[Trajectory]:
         name = time_name(list(sets))
         if name is None:
             return []
-        unit = getattr(sets[name], "units", "")
-        clock = _in_seconds(np.array(sets[name].data, dtype=float).ravel(), _text(unit), path)
+        unit = _text(getattr(sets[name], "units", ""))
+        clock, origin = instants(np.array(sets[name].data).ravel(), name, unit.split(" since ")[0], path)
         columns = {k: np.array(v.data, dtype=float) for k, v in sets.items() if k != name and v.shape == clock.shape}
         units = tuple(_text(getattr(sets[k], "units", "")) for k in columns)
     if not columns:
         return []
-    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), units)]
+    return [Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), units, origin)]

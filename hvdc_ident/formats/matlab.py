@@ -2,26 +2,26 @@
 
 Three layouts are understood, each either way round: a vector called time, t, tout, Zeit or temps with vectors or
 matrices of as many rows beside it; a matrix whose first column or row is the time, which increases; Simulink's
-"structure with time" (fields `time` and `signals`, each with `values` and `label`). Several structures are several
-rates, joined over the finest. Objects (timeseries, Dataset) are stored in a form MathWorks does not publish: they are
-refused with the way out.
+"structure with time" (fields `time` and `signals`, each with `values` and `label`). Several structures are
+records of their own rates. Complex numbers are two signals, `y.real` and `y.imag`. Objects (timeseries, Dataset) are
+stored in a form MathWorks does not publish: they are refused with the way out.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hvdc_ident.data import Array, Trajectory
+from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, damaged, guarded, joined, package, time_name
-from hvdc_ident.formats._mat5 import Mat5Error, Opaque, variables
-from hvdc_ident.formats.dymola_mat import matrices_of, starts_as_version_4
+from hvdc_ident.formats._columns import check_size, checked, chosen, guarded, instants, joined, package, time_name
 from hvdc_ident.formats.dymola_mat import recognises as is_result_file
+from hvdc_ident.formats.dymola_mat import starts_as_version_4
 
 NAME = "matlab"
 SUMMARY = "MATLAB and Simulink, versions 4 to 7.3: time vector, time in the first column, or structure with time"
@@ -32,6 +32,11 @@ _ADVICE = "save it as 'Structure with time' or as vectors: t = ts.Time; y = ts.D
 _MAX_DEPTH = 4
 _FEWEST = 8
 """Numbers that increase by chance once in 8! = 40 320 times: with fewer, an increasing row proves no time axis."""
+
+
+@dataclass(frozen=True)
+class _Object:
+    """A variable in a form that is not published: an object, a function, a timeseries."""
 
 
 def recognises(path: Path) -> bool:
@@ -51,9 +56,7 @@ def signals(path: Path) -> list[tuple[str, str]]:
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     """The signals, all or those named in that order. An instant with more than two rows keeps its first and last."""
-    found = _waveforms(path)
-    wanted = pick(path, signals, found.names)
-    return found.select([found.names[i] for i in wanted])
+    return chosen(_waveforms(path), signals, path)
 
 
 def sample(path: Path) -> None:
@@ -65,51 +68,51 @@ def sample(path: Path) -> None:
 
 
 def _waveforms(path: Path) -> Trajectory:
-    with open(path, "rb") as file:
-        top = file.read(64)
-    if top.startswith(_V73):
-        package("h5py", path)
-        return guarded(waveforms_unguarded, path)
-    return _joined(_version_5(path) if top.startswith(_V5) else _version_4(path), path)
+    return guarded(waveforms_unguarded, path)
 
 
 def waveforms_unguarded(path: Path) -> Trajectory:
-    """All waveforms of a version 7.3 file, read in this process, which a damaged file may hang or end."""
-    return _joined(_version_73(path), path)
-
-
-def _joined(found: Mapping[str, Any], path: Path) -> Trajectory:
+    """All waveforms of the file, read in this process, which a damaged file may hang or end."""
+    with open(path, "rb") as file:
+        newest = file.read(len(_V73)) == _V73
+    found = _split_complex(_version_73(path) if newest else _until_version_7(path))
     parts = list(_parts(found, path))
     if not parts:
         raise _no_time(found, path)
-    return joined([checked(part, path) for part in parts], path)
+    return joined([checked(part, path) for part in parts])
 
 
-def _version_4(path: Path) -> dict[str, Any]:
-    """The variables of a version 4 file: matrices and text."""
-    found = matrices_of(path)
-    if "dataInfo" in found:
-        raise damaged(path, "a result file of Dymola without its class", expected="a matrix 'Aclass' at its start")
-    return {name: np.squeeze(np.asarray(m.values.T, dtype=float)) for name, m in found.items() if not m.is_text}
+def _until_version_7(path: Path) -> dict[str, Any]:
+    """The variables of a file of version 4 to 7.2 by name."""
+    from scipy.io import loadmat
 
-
-def _version_5(path: Path) -> dict[str, Any]:
-    try:
-        found = variables(path.read_bytes())
-    except (Mat5Error, MemoryError, OverflowError, ValueError) as error:
-        raise damaged(path, f"MATLAB file cannot be read: {error}") from None
+    found = {}
+    for name, value in loadmat(path, simplify_cells=True).items():
+        if isinstance(value, np.ndarray) and value.dtype.names == ("s0", "s1", "s2", "arr"):
+            found[value["s0"][0].decode("latin-1")] = _Object()  # scipy calls it 'None'
+        elif not name.startswith("__"):
+            found[name] = value
     return found
 
 
 def _version_73(path: Path) -> dict[str, Any]:
-    h5py = package("h5py", path)
-    try:
-        with h5py.File(path, "r") as file:
-            return {name: _from_hdf5(file[name], file, path, 0) for name in file if not name.startswith("#")}
-    except WaveformError:
-        raise
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise damaged(path, f"MATLAB 7.3 file cannot be read: {error}") from None
+    with package("h5py", path).File(path, "r") as file:
+        return {name: _from_hdf5(file[name], file, path, 0) for name in file if not name.startswith("#")}
+
+
+def _split_complex(found: Mapping[str, Any]) -> dict[str, Any]:
+    """The variables with two in place of each complex one, in the structures among them too."""
+    parts: dict[str, Any] = {}
+    for name, value in found.items():
+        if isinstance(value, dict):
+            parts[name] = _split_complex(value)
+        elif isinstance(value, list):
+            parts[name] = [_split_complex(item) if isinstance(item, dict) else item for item in value]
+        elif np.iscomplexobj(value):
+            parts |= {f"{name}.real": np.real(value), f"{name}.imag": np.imag(value)}
+        else:
+            parts[name] = value
+    return parts
 
 
 def _from_hdf5(item: Any, file: Any, path: Path, depth: int) -> Any:
@@ -119,17 +122,18 @@ def _from_hdf5(item: Any, file: Any, path: Path, depth: int) -> Any:
     if hasattr(item, "keys"):
         return {k: _from_hdf5(item[k], file, path, depth + 1) for k in item}
     if "MATLAB_object_decode" in item.attrs:
-        return Opaque("object")
+        return _Object()
     kind = item.attrs.get("MATLAB_class", b"").decode("ascii", "replace")
     if kind == "char":
         check_size(1, item.size, path)
         return "".join(map(chr, np.asarray(item).ravel().astype(int))) if item.size > 2 or not _empty(item) else ""
     if item.dtype.kind == "O":  # references: the elements of a structure array
         return [_from_hdf5(file[r], file, path, depth + 1) for r in np.asarray(item).ravel()]
-    if item.dtype.kind not in "fiub":
+    values = np.asarray(item) if item.dtype.kind in "fiub" or item.dtype.names == ("real", "imag") else None
+    if values is None:
         return None
-    check_size(1, item.size, path)
-    return np.squeeze(np.asarray(item, dtype=float).T) if not _empty(item) else np.empty(0)
+    values = values["real"] + 1j * values["imag"] if values.dtype.names else values
+    return np.squeeze(values.T) if not _empty(item) else np.empty(0)
 
 
 def _empty(item: Any) -> bool:
@@ -139,7 +143,7 @@ def _empty(item: Any) -> bool:
 def _parts(found: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
     """The records among the variables, each with a time of its own."""
     structures = {k: v for k, v in found.items() if isinstance(v, dict)}
-    arrays = {k: np.asarray(v, dtype=float) for k, v in found.items() if _numeric(v)}
+    arrays = {k: np.asarray(v) for k, v in found.items() if _numeric(v)}
     for name, structure in structures.items():
         yield from _structure(name, structure, path)
     time = time_name(list(arrays))
@@ -154,7 +158,7 @@ def _parts(found: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
                 yield Trajectory(upright[:, 0], upright[:, 1:], labels)
 
 
-def _upright(table: Array) -> Array | None:
+def _upright(table: NDArray[Any]) -> NDArray[Any] | None:
     """The matrix with the time in its first column; None where neither its first column nor its first row is one.
 
     To File blocks save one row a signal, logged arrays one column a signal: the time is what increases. Where both
@@ -171,8 +175,8 @@ def _upright(table: Array) -> Array | None:
 
 def _no_time(found: Mapping[str, Any], path: Path) -> WaveformError:
     """The error for a file without a time, which names the variable that may be it."""
-    arrays = {k: np.asarray(v, dtype=float) for k, v in found.items() if _numeric(v)}
-    opaque = next((name for name, value in found.items() if isinstance(value, Opaque)), None)
+    arrays = {k: np.asarray(v) for k, v in found.items() if _numeric(v)}
+    opaque = next((name for name, value in found.items() if isinstance(value, _Object)), None)
     if opaque is not None and not arrays:
         return WaveformError(
             f"'{opaque}' is a MATLAB object, whose form is not published",
@@ -202,36 +206,40 @@ def _structure(name: str, structure: Mapping[str, Any], path: Path) -> Iterator[
         if other is not None:
             yield _beside(other, numeric, path, prefix=f"{name}.")
         return
-    clock = np.atleast_1d(np.asarray(time, dtype=float))
+    clock, origin = instants(np.atleast_1d(np.asarray(time)).ravel(), "time", "", path)
     if listed is None:
         yield _beside("time", _flat(structure), path, prefix=f"{name}.")
         return
-    columns: dict[str, Array] = {}
+    columns: dict[str, NDArray[Any]] = {}
     for i, signal in enumerate(_list(listed)):
         if not isinstance(signal, dict) or not _numeric(signal.get("values")):
             continue
         label = signal.get("label")
         shown = label if isinstance(label, str) and label else f"{name}.{i + 1}"
-        _add(columns, shown, np.asarray(signal["values"], dtype=float), clock.size)
+        _add(columns, shown, np.asarray(signal["values"]), clock.size)
     if columns:
-        yield Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
+        yield _record(clock, columns, origin)
 
 
-def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, Array]:
+def _record(clock: Array, columns: Mapping[str, NDArray[Any]], origin: Origin) -> Trajectory:
+    return Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns), origin=origin)
+
+
+def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, NDArray[Any]]:
     """The arrays of numbers in a structure and the structures inside it, those under `inner.name`."""
-    found: dict[str, Array] = {}
+    found: dict[str, NDArray[Any]] = {}
     for key, value in structure.items():
         if _numeric(value):
-            found[prefix + key] = np.asarray(value, dtype=float)
+            found[prefix + key] = np.asarray(value)
         elif isinstance(value, dict):
             found |= _flat(value, f"{prefix}{key}.")
     return found
 
 
-def _beside(time: str, arrays: Mapping[str, Array], path: Path, prefix: str = "") -> Trajectory:
+def _beside(time: str, arrays: Mapping[str, NDArray[Any]], path: Path, prefix: str = "") -> Trajectory:
     """A time vector and every array of as many rows."""
-    clock = np.atleast_1d(arrays[time]).ravel()
-    columns: dict[str, Array] = {}
+    clock, origin = instants(np.atleast_1d(arrays[time]).ravel(), time, "", path)
+    columns: dict[str, NDArray[Any]] = {}
     for name, values in arrays.items():
         if name != time:
             _add(columns, prefix + name, values, clock.size)
@@ -246,10 +254,10 @@ def _beside(time: str, arrays: Mapping[str, Array], path: Path, prefix: str = ""
             got=shapes or "nothing else",
             hint="save signals and their time at the same instants",
         )
-    return Trajectory(clock, np.column_stack(list(columns.values())), tuple(columns))
+    return _record(clock, columns, origin)
 
 
-def _add(columns: dict[str, Array], name: str, values: Array, rows: int) -> None:
+def _add(columns: dict[str, NDArray[Any]], name: str, values: NDArray[Any], rows: int) -> None:
     """Put a vector, or each column of a matrix, of so many rows among the columns; anything else is no signal."""
     if values.ndim == 1 and values.size == rows:
         columns[name] = values
@@ -276,5 +284,6 @@ def _numeric(value: Any) -> bool:
     return isinstance(value, np.ndarray | float | int) and np.asarray(value).dtype.kind in "fiub"
 
 
-def _increases(values: Array) -> bool:
+def _increases(values: NDArray[Any]) -> bool:
+    values = values.astype(float)  # differences of whole numbers without a sign never fall
     return bool(values.size > 1 and np.isfinite(values).all() and (np.diff(values) >= 0).all() and np.ptp(values) > 0)

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hvdc_ident.data import Trajectory
+from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, damaged, package, time_name
+from hvdc_ident.formats._columns import check_size, checked, damaged, instants, package, time_name
 
 NAME = "parquet"
 SUMMARY = "Parquet tables with a column `time`"
@@ -37,10 +38,11 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     wanted = pick(path, signals, names)
     check_size(file.metadata.num_rows, len(wanted) + 1, path)
     table = _guarded(path, lambda: file.read(columns=[clock, *(names[i] for i in wanted)]))
-    time = _seconds(table.column(clock).to_numpy(), path)
+    time, origin = _seconds(table.column(clock).to_numpy(), clock, path)
     columns = [np.asarray(table.column(names[i]).to_numpy(), dtype=float) for i in wanted]
     values = np.column_stack(columns) if columns else np.empty((time.size, 0))
-    return checked(Trajectory(time, values, tuple(names[i] for i in wanted), tuple(units[i] for i in wanted)), path)
+    found = tuple(names[i] for i in wanted), tuple(units[i] for i in wanted)
+    return checked(Trajectory(time, values, *found, origin), path)
 
 
 def write(trajectory: Trajectory, path: Path) -> None:
@@ -78,12 +80,13 @@ def _is_number(kind: str) -> bool:
     return kind.startswith(("double", "float", "halffloat", "int", "uint", "bool"))
 
 
-def _seconds(values: Any, path: Path) -> Any:
+def _seconds(values: NDArray[Any], name: str, path: Path) -> tuple[Array, Origin]:
+    """Times in s, time stamps from the first row, and their origin."""
     if values.dtype.kind == "M":
-        return (values - values[:1]) / np.timedelta64(1, "ns") * 1e-9
+        return (values - values[:1]) / np.timedelta64(1, "ns") * 1e-9, Origin(time_unit="date")
     if values.dtype.kind not in "fiu":
         raise damaged(path, "the time column is no number and no time stamp", got=str(values.dtype))
-    return np.asarray(values, dtype=float)
+    return instants(values, name, "", path)
 
 
 def _guarded(path: Path, act: Any) -> Any:

@@ -19,6 +19,7 @@ from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import pick
 from hvdc_ident.formats._columns import check_size, checked, damaged, own_names
+from hvdc_ident.formats._text import decoded
 
 NAME = "pscad"
 SUMMARY = "PSCAD output: the .inf, with its numbered .out files beside it"
@@ -121,7 +122,7 @@ def _channels(path: Path) -> list[_Channel]:
     if path.stat().st_size > _MAX_HEADER:
         raise damaged(path, "the list of channels is too long", expected=f"at most {_MAX_HEADER >> 20} MiB")
     found = {}
-    for match in _CHANNEL.finditer(path.read_bytes().decode("latin-1")):
+    for match in _CHANNEL.finditer(decoded(path.read_bytes())):
         number, fields = int(match[1]), dict(_FIELD.findall(match[2]))
         if number in found or not 1 <= number <= _MAX_CHANNELS:
             raise damaged(path, f"channel {number} stands twice or is out of range", got=match[0].strip()[:80])

@@ -142,15 +142,15 @@ class Child:
             self.guard.wait()
 
 
-def call(function: Callable[..., Any], *arguments: object, seconds: float) -> Any:
+def call(function: Callable[..., Any], *arguments: object, seconds: float, memory: int | None = None) -> Any:
     """Return function(*arguments) from a process of its own. Both, and what is returned, must be picklable.
 
-    Raises what the function raises, TimeoutError where it takes longer, and ChildEndedError where its process ends. Windows
-    hands no descriptors on: there it is called in this process.
+    memory: bytes that it may take; None: no limit. Raises what the function raises, TimeoutError where it takes longer, and
+    ChildEndedError where its process ends. Windows hands no descriptors on: there it is called in this process.
     """
     if os.name != "posix":
         return function(*arguments)
-    child = Child(inside.answer, function, arguments)
+    child = Child(inside.answer, function, arguments, memory)
     try:
         if not child.connection.poll(seconds):
             raise TimeoutError(f"no result after {seconds:g} s")

@@ -157,8 +157,15 @@ def _work(guard: int, talk: Connection, progress: memoryview[float], dumps: sock
     os._exit(code)  # a library may hang in its own clean-up
 
 
-def answer(connection: Connection, _: memoryview[float], function: Callable[..., Any], arguments: Sequence[Any]) -> None:
-    """Send the function's value and None, or None and what it raised."""
+def answer(
+    connection: Connection,
+    progress: memoryview[float],
+    function: Callable[..., Any],
+    arguments: Sequence[Any],
+    memory: int | None,
+) -> None:
+    """Send the function's value and None, or None and what it raised. memory: bytes that it may take."""
+    limit_memory(progress, memory)
     try:
         value, error = function(*arguments), None
     except Exception as raised:

@@ -17,8 +17,10 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.data import FEWEST_QUIET, Array, Trajectory, before_event, conversion, noise_estimate
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
-from hvdc_ident.study.conversions import Evidence, suggest_conversion
+from hvdc_ident.parameters import Parameter
+from hvdc_ident.study.conversions import Evidence, scale_between, suggest_conversion
 from hvdc_ident.text import quantity
 
 Kind = Literal["input", "output"]
@@ -44,7 +46,8 @@ class Target:
 class Column:
     """A column of a recording: its unit, its level before the event and the noise about it, in that unit.
 
-    gaps: rows in which it is not recorded. quiet: whether the level is a mean of rows before an event, not the first row.
+    gaps: rows in which it is not recorded. quiet: whether the level is a mean of rows before an event, not the first row. counted: in
+    which of several ways it is counted, as a peak or rms, in words; "" where there is only one.
     """
 
     name: str
@@ -53,6 +56,12 @@ class Column:
     noise: float
     gaps: int
     quiet: bool = True
+    counted: str = ""
+
+    @property
+    def stem(self) -> str:
+        """The name without its unit, as in `P_MW`."""
+        return self.name.removesuffix(f"_{self.unit}") if self.unit else self.name
 
     @property
     def place(self) -> str:
@@ -87,14 +96,16 @@ class Matching:
     missing: tuple[Target, ...]
 
 
-def columns_of(record: Trajectory, event: float | None) -> tuple[Column, ...]:
-    """Return the columns of a recording that hold numbers. event: s; without one the first row tells the level."""
+def columns_of(
+    record: Trajectory, event: float | None, counted: Mapping[str, str] = FrozenMap()
+) -> tuple[Column, ...]:
+    """Return the columns of a recording that hold numbers. event: s; without one the first row tells the level. counted: by name."""
     found = []
     for name, unit in zip(record.names, record.units, strict=True):
         values = record[name]
         if not np.isnan(values).all():
             level, noise, quiet = _rest(record.time, values, event)
-            found.append(Column(name, unit, level, noise, int(np.isnan(values).sum()), quiet))
+            found.append(Column(name, unit, level, noise, record.gaps(name), quiet, counted.get(name, "")))
     return tuple(found)
 
 
@@ -116,28 +127,33 @@ def match_names(columns: Sequence[Column], targets: Sequence[Target]) -> dict[st
             found[target.name] = Match(target, by_name[target.name], "the same name")
     taken = {m.column.name for m in found.values()}
     for target in (t for t in targets if t.name not in found):
-        alike = [c for c in columns if c.name not in taken and _bare(c.name) == _bare(target.name)]
+        alike = [c for c in columns if c.name not in taken and _bare(target.name) in (_bare(c.name), _bare(c.stem))]
         others = [t for t in targets if t.name not in found and _bare(t.name) == _bare(target.name)]
         if len(alike) == 1 and len(others) == 1:
             found[target.name] = Match(target, alike[0], "the same name but for case and punctuation")
     return found
 
 
-def matching(columns: Sequence[Column], targets: Sequence[Target]) -> Matching:
-    """Return the columns by signal. The targets' levels are those of the model at the inputs that names map."""
-    named = match_names(columns, targets)
+def matching(
+    columns: Sequence[Column], targets: Sequence[Target], parameters: Mapping[str, Parameter] = FrozenMap()
+) -> Matching:
+    """Return the columns by signal. The targets' levels are those of the model at the inputs that names map.
+
+    parameters: of the model, among which rated bases are.
+    """
+    named = {n: m for n, m in match_names(columns, targets).items() if not is_ambiguous(m)}
     mapped = [_questioned(m) for m in named.values() if usable(m)]
-    proposed = [_with_base(m) for m in named.values() if not usable(m)]
+    proposed = [_with_base(m, parameters) for m in named.values() if not usable(m)]
     taken = {m.column.name for m in named.values()}
     free = [c for c in columns if c.name not in taken]
     pairs = {c.name: [m for t in targets if t.name not in named and (m := _candidate(t, c))] for c in free}
     wanted = [m.target.name for matches in pairs.values() for m in matches]
     for matches in pairs.values():
-        only = len(matches) == 1 and wanted.count(matches[0].target.name) == 1
+        only = len(matches) == 1 and not matches[0].column.counted and wanted.count(matches[0].target.name) == 1
         if only and matches[0].column.unit and matches[0].target.unit and _is_near(matches[0]):
             mapped.append(matches[0])
         else:
-            proposed += sorted(matches, key=_far)[:SHOWN]
+            proposed += [_questioned(m) for m in sorted(matches, key=_far)[:SHOWN]]
     named_columns = {m.column.name for m in (*mapped, *proposed)}
     known = {m.target.name for m in (*mapped, *proposed)}
     return Matching(
@@ -154,6 +170,11 @@ def usable(match: Match) -> bool:
     return converts and not (match.target.kind == "input" and match.column.gaps)
 
 
+def is_ambiguous(match: Match) -> bool:
+    """Return whether a name says nothing: of a column that is counted in one of several ways, in a unit that converts."""
+    return bool(match.column.counted) and match.column.converted(match.target.unit) is not None
+
+
 def _bare(name: str) -> str:
     return re.sub(r"[\W_]+", "", name.casefold())
 
@@ -164,7 +185,7 @@ def _rest(time: Array, values: Array, event: float | None) -> tuple[float | None
     before = before_event(time, values, event)
     if int(before.sum()) < FEWEST_QUIET:
         return (float(values[known][0]) if known.any() else None), 0.0, False
-    return float(values[before].mean()), noise_estimate(time, values, event).std, True
+    return float(values[before].mean()), noise_estimate(time[known], values[known], event).std, True
 
 
 def _candidate(target: Target, column: Column) -> Match | None:
@@ -176,10 +197,10 @@ def _candidate(target: Target, column: Column) -> Match | None:
     reason = f"its unit {column.unit}" if stated else "its level, for no unit is stated"
     if stated and column.unit != target.unit:
         reason += f", converted to {target.unit}"
-    if column.level is not None and target.level is not None:
-        reads = quantity(by[0] * column.level + by[1], target.unit)
-        reason += f"; it reads {reads} {column.place}, the model is at {quantity(target.level, target.unit)}"
+    if column.counted:
+        reason += f"; it is the {column.counted}"
     match = Match(target, column, reason)
+    match = replace(match, reason=f"{reason}{_levels(match)}")
     return match if stated or _is_near(match) else None
 
 
@@ -210,17 +231,38 @@ def _far(match: Match) -> float:
 
 
 def _questioned(match: Match) -> Match:
-    """Return a match of names, with the conversion that its levels suggest where they are far apart."""
+    """Return a match with the conversion that its levels suggest where they are far apart."""
     found = _evidence(match)
     suggested = suggest_conversion([found], match.target.unit) if found is not None and not _is_near(match) else None
     if found is None or suggested is None:
         return match
-    reads = quantity(found.recorded or 0.0, match.target.unit)
-    level = quantity(found.levels[0], match.target.unit)
-    return replace(match, reason=f"{match.reason}; it reads {reads} {match.column.place}, the model is at {level}: {suggested.reason}")
+    return replace(match, reason=f"{match.reason}{_levels(match)}: {suggested.reason}")
 
 
-def _with_base(match: Match) -> Match:
+def _levels(match: Match) -> str:
+    """The levels of column and model, in words; "" where one is not known, or the reason has them."""
+    found = _evidence(match)
+    if found is None or found.recorded is None or "; it reads " in match.reason:
+        return ""
+    unit = match.target.unit
+    return f"; it reads {quantity(found.recorded, unit)} {match.column.place}, the model is at {quantity(found.levels[0], unit)}"
+
+
+def _base_meant(match: Match, parameters: Mapping[str, Parameter]) -> tuple[float, str] | None:
+    """The base in the column's unit that the level tells by one of the model's bases, and how, in words; None where it fits none."""
+    column, target = match.column, match.target
+    for name, p in parameters.items():
+        scale = scale_between(column.unit, p.unit)
+        if scale is None or column.level is None or target.level is None:
+            continue
+        evidence = Evidence(scale * column.level, (target.level,), scale * column.noise)
+        found = suggest_conversion([evidence], target.unit, {name: p})
+        if found is not None and f"of the base {name} =" in found.conversion.name:
+            return float(f"{found.conversion.factor / scale:.6g}"), found.reason
+    return None
+
+
+def _with_base(match: Match, parameters: Mapping[str, Parameter]) -> Match:
     """Return a match of names that cannot be used, with the reason, and the base that its levels suggest."""
     column, target = match.column, match.target
     if column.converted(target.unit) is not None:
@@ -231,4 +273,7 @@ def _with_base(match: Match) -> Match:
         return replace(match, reason=reason)
     base = float(f"{column.level / target.level:.3g}")
     levels = f"{quantity(column.level, column.unit)} {column.place}, {quantity(target.level, target.unit)} in the model"
+    if (meant := _base_meant(match, parameters)) is not None:
+        base, why = meant
+        levels = f"{levels}, {why}"
     return replace(match, reason=f"{reason}: {levels}", base=base)

@@ -23,15 +23,19 @@ POSITIVE = 3.0
 
 POWERS = ("W", "var", "VA")
 ELECTRICAL = ("V", "A", *POWERS)
+COUNTED = (
+    ("sqrt(2)", sqrt(2.0), "peak for rms"), ("1/sqrt(2)", sqrt(0.5), "rms for peak"),
+    ("sqrt(3)", sqrt(3.0), "line to line for phase"), ("1/sqrt(3)", sqrt(1.0 / 3.0), "phase for line to line"),
+    ("sqrt(2/3)", sqrt(2.0 / 3.0), "peak of phase for rms of line to line"),
+    ("sqrt(3/2)", sqrt(1.5), "rms of line to line for peak of phase"),
+)  # fmt: skip
+"""Ratios of two ways to count a voltage or current of three phases."""
 RATIOS: tuple[tuple[tuple[str, ...], str, float, float], ...] = (
     *((("pu",), f"a factor of {n}", a, 0.0) for n, a in (("100", 100.0), ("1/100", 0.01), ("1000", 1e3), ("1/1000", 1e-3))),
     (("pu",), "in degrees", 180.0 / pi, 0.0),
-    (("pu", "V", "A"), "a factor of sqrt(2): peak for rms", sqrt(2.0), 0.0),
-    (("pu", "V", "A"), "a factor of 1/sqrt(2): rms for peak", 1.0 / sqrt(2.0), 0.0),
-    (("pu", "V", "A"), "a factor of sqrt(3): line to line for phase", sqrt(3.0), 0.0),
-    (("pu", "V", "A"), "a factor of 1/sqrt(3): phase for line to line", 1.0 / sqrt(3.0), 0.0),
-    (("pu", "V", "A"), "a factor of sqrt(2/3): peak of phase for rms of line to line", sqrt(2.0 / 3.0), 0.0),
-    (("pu", "V", "A"), "a factor of sqrt(3/2): rms of line to line for peak of phase", sqrt(1.5), 0.0),
+    *((("pu", "V", "A"), f"a factor of {n}: {why}", a, 0.0) for n, a, why in COUNTED),
+    *((("pu",), f"a factor of {k} {n}: {why}, and {with_k}", by * a, 0.0)
+      for n, a, why in COUNTED for k, by, with_k in (("1000", 1e3, "a k too few"), ("1/1000", 1e-3, "a k too many"))),
     (("pu", *POWERS), "a factor of 3/2: power of dq peak values", 1.5, 0.0),
     (("pu", *POWERS), "a factor of 2/3: power of dq peak values", 2.0 / 3.0, 0.0),
     (("pu", *POWERS), "a factor of 3: all phases for one", 3.0, 0.0),
@@ -107,17 +111,21 @@ def _of_bases(unit: str, parameters: Mapping[str, Parameter]) -> Iterator[tuple[
     bases = {n: p for n, p in parameters.items() if p.value > 0.0 and any(conversion(p.unit, b) for b in ELECTRICAL)}
     if not same_unit(unit, "pu"):
         for n, p in bases.items():
-            if (scale := _scale(p.unit, unit)) is not None:
+            if (scale := scale_between(p.unit, unit)) is not None:
                 yield f"per unit of {n} = {p.value:g} {p.unit}", 1.0 / (scale * p.value), 0.0
                 yield f"in per cent of {n} = {p.value:g} {p.unit}", 100.0 / (scale * p.value), 0.0
         return
-    yield from ((f"in {p.unit} of the base {n} = {p.value:g}", p.value, 0.0) for n, p in bases.items())
+    for n, p in bases.items():
+        yield f"in {p.unit} of the base {n} = {p.value:g}", p.value, 0.0
+        if any(conversion(p.unit, counted) for counted in ("V", "A")):
+            for name, factor, why in COUNTED:
+                yield f"in {p.unit} of the base {n} = {p.value:g} by {name}: {why}", factor * p.value, 0.0
     for (a, one), (b, other) in permutations(bases.items(), 2):
-        if (scale := _scale(one.unit, other.unit)) is not None:
+        if (scale := scale_between(one.unit, other.unit)) is not None:
             yield f"per unit of {b} and not of {a}", scale * one.value / other.value, 0.0
 
 
-def _scale(unit: str, wanted: str) -> float | None:
+def scale_between(unit: str, wanted: str) -> float | None:
     """Return the scale from one unit to another, of powers whether W, var or VA: a base in MVA is that of MW too."""
     ends = [next((by[0] for kind in POWERS if (by := conversion(u, kind))), None) for u in (unit, wanted)]
     if ends[0] is not None and ends[1] is not None:

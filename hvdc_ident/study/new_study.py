@@ -6,11 +6,14 @@ import math
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hvdc_ident.data import Experiment, Trajectory, event_time, input_signal, scaled
+import numpy as np
+
+from hvdc_ident.data import Array, Experiment, Trajectory, event_time, input_signal, scaled
+from hvdc_ident.data.three_phase import PHASE_QUANTITIES
 from hvdc_ident.display import Shown
 from hvdc_ident.errors import ComputationError, InputError, located
 from hvdc_ident.files import write_text
@@ -25,13 +28,15 @@ from hvdc_ident.study.column_matching import (
     Matching,
     Target,
     columns_of,
+    is_ambiguous,
     match_names,
     matching,
     targets_of,
     usable,
 )
 from hvdc_ident.study.json_schema import SCHEMA_LINE, write_schemas
-from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
+from hvdc_ident.study.phase_columns import of_use, phases_text, proposed_phases, ways_to_count, without_phases
+from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments, smoothed, with_derived
 from hvdc_ident.text import listed, quantity
 
 MOST_LISTED = 40
@@ -59,7 +64,8 @@ class DyrOfStudy:
 class Mapped:
     """One recording of a new study: its experiment's name, its file, its columns, and what was found in it as `check` finds it.
 
-    levels: why the model's levels are not known; empty where they are. experiment: None where no output is mapped.
+    levels: why the model's levels are not known; empty where they are. experiment: None where no output is mapped. phases: what
+    columns made of three phases are made of.
     """
 
     name: str
@@ -69,6 +75,7 @@ class Mapped:
     levels: str
     experiment: Experiment | None
     noise: Mapping[str, NoiseNote]
+    phases: tuple[schema.PhasesTable, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,6 +98,7 @@ class NewStudy(Shown):
                 "proposed": [{"signal": m.target.name, **_about(m), "base": m.base} for m in r.columns.proposed],
                 "missing": [t.name for t in r.columns.missing],
                 "unused": list(r.columns.unused),
+                "phases": [line.model_dump(exclude_none=True, exclude_defaults=True) for line in r.phases],
                 "event": e.event if e else None,
                 "noise": {o: n.std for o, n in r.noise.items()},
             }
@@ -159,37 +167,48 @@ def new_study(
     return NewStudy(path, plant, mapped, dyr)
 
 
-def matched(record: Trajectory, model: AnyModel) -> tuple[Matching, str]:
+def matched(
+    record: Trajectory, model: AnyModel, phases: Sequence[schema.PhasesTable] = ()
+) -> tuple[Matching, str]:
     """Return the columns of a recording by signal of a model, and why the model's levels are not known ("" where they are).
 
-    Levels are those before the event that inputs of the signals' names show.
+    Levels are those before the event that inputs of the signals' names show. phases: what columns are made of.
     """
-    named = match_names(columns_of(record, None), targets_of(model, {}))
+    ways = ways_to_count(phases)
+    named = match_names(columns_of(record, None, ways), targets_of(model, {}))
     moved = [m for m in named.values() if m.target.kind == "input" and not m.column.gaps]  # in whatever unit
-    event = event_time({m.target.name: input_signal(record.time, _values(record, m)) for m in moved})
-    inputs = [m for m in moved if usable(m)]
-    levels, why = _levels(model, {m.target.name: float(_values(record, m)[0]) for m in inputs})
-    return matching(columns_of(record, event), targets_of(model, levels)), why
+    signals = {m.column.name: input_signal(*_values(record, m)) for m in moved}
+    event = event_time(signals, smoothed(phases))
+    inputs = [m for m in moved if usable(m) and not is_ambiguous(m)]
+    levels, why = _levels(model, {m.target.name: float(_values(record, m)[1][0]) for m in inputs})
+    return matching(columns_of(record, event, ways), targets_of(model, levels), model.parameters), why
 
 
 def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
-    found, why = matched(read_waveforms(file), model)
+    record = read_waveforms(file)
+    phases = proposed_phases(record)
+    made = with_derived(phases, (), record, name)
+    found, why = matched(without_phases(made, phases), model, phases)
+    phases = of_use(phases, [m.column.name for m in (*found.mapped, *found.proposed)])
+    found = replace(found, unused=tuple(c for c in found.unused if c in record))
     data = _relative(file, folder)
     by_kind = {
         kind: {m.target.name: m.column.name for m in found.mapped if m.target.kind == kind}
         for kind in ("input", "output")
     }
     if not by_kind["output"]:
-        return Mapped(name, file, data, found, why, None, {})
-    table = schema.ExperimentTable(name=name, data=file.name, inputs=by_kind["input"], outputs=by_kind["output"])
+        return Mapped(name, file, data, found, why, None, {}, phases)
+    inputs, outputs = by_kind["input"], by_kind["output"]
+    table = schema.ExperimentTable(name=name, data=file.name, inputs=inputs, outputs=outputs, phases=list(phases))
     (experiment,), notes = read_experiments([table], model, Recordings(file.parent), str(file))
-    return Mapped(name, file, data, found, why, experiment, notes[name])
+    return Mapped(name, file, data, found, why, experiment, notes[name], phases)
 
 
-def _values(record: Trajectory, match: Match) -> Any:
-    """The values of a column in the signal's unit."""
+def _values(record: Trajectory, match: Match) -> tuple[Array, Array]:
+    """The instants of a column in s, and its values in the signal's unit."""
     scale, offset = match.column.converted(match.target.unit) or (1.0, 0.0)
-    return scaled(record[match.column.name], scale) + offset
+    rows = np.isfinite(record[match.column.name])
+    return record.time[rows], scaled(record[match.column.name][rows], scale) + offset
 
 
 def _levels(model: AnyModel, inputs: Mapping[str, float]) -> tuple[dict[str, float], str]:
@@ -250,6 +269,9 @@ def _open_lines(r: Mapped) -> Iterator[str]:
     """Lines on the columns and signals that are not mapped."""
     if r.levels:
         yield r.levels
+    for line in r.phases:
+        made = ", ".join(f"{name} ({PHASE_QUANTITIES[of]})" for name, of in line.gives.items())
+        yield f"of the phases {', '.join((*line.voltage, *(line.current or ())))} at {line.frequency:g} Hz are made: {made}"
     open_ = _by_column(r.columns.proposed)
     for name, matches in list(open_.items())[:COLUMNS_SHOWN]:
         may_be = "; ".join(f"{m.target.kind} {m.target.name} ({m.reason}{_base_words(m)})" for m in matches)
@@ -350,6 +372,10 @@ def _experiment_text(r: Mapped, played: bool) -> Iterator[str]:
     trim = _trim(r)
     if trim:
         yield f"{mark}trim = {{{', '.join(f'{level} = {toml_string(o)}' for level, o in trim.items())}}}   # the level before the event"
+    if r.phases:
+        made = any(m.column.name in line.gives for m in r.columns.mapped for line in r.phases)
+        lines = ", ".join(map(phases_text, r.phases))
+        yield f"{mark if made else '# '}phases = [{lines}]   # the columns that they give, as if recorded"
     bases: list[Match] = []
     for kind in ("input", "output"):
         mapped = [m for m in r.columns.mapped if m.target.kind == kind]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.data import (
     FEWEST_QUIET,
@@ -45,6 +46,8 @@ from hvdc_ident.study import schema
 from hvdc_ident.toml_tables import check_names
 
 TIME_SHIFT = "time-shift"
+SETTLED = 3.0
+"""Time constants after which a low pass has forgotten 95 %."""
 
 
 @dataclass(frozen=True)
@@ -126,12 +129,13 @@ def read_experiments(
 
 
 def with_noise(
-    experiment: Experiment, stated: Mapping[str, float] | None = None
+    experiment: Experiment, stated: Mapping[str, float] | None = None, means: Mapping[str, float] = FrozenMap()
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     """Return the experiment with its event and the noise of its outputs where they are not stated, and their sources.
 
     stated: standard deviations by output, 0 allowed; left out, the experiment's. The noise is estimated before the event,
-    and where there is none the fit's residual tells.
+    and where there is none the fit's residual tells. means: by output the length in s of a mean that smoothed it, whose rows tell
+    of noise only where they are so far apart.
     """
     e = experiment
     stated = e.noise if stated is None else stated
@@ -141,8 +145,11 @@ def with_noise(
     table = e.measured
     notes, dof, told_by = {}, {}, {}
     for o in e.outputs:
-        told = o not in stated and int(before_event(e.time, table[o], event).sum()) >= FEWEST_QUIET
-        found = noise_estimate(e.time, table[o], event) if told else NoiseEstimate()
+        recorded = np.flatnonzero(np.isfinite(table[o]))
+        rows = recorded[_apart(e.time[recorded], means.get(o, 0.0))]
+        time, values = e.time[rows], table[o][rows]
+        told = o not in stated and int(before_event(time, values, event).sum()) >= FEWEST_QUIET
+        found = noise_estimate(time, values, event) if told else NoiseEstimate()
         notes[o] = _noise(stated.get(o), found, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
         if notes[o].source == "estimated":
             dof[o], told_by[o] = max(1.0, found.freedom), found.source
@@ -150,6 +157,14 @@ def with_noise(
     profile = {o: v for o, v in e.noise_profile.items() if o in noise}
     known = {"noise_dof": e.noise_dof | dof, "noise_from": e.noise_from | told_by}
     return e.with_(event=event, noise=noise, **known, noise_profile=profile), FrozenMap(notes)
+
+
+def _apart(time: Array, length: float) -> NDArray[np.intp]:
+    """The rows that are so far apart, in s, the first so far from the start; all of them for 0."""
+    if not length:
+        return np.arange(time.size)
+    ends = np.arange(time[0] + length, time[-1], length)
+    return np.unique(np.searchsorted(time, ends))
 
 
 def _check_names(table: schema.ExperimentTable, model: AnyModel, place: str) -> None:
@@ -199,12 +214,16 @@ def _experiment(
     table: schema.ExperimentTable, model: AnyModel, data: Trajectory, place: str
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     columns = dict(_channels(table))
-    data = with_derived(table, data, place)
+    data = with_derived(table.phases, table.phasors, data, place)
+    data = _within_inputs(data, [columns[s] for s in (*table.inputs, *table.drive)], place)
     time = _time(table, data, place)
     mappings = {s: _mapping(table, model, s, c, data, place) for s, c in columns.items()}
     mapped = {s: scaled(data[c], mappings[s][0]) for s, c in columns.items()}
     mapped |= {s: mapped[s] + offset for s, (_, offset) in mappings.items() if offset != 0.0}
-    inputs = {s: _input(table, s, columns[s], time, mapped[s], place) for s in (*table.inputs, *table.drive)}
+    inputs = {}
+    for s in (*table.inputs, *table.drive):
+        rows = data.own_rows(columns[s])
+        inputs[s] = _input(table, s, columns[s], time[rows], mapped[s][rows], place)
     outputs = tuple(table.outputs)
     if empty := [o for o in outputs if np.isnan(mapped[o]).all()]:
         raise StudyError(
@@ -219,12 +238,15 @@ def _experiment(
     }
     stated = {o: n for o, n in table.noise.items() if isinstance(n, float | int)}
     stated |= {o: float(np.sqrt(np.nanmean(d**2))) for o, d in deviations.items()}
+    lengths = smoothed(table.phases, table.phasors)
+    means = {s: lengths[c] for s, c in columns.items() if c in lengths}
     units = tuple(model.outputs[o].unit for o in outputs)
     converted = tuple(_conversion_words(table, model, s, c, data, mappings[s]) for s, c in columns.items())
     origin = replace(
         data.origin,
         time_unit=_time_unit(table, data.origin),
         converted=(*data.origin.converted, *(line for line in converted if line)),
+        records=tuple(tuple(s for s, c in columns.items() if c in record) for record in data.origin.records),
     )
     measured = Trajectory(time, np.column_stack([mapped[o] for o in outputs]), outputs, units, origin)
     instrument = {o: line.model_dump(by_alias=True, exclude_none=True) for o, line in table.instrument.items()}
@@ -236,15 +258,34 @@ def _experiment(
         measured=measured,
         # 1 where nothing is recorded, which nobody looks at
         noise_profile={o: np.where(np.isnan(d), 1.0, d / stated[o]) for o, d in deviations.items()},
-        event=_event(table, time, place),
+        event=_event(table, time, inputs, means, place),
         window=_window(table, time, place),
         role=table.role,
         drive=tuple(table.drive),
         instrument=instrument,
         nuisance=tuple(dict.fromkeys(table.nuisance)),
     )
-    experiment, notes = with_noise(experiment, stated)
+    experiment, notes = with_noise(experiment, stated, means)
     return (_trimmed(experiment, table, mapped) if table.trim else experiment), notes
+
+
+def _within_inputs(data: Trajectory, columns: Sequence[str], place: str) -> Trajectory:
+    """The rows within the records of all inputs, where those have several rates: outside, an input is not known."""
+    if not data.origin.records or not columns:
+        return data
+    spans = [data.time[data.own_rows(column)][[0, -1]] for column in columns]
+    low, high = max(span[0] for span in spans), min(span[1] for span in spans)
+    inside = (data.time >= low) & (data.time <= high)
+    if int(inside.sum()) < 2:
+        raise StudyError(
+            "the records of the inputs share no time",
+            where=place,
+            expected="records that overlap",
+            got=", ".join(f"{c} {a:g} to {b:g} s" for c, (a, b) in zip(columns, spans, strict=True)),
+            hint="take inputs of one record",
+        )
+    dropped = data.origin.dropped + int(np.count_nonzero(~inside))
+    return replace(data.rows(inside), origin=replace(data.origin, dropped=dropped))
 
 
 def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapping[str, Array]) -> Experiment:
@@ -255,7 +296,8 @@ def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapp
     levels = {n: level_before(experiment.time, v, experiment.event) for n, v in mapped.items()}
     inputs = {n: i.begun_at(levels[n]) for n, i in experiment.inputs.items()}
     values = {n: levels[o] for n, o in table.trim.items()}
-    noise = {n: input_noise(experiment.time, mapped[n], experiment.event) for n in inputs}
+    known = {n: np.isfinite(mapped[n]) for n in inputs}
+    noise = {n: input_noise(experiment.time[k], mapped[n][k], experiment.event) for n, k in known.items()}
     return experiment.with_(
         inputs=inputs,
         values=experiment.values | values,
@@ -387,7 +429,10 @@ def _time_unit(table: schema.ExperimentTable, origin: Origin) -> str:
     return line.unit or (f"{line.scale:g} s" if line.scale is not None else "")
 
 
-def _event(table: schema.ExperimentTable, time: Array, place: str) -> float | None:
+def _event(
+    table: schema.ExperimentTable, time: Array, inputs: Mapping[str, InputSignal], means: Mapping[str, float], place: str
+) -> float | None:
+    """The event as stated, or of inputs that are made of phases or phasors; None where the inputs themselves show it."""
     if table.event is not None and not time[0] <= table.event <= time[-1]:
         raise StudyError(
             "the event lies outside the record",
@@ -395,7 +440,24 @@ def _event(table: schema.ExperimentTable, time: Array, place: str) -> float | No
             expected=f"{time[0]:g} to {time[-1]:g} s",
             got=f"{table.event:g} s",
         )
-    return table.event
+    return table.event if table.event is not None or not means.keys() & inputs.keys() else event_time(inputs, means)
+
+
+def smoothed(phases: Sequence[schema.PhasesTable], phasors: Sequence[schema.PhasorsTable] = ()) -> dict[str, float]:
+    """Return by column that is made of phases or phasors the time in s within which its noise is the same: of one that is not filtered
+    a cycle, within which it ripples."""
+    lengths: dict[str, float] = {}
+    for line in phases:
+        kept = {"mean": _window_of(line), "lowpass": SETTLED * _window_of(line), "none": 1.0 / line.frequency}
+        lengths |= dict.fromkeys(line.gives, kept[line.filter])
+    for phasor in phasors:
+        lengths |= {name: phasor.window for name, quantity in phasor.gives.items() if quantity == "f"}
+    return {name: length for name, length in lengths.items() if length > 0.0}
+
+
+def _window_of(line: schema.PhasesTable) -> float:
+    """The length of the filter in s: one cycle where it is not stated."""
+    return line.window if line.window is not None else 1.0 / line.frequency
 
 
 def _window(table: schema.ExperimentTable, time: Array, place: str) -> tuple[float, float] | None:
@@ -463,20 +525,21 @@ def raw_columns(table: schema.ExperimentTable, columns: Sequence[str]) -> list[s
     return list(dict.fromkeys([*(c for c in columns if c not in made), *phases, *phasors, *map(str, references)]))
 
 
-def with_derived(table: schema.ExperimentTable, data: Trajectory, place: str) -> Trajectory:
-    """The recording with the columns its phases and phasors give; the same object where none are asked for."""
+def with_derived(
+    phases: Sequence[schema.PhasesTable], phasors: Sequence[schema.PhasorsTable], data: Trajectory, place: str
+) -> Trajectory:
+    """The recording with the columns that phases and phasors give; the same object where none are asked for."""
     found = data
-    for number, line in enumerate(table.phases, 1):
-        found = _added(found, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"))
-    for number, phasors in enumerate(table.phasors, 1):
-        made = _of_phasors(phasors, data, f"{place}.phasors, line {number}")
-        found = _added(found, phasors.gives, made)
+    for number, line in enumerate(phases, 1):
+        found = _added(found, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"), line.voltage[0])
+    for number, phasor in enumerate(phasors, 1):
+        found = _added(found, phasor.gives, _of_phasors(phasor, data, f"{place}.phasors, line {number}"), phasor.voltage.magnitude[0])
     return found
 
 
-def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajectory:
-    _check_new(line.gives, data, where)
-    window = line.window if line.window is not None else 1.0 / line.frequency  # one cycle
+def _of_phases(line: schema.PhasesTable, whole: Trajectory, where: str) -> Trajectory:
+    _check_new(line.gives, whole, where)
+    data = whole.rows(whole.own_rows(line.voltage[0]))
     with located(where):
         return phase_quantities(
             data,
@@ -484,12 +547,13 @@ def _of_phases(line: schema.PhasesTable, data: Trajectory, where: str) -> Trajec
             line.current,
             list(line.gives.values()),
             frequency=line.frequency,
-            smoothing=PhaseFilter(line.filter, window),
+            smoothing=PhaseFilter(line.filter, _window_of(line)),
         )
 
 
-def _of_phasors(line: schema.PhasorsTable, data: Trajectory, where: str) -> Trajectory:
-    _check_new(line.gives, data, where)
+def _of_phasors(line: schema.PhasorsTable, whole: Trajectory, where: str) -> Trajectory:
+    _check_new(line.gives, whole, where)
+    data = whole.rows(whole.own_rows(line.voltage.magnitude[0]))
     how = PhasorSettings(line.frequency, line.window, line.magnitudes or "", line.reference or "")
     current = _columns(line.current) if line.current is not None else None
     with located(where):
@@ -513,11 +577,15 @@ def _check_new(gives: Mapping[str, str], data: Trajectory, where: str) -> None:
         raise StudyError(f"a column '{taken[0]}' is already there", where=where, expected="a new name in gives")
 
 
-def _added(found: Trajectory, gives: Mapping[str, str], made: Trajectory) -> Trajectory:
+def _added(found: Trajectory, gives: Mapping[str, str], made: Trajectory, of: str) -> Trajectory:
+    """The recording with columns made of the one called `of`, at the rows of its record."""
+    values = np.full((len(found), len(gives)), np.nan)
+    values[found.own_rows(of)] = made.values
+    records = tuple((*r, *gives) if of in r else r for r in found.origin.records)
     return Trajectory(
         found.time,
-        np.column_stack([found.values, made.values]),
+        np.column_stack([found.values, values]),
         (*found.names, *gives),
         (*found.units, *made.units),
-        replace(found.origin, converted=(*found.origin.converted, *made.origin.converted)),
+        replace(found.origin, converted=(*found.origin.converted, *made.origin.converted), records=records),
     )

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import list_signals, read_waveforms
+from hvdc_ident.formats import formats, list_signals, read_waveforms
 from hvdc_ident.study import Summary, load_study
 
 DATES = "07/11/2024,06:30:00.250000\n07/11/2024,06:30:00.300000\n"
@@ -80,6 +80,24 @@ def test_binary_stamps_that_begin_again_at_the_end_of_their_four_bytes(tmp_path:
     data = binary([t % 2**32 for t in stamps])
     found = read_waveforms(put(tmp_path, header("1\n1000,8", kind="BINARY"), data))
     assert us(found.time) == [t - stamps[0] for t in stamps]
+
+
+def test_stamps_that_begin_again_at_the_end_of_two_bytes(tmp_path: Path) -> None:
+    stamps = after([1000 * k for k in range(200)], 150, 4000)
+    found = read_waveforms(put(tmp_path, header("1\n1000,200"), rows([t % 2**16 for t in stamps])))
+    assert us(found.time) == stamps
+    (note,) = found.origin.notes
+    assert "a pause" in note and "0.005 s after 0.149 s" in note
+
+
+def test_one_file_whose_marks_of_sections_have_no_colon(tmp_path: Path) -> None:
+    formats()["comtrade"].sample(tmp_path / "r.cff")
+    whole = read_waveforms(tmp_path / "r.cff")
+    text = (tmp_path / "r.cff").read_text("ascii")
+    for standard, other in (("--- file type: CFG", "--- file type  CFG"), ("--- file type: DAT", "-- file type  DAT")):
+        text = text.replace(standard, other)
+    (tmp_path / "r.cff").write_text(text)
+    np.testing.assert_array_equal(read_waveforms(tmp_path / "r.cff").values, whole.values)
 
 
 def test_a_step_between_two_rates_is_the_one_that_the_stamps_tell(tmp_path: Path) -> None:

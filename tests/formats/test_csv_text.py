@@ -15,6 +15,7 @@ from hvdc_ident import formats as catalogue
 from hvdc_ident.data import Trajectory, trajectory
 from hvdc_ident.errors import UnknownNameError, WaveformError
 from hvdc_ident.formats import convert, csv_text, list_signals, read_waveforms, write_csv
+from hvdc_ident.formats._clock import Clock
 
 DIALECTS = {
     "comma": "time,a,b\n0,1.5,-2\n0.5,1e-3,+4\n",
@@ -48,7 +49,7 @@ def test_dialects(tmp_path: Path, text: str) -> None:
     assert found.values.tolist() == [[1.5, -2.0], [1e-3, 4.0]]
     layout = csv_text._layout(path)
     assert csv_text._fast(layout, [0, 1, 2]) is not None
-    assert np.array_equal(csv_text._careful(layout, [0, 1, 2]), np.column_stack([found.time, found.values]))
+    assert np.array_equal(csv_text._careful(layout, [0, 1, 2], Clock()), np.column_stack([found.time, found.values]))
 
 
 def test_names_and_units(tmp_path: Path) -> None:
@@ -71,6 +72,19 @@ def test_units_that_tell_columns_apart_stay_in_the_name(tmp_path: Path) -> None:
         ("I [pu]", "pu"),
         ("U", "V"),
     ]
+
+
+def test_units_behind_an_underscore(tmp_path: Path) -> None:
+    """Only of what the name begins with, for seconds and hours are seldom meant by V_s and I_h; I_A, I_B, I_C are phases."""
+    units = {
+        "P_W": "W", "f_Hz": "Hz", "Q_Mvar": "Mvar", "Vdc_kV": "kV", "id_A": "A", "n_rpm": "rpm", "theta_deg": "deg", "y_pu": "pu",
+        "I_A": "", "I_B": "", "I_C": "", "V_s": "", "I_h": "", "P_m": "", "P_g": "", "T_m": "", "U_U": "", "U_V": "", "U_W": "", "P_N": "",
+    }  # fmt: skip
+    path = write(tmp_path, ",".join(["time_ms", *units]) + "\n" + "\n".join(["0" + ",1" * len(units), "5" + ",1" * len(units)]))
+    assert dict(list_signals(path)) == units
+    found = read_waveforms(path)
+    assert dict(zip(found.names, found.units, strict=True)) == units
+    assert found.time.tolist() == [0.0, 0.005] and found.origin.time_unit == "ms"
 
 
 def test_units_between_blanks(tmp_path: Path) -> None:
@@ -234,7 +248,7 @@ def test_both_readers_agree_on_many_rows(tmp_path: Path) -> None:
     layout = csv_text._layout(tmp_path / "x.csv")
     fast = csv_text._fast(layout, [0, 2])
     assert fast is not None
-    assert np.array_equal(fast, csv_text._careful(layout, [0, 2]))
+    assert np.array_equal(fast, csv_text._careful(layout, [0, 2], Clock()))
 
 
 def write(folder: Path, text: str) -> Path:

@@ -40,18 +40,55 @@ def test_a_matrix_with_time_first_either_way_round(tmp_path: Path, rows: str) ->
     np.testing.assert_array_equal(found.values[:, 1], 2 * Y)
 
 
-def test_structures_of_two_rates_are_joined_over_the_finer(tmp_path: Path) -> None:
+FAST = np.array([0.0, 0.05, 0.1, 0.15000000000000002, 0.2, 0.2, 0.25, 0.30000000000000004])
+"""Two rows at 0.2 s, and instants that differ from those of TIME by their rounding."""
+
+
+def test_structures_of_two_rates_stand_at_their_own_rows(tmp_path: Path) -> None:
     from scipy.io import savemat
 
-    fast = np.linspace(0.0, 0.3, 31)
-    savemat(
-        tmp_path / "s.mat",
-        {"a": {"time": fast, "x": fast**2}, "b": {"time": TIME, "y": Y}},
-    )
+    savemat(tmp_path / "s.mat", {"a": {"time": FAST, "x": np.arange(8.0)}, "b": {"time": TIME, "y": Y, "z": -Y}})
     found = read_waveforms(tmp_path / "s.mat")
-    assert found.names == ("a.x", "b.y")
-    np.testing.assert_array_equal(found.time, fast)
-    np.testing.assert_allclose(found["b.y"], np.interp(fast, TIME, Y))
+    assert found.names == ("a.x", "b.y", "b.z") and found.origin.records == (("a.x",), ("b.y", "b.z"))
+    np.testing.assert_allclose(found.time, FAST, rtol=1e-15)
+    np.testing.assert_array_equal(found["a.x"], np.arange(8.0))
+    nan = np.nan
+    np.testing.assert_array_equal(found["b.y"], [Y[0], nan, Y[1], nan, nan, Y[2], nan, Y[3]])  # after the jump at 0.2 s
+    assert found.gaps("b.y") == 0 and found.own_rows("b.z").sum() == 4
+    assert "each at its own instants: 8 rows of a.x, 4 rows of b.y" in found.origin.notes[0]
+
+
+def test_the_signals_of_one_record_alone_have_its_rows(tmp_path: Path) -> None:
+    from scipy.io import savemat
+
+    savemat(tmp_path / "s.mat", {"a": {"time": FAST, "x": np.arange(8.0)}, "b": {"time": TIME, "y": Y, "z": -Y}})
+    found = read_waveforms(tmp_path / "s.mat", ["b.z"])
+    np.testing.assert_array_equal(found.time, TIME)
+    np.testing.assert_array_equal(found["b.z"], -Y)
+    assert found.origin.records == () and found.origin.notes == ()
+    convert(tmp_path / "s.mat", tmp_path / "s.csv")
+    assert (tmp_path / "s.csv").read_text().splitlines()[2] == "0.05,1.0,,"
+
+
+def test_records_that_share_no_time_and_gaps_of_their_own(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["one/time"], file["one/P"], file["one/Q"] = [0.0, 1.0], [1.0, np.nan], [2.0, 2.5]
+        file["two/time"], file["two/P"] = [5.0, 6.0], [3.0, 4.0]
+    found = read_waveforms(tmp_path / "a.h5")
+    assert found.time.tolist() == [0.0, 1.0, 5.0, 6.0]
+    assert {name: found.gaps(name) for name in found.names} == {"one/P": 1, "one/Q": 0, "two/P": 0}
+
+
+def test_records_since_1970_keep_the_time_between_their_starts(tmp_path: Path) -> None:
+    start = 1_732_440_000_123_456_789
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, first, step in (("fast", start + 2_000, 1_000), ("slow", start, 3_000)):
+            file[f"{name}/time"] = first + step * np.arange(3)
+            file[f"{name}/time"].attrs["units"] = "ns"
+            file[f"{name}/u"] = np.arange(3.0)
+    found = read_waveforms(tmp_path / "a.h5")
+    np.testing.assert_allclose(found.time, [0.0, 2e-6, 3e-6, 4e-6, 6e-6], rtol=1e-9)
+    assert found["fast/u"][1:4].tolist() == [0.0, 1.0, 2.0]
 
 
 def test_version_7_3(tmp_path: Path) -> None:
@@ -134,8 +171,8 @@ def test_hdf5_groups_without_a_time_use_the_one_above(tmp_path: Path) -> None:
         file["away"] = h5py.ExternalLink("/etc/passwd", "/")
     found = read_waveforms(tmp_path / "a.h5")
     assert set(found.names) == {"left/P", "right/Q"}
-    np.testing.assert_allclose(found["right/Q"], [1.0, 1.25, 1.5])
-    assert found.time[-1] == pytest.approx(0.2)  # what both cover
+    np.testing.assert_array_equal(found["right/Q"], [Y[0], np.nan, Y[2], np.nan])
+    np.testing.assert_array_equal(found.time, TIME)
 
 
 def test_parquet_written_by_another_package_with_time_stamps(tmp_path: Path) -> None:
@@ -181,14 +218,53 @@ def test_a_broken_date_is_named_with_its_line(tmp_path: Path) -> None:
         read_waveforms(tmp_path / "pmu.csv")
 
 
+def element(kind: int, content: bytes) -> bytes:
+    """An element of a MATLAB 5 file: its kind, its length, and its bytes up to a multiple of 8."""
+    return struct.pack("<II", kind, len(content)) + content.ljust(-(-len(content) // 8) * 8, b"\0")
+
+
 def test_matlab_objects_are_refused_with_the_way_out(tmp_path: Path) -> None:
     """A file of one variable of class 17, as a timeseries is saved, laid out by hand."""
-    flags = struct.pack("<IIII", 6, 8, 17, 0)
-    body = flags + struct.pack("<II", 1, 2) + b"ts".ljust(8, b"\0")
-    content = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + struct.pack("<II", 14, len(body)) + body
-    (tmp_path / "s.mat").write_bytes(content)
-    with pytest.raises(WaveformError, match="Structure with time"):
+    inner = element(6, struct.pack("<II", 13, 0)) + element(5, struct.pack("<ii", 1, 2)) + element(1, b"")
+    inner += element(6, struct.pack("<II", 1, 2))
+    names = b"".join(element(1, name) for name in (b"ts", b"MCOS", b"timeseries"))
+    body = element(6, struct.pack("<II", 17, 0)) + names + element(14, inner)
+    (tmp_path / "s.mat").write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + element(14, body))
+    with pytest.raises(WaveformError, match=r"'ts' is a MATLAB object.*Structure with time"):
         read_waveforms(tmp_path / "s.mat")
+
+
+@pytest.mark.parametrize("version", ["4", "5"])
+def test_complex_numbers_are_two_signals(tmp_path: Path, version: str) -> None:
+    from scipy.io import savemat
+
+    savemat(tmp_path / "s.mat", {"t": TIME, "v": Y + 2j * TIME}, format=version)
+    found = read_waveforms(tmp_path / "s.mat")
+    np.testing.assert_array_equal(found["v.real"], Y)
+    np.testing.assert_array_equal(found["v.imag"], 2 * TIME)
+
+
+def test_a_file_that_unpacks_to_more_than_memory_may_take_is_refused(tmp_path: Path) -> None:
+    with h5py.File(tmp_path / "s.mat", "w", userblock_size=512) as file:
+        file.create_dataset("t", (10**10,), "f8", chunks=(10**6,), fillvalue=0.0)
+    with open(tmp_path / "s.mat", "r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(512))
+    with pytest.raises(WaveformError, match="too much memory"):
+        read_waveforms(tmp_path / "s.mat")
+
+
+@pytest.mark.parametrize("name", ["parabola", "some_functions"])
+def test_matlab_functions_beside_waveforms_do_not_refuse_a_file(tmp_path: Path, name: str) -> None:
+    """Files of MATLAB's own that scipy is tested with; here a time and a signal stand before what they hold."""
+    import scipy
+    from scipy.io import savemat
+
+    path = Path(scipy.__file__).parent / "io/matlab/tests/data" / f"{name}.mat"
+    if not path.is_file():
+        pytest.skip("scipy is installed without its tests")
+    savemat(tmp_path / "s.mat", {"t": TIME, "y": Y})
+    (tmp_path / "s.mat").write_bytes((tmp_path / "s.mat").read_bytes() + path.read_bytes()[128:])
+    np.testing.assert_array_equal(read_waveforms(tmp_path / "s.mat", ["y"])["y"], Y)
 
 
 @pytest.mark.parametrize("compressed", [False, True])

@@ -12,6 +12,7 @@ import scipy.io
 from hvdc_ident.data import trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import convert, csv_text, files_of, formats, list_signals, read_waveforms, write_csv
+from hvdc_ident.formats._clock import Clock
 
 ROWS = ((0.0, 1.5, -2.0), (0.5, 1e-3, 4.0))
 """What every file of STYLES holds: time in s, U in kV, P in MW."""
@@ -90,7 +91,7 @@ def test_both_readers_see_the_same_gaps(tmp_path: Path) -> None:
     assert quick is not None
     np.testing.assert_array_equal(quick, [[0, 1, np.nan], [1, np.nan, np.nan], [2, np.nan, 2]])
     np.testing.assert_array_equal(
-        csv_text._careful(layout, [0, 2, 3]), [[0, np.nan, np.nan], [1, np.nan, 3], [2, 2, 4]]
+        csv_text._careful(layout, [0, 2, 3], Clock()), [[0, np.nan, np.nan], [1, np.nan, 3], [2, 2, 4]]
     )
 
 

@@ -245,7 +245,7 @@ KINDS: dict[str, Kind] = {
     "comtrade-header": _file_of("comtrade", ".cfg"),
     "comtrade-data": _companion("comtrade", ".cfg", "sample.dat"),
     "comtrade-one-file": _file_of("comtrade", ".cff"),
-    "matlab": _file_of("matlab", ".mat"),
+    "matlab": replace(_file_of("matlab", ".mat"), slow=True),
     "dymola": _file_of("dymola-mat", ".mat"),
     "pscad-header": _file_of("pscad", ".inf"),
     "pscad-data": _companion("pscad", ".inf", "sample_01.out"),

@@ -49,6 +49,12 @@ def test_one_that_ends_its_process_says_how(function: object, arguments: tuple[i
         call(function, *arguments, seconds=60.0)  # type: ignore[arg-type]
 
 
+def test_one_that_takes_more_memory_than_it_may_raises() -> None:
+    assert len(call(bytes, 1000, seconds=60.0, memory=10**8)) == 1000
+    with pytest.raises(MemoryError):
+        call(bytes, 10**9, seconds=60.0, memory=10**8)
+
+
 def test_what_it_printed_last_is_told() -> None:
     with pytest.raises(ChildEndedError) as ended:
         call(exec, "import os; print('bad superblock', flush=True); os._exit(3)", seconds=60.0)

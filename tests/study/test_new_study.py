@@ -245,3 +245,79 @@ def test_hostile_names_stay_text(tmp_path: Path) -> None:
         m.column.name for m in found.recordings[0].columns.proposed
     } == set(evil)
     hi.load_study(found.path)
+
+
+THREE = """schema = 1
+name = "converter"
+[parameters]
+T = {value = 0.05, unit = "s"}
+Vb = {value = 400.0, unit = "kV"}
+Sb = {value = 200.0, unit = "MVA"}
+[inputs]
+V = {value = 1.0, unit = "UNIT"}
+[states]
+x = {derivative = "(V/SIZE - x)/T", unit = "pu"}
+[outputs]
+P = {value = "100e6*x", unit = "W"}
+"""
+
+
+def three_phases(path: Path, unit: str = "kV") -> Path:
+    """400 kV that fall to 80 % at 0.3 s, and the currents of 100 MW that follow with 50 ms; the raw phases alone."""
+    time = np.arange(0.0, 1.0, 1e-4)
+    voltage = np.where(time >= 0.3, 0.8, 1.0) * 400.0 * np.sqrt(2.0 / 3.0)
+    power = np.where(time >= 0.3, 0.8 + 0.2 * np.exp(-(time - 0.3) / 0.05), 1.0) * 1e5
+    random = np.random.default_rng(5)
+    columns = {"time [s]": time}
+    for name, size, of in (("U", voltage, unit), ("I", power / (1.5 * voltage), "A")):
+        for k, phase in enumerate("ABC"):
+            wave = np.cos(2 * np.pi * 50 * time - 2 * np.pi * k / 3) + 1e-3 * random.standard_normal(time.size)
+            columns[f"{name}{phase} [{of}]"] = size * wave * (1e3 if of == "V" else 1.0)
+    return write_csv(path, columns)
+
+
+def test_phases_are_proposed_and_what_they_give_is_mapped(tmp_path: Path) -> None:
+    """A model in V, line to line rms: the two magnitudes of the phases are told apart by their levels."""
+    (tmp_path / "c.toml").write_text(THREE.replace("UNIT", "kV").replace("SIZE", "400").replace("1.0, unit", "400, unit"))
+    shown = call("new", tmp_path / "st", "--from", three_phases(tmp_path / "r.csv"), "--model", tmp_path / "c.toml", "--json")
+    assert shown.exit_code == 0, shown.output
+    told = json.loads(shown.stdout)["experiments"]["r"]
+    assert told["mapped"]["P"]["column"] == "p" and "V" not in told["mapped"] and told["unused"] == []
+    candidates = {p["column"]: p["reason"] for p in told["proposed"] if p["signal"] == "V"}
+    assert "phase to ground, peak; it reads 326.6 kV" in candidates["v"] and "the model is at 400 kV" in candidates["v"]
+    assert "it reads 400 kV" in candidates["v-rms"]
+    (line,) = told["phases"]
+    assert (line["voltage"], line["current"]) == (["UA", "UB", "UC"], ["IA", "IB", "IC"]) and line["frequency"] == 50.0
+    assert line["gives"]["p"] == "p"
+    path = tmp_path / "st" / "study.toml"
+    (experiment,) = tomllib.loads(path.read_text())["experiment"]
+    assert experiment["phases"] == told["phases"] and experiment["outputs"] == {"P": "p"}
+    (read,) = hi.load_study(path).experiments
+    assert read.measured is not None and read.measured["P"][0] == pytest.approx(1e8, rel=1e-2)
+    text = path.read_text().replace("# [experiment.inputs]", "[experiment.inputs]")
+    path.write_text(text.replace('# V = "v-rms"', 'V = "v-rms"'))
+    (read,) = hi.load_study(path).experiments
+    assert read.event == pytest.approx(0.3, abs=1e-3) and 0.0 < read.noise["P"] < 1e-3 * 1e8
+
+
+@pytest.mark.parametrize("unit", ["kV", "V"])
+def test_the_base_of_a_peak_is_told_from_the_rated_voltage(tmp_path: Path, unit: str) -> None:
+    (tmp_path / "c.toml").write_text(THREE.replace("UNIT", "pu").replace("SIZE", "1"))
+    shown = call("new", tmp_path / "st", "--from", three_phases(tmp_path / "r.csv", unit), "--model", tmp_path / "c.toml", "--json")
+    told = json.loads(shown.stdout)["experiments"]["r"]["proposed"]
+    (voltage,) = (p for p in told if p["signal"] == "V" and p["column"] == "v")
+    base = 400.0 * np.sqrt(2.0 / 3.0) * (1e3 if unit == "V" else 1.0)
+    assert voltage["base"] == pytest.approx(base, rel=1e-5)
+    assert "of the base Vb = 400 by sqrt(2/3): peak of phase for rms of line to line?" in voltage["reason"]
+
+
+def test_units_in_names_count_as_those_in_headers(motor: Path, tmp_path: Path) -> None:
+    r = recorded()
+    data = write_csv(tmp_path / "a.csv", {"time_ms": 1e3 * r["time"], "v_kV": 1e-3 * r["v"], "w_rpm": r["w"] * 30 / np.pi, "i_a": r["i"]})
+    found = hi.new_study(tmp_path / "st", data, motor)
+    assert {m.target.name: (m.column.name, m.column.unit) for m in found.recordings[0].columns.mapped} == {
+        "v": ("v_kV", "kV"), "w": ("w_rpm", "rpm"), "i_a": ("i_a", ""),
+    }  # fmt: skip
+    (e,) = hi.load_study(found.path).experiments
+    assert e.event == pytest.approx(0.5) and e.measured is not None
+    np.testing.assert_allclose(e.measured["w"], r["w"], rtol=1e-12)

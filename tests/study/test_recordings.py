@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from scipy.optimize import curve_fit
@@ -120,6 +121,49 @@ def test_gaps_of_inputs_are_an_error_that_says_where(tmp_path: Path) -> None:
     rows[:, 3] = np.nan
     with pytest.raises(StudyError, match="not recorded in any row"):
         load_study(write(tmp_path, rows))
+
+
+def of_three_rates(folder: Path, gap: int = 0) -> Path:
+    """The study of `write` with v every 5 ms, w every 2 ms and i every 15 ms, from 0.05 s on, each with its own time in an HDF5 file."""
+    study = write(folder, record())
+    text = study.read_text().replace('"d.csv"', '"d.h5"').replace('["v"]', '{v = "in/v"}')
+    study.write_text(text.replace('["w", "i"]', '{w = "speed/w", i = "arm/i"}'))
+    random = np.random.default_rng(3)
+    with h5py.File(folder / "d.h5", "w") as file:
+        for name, step, first, column in (("in/v", 5e-3, 0.0, 0), ("speed/w", 2e-3, 0.0, 1), ("arm/i", 1.5e-2, 0.05, 2)):
+            time = first + step * np.arange(round((1.2 - first) / step))
+            values = exact(time)[column] + (1e-3 * random.standard_normal(time.size) if column else 0.0)
+            if gap and column == 0:
+                values[gap] = np.nan
+                file["in/other"] = np.zeros(time.size)
+            file[name], file[f"{name.partition('/')[0]}/time"] = values, time
+            file[f"{name.partition('/')[0]}/time"].attrs["units"] = "s"
+    return study
+
+
+def test_outputs_of_other_rates_than_the_inputs_are_compared_at_their_own_rows(tmp_path: Path) -> None:
+    study = load_study(of_three_rates(tmp_path))
+    (experiment,) = study.experiments
+    assert experiment.event == pytest.approx(EVENT) and experiment.time[-1] <= 1.195
+    text = told(study)
+    assert "77 rows of arm/i, 240 rows of in/v, 600 rows of speed/w" in text and "not recorded" not in text
+    for output, rows in (("w", 150), ("i", 17)):  # before the event
+        assert study.noise["d"][output].source == "estimated"
+        assert study.noise["d"][output].std == pytest.approx(1e-3, rel=3.0 / np.sqrt(2 * rows))
+    found = fitted(study)
+    counted = {o: found.goodness["outputs"][o]["d"]["n"] for o in ("w", "i")}
+    assert counted == {"w": 598, "i": 77}  # of w, those until the last of v
+    assert found.estimates["J"].ci95 is not None
+    low, high = found.estimates["J"].ci95
+    assert low < TRUE < high and high - low < 0.05 * TRUE
+
+
+def test_a_gap_of_an_input_among_records_of_other_rates_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match=r"column 'in/v' is not recorded in 1 of 240 rows, the first at 0.02 s"):
+        path = of_three_rates(tmp_path, gap=4)
+        path.write_text(path.read_text().replace('{w = "speed/w"', '{o = "in/other", w = "speed/w"'))
+        (tmp_path / "motor.toml").write_text(CARD + 'o = {value = "0", unit = "V"}\n')
+        load_study(path)
 
 
 def test_a_gap_splits_the_rows_that_noise_is_estimated_from() -> None:
