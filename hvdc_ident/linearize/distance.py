@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.frequency import default_omega, transfer
+from hvdc_ident.linearize.frequency import transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.reduction import (
     Peak,
@@ -68,7 +68,7 @@ def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
     where the numbers of channels differ.
     """
     same_channels(first, second)
-    grid = np.unique(np.concatenate([default_omega(first, 2000), default_omega(second, 2000)]))
+    grid = np.unique(np.concatenate([wide_omega(first, 2000), wide_omega(second, 2000)]))
     far = 1e6 * grid[-1]
     grid = np.concatenate([grid[0] * np.logspace(-8, -0.01, 100), grid, [far]])
 
@@ -335,7 +335,7 @@ def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:
         middle = np.linalg.solve(eye + p @ c, np.concatenate([eye, p], axis=2))
         return np.linalg.svd(np.concatenate([middle, c @ middle], axis=1), compute_uv=False)[:, 0]
 
-    return peak_over(blocks, np.unique(np.concatenate([default_omega(m, 4000) for m in (plant, controller)])))
+    return peak_over(blocks, np.unique(np.concatenate([wide_omega(m, 4000) for m in (plant, controller)])))
 
 
 @dataclass(frozen=True)

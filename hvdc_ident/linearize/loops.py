@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, transfer
+from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, transfer, wide_omega
 from hvdc_ident.linearize.gain_limits import FLOOR, NONE, Closing, Crossing, crossing_frequencies, refined
 from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
@@ -162,7 +162,7 @@ def plant_and_controller(
     k = len(inputs)
     names = both.output_names
     returned_inputs, returned_outputs = names[:k], names[k:]
-    w = default_omega(both, 50)
+    w = wide_omega(both, 50)
     values = np.abs(transfer(both, 1j * w))
     size = np.maximum(values.max(axis=0), 1e-300)
     for part in ((slice(0, k), slice(0, k)), (slice(k, None), slice(k, None))):
@@ -470,7 +470,7 @@ def _grid(model: LinearModel, closing: Closing, omega: Array | None) -> Array:
     """Return the frequencies at which curves are computed first: around open and closed poles, and beside crossings."""
     if omega is not None:
         return np.asarray(omega, dtype=float)
-    own = default_omega(model, 4000)
+    own = wide_omega(model, 4000)
     closed = np.abs(closing.open.closed(np.ones(closing.open.through.shape[0])).roots.values)
     closed = closed[closed > 1e-6 * own[0]]
     beyond = [np.geomspace(own[-1], 30.0 * v, 200) for v in (closed.max(initial=0.0),) if 30.0 * v > own[-1]]

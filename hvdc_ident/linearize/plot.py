@@ -56,7 +56,7 @@ def bode(responses: Sequence[FrequencyResponse], labels: Sequence[str] = (), ax:
                 if r.source in ("recording", "simulation"):
                     style = {"color": style["color"], "linestyle": "none", "marker": ".", "markersize": 4}
                 gain.semilogx(f, db, label=f"{name}{input} to {output}", **style)
-                phase.semilogx(f, np.degrees(np.unwrap(np.angle(r.values[keep, i, j]))), **style)
+                phase.semilogx(f, r.phase_deg[keep, i, j], **style)
                 if r.std is not None:
                     size, spread = r.magnitude[keep, i, j], 2.0 * r.std[keep, i, j]
                     low = 20 * np.log10(np.maximum(size - spread, 1e-3 * size))

@@ -15,7 +15,7 @@ import scipy.linalg
 from scipy.optimize import minimize_scalar
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.frequency import default_omega, transfer
+from hvdc_ident.linearize.frequency import transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.stability import sliding_means, stability
 from hvdc_ident.linearize.system import Array
@@ -94,7 +94,10 @@ def _kalman(
     hidden = []
     for transposed in (False, True):
         basis, k = staircase(a.T if transposed else a, c.T if transposed else b, tolerance)
-        hidden.append(np.linalg.eigvals((basis.T @ a @ basis)[k:, k:]) if k < a.shape[0] else np.zeros(0))
+        if k == a.shape[0]:  # nothing is hidden: the model's own states keep the digits that a basis would mix
+            hidden.append(np.zeros(0))
+            continue
+        hidden.append(np.linalg.eigvals((basis.T @ a @ basis)[k:, k:]))
         keep = basis[:, :k]
         a, b, c = keep.T @ a @ keep, keep.T @ b, c @ keep
     return (a, b, c), (hidden[0], hidden[1])
@@ -188,8 +191,10 @@ def hankel(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
 
 
 def _root(p: Array) -> Array:
-    values, vectors = np.linalg.eigh(0.5 * (p + p.T))
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    """Return R with R R' = P, of a Gramian whose states are first counted in units in which each has 1: small ones keep their digits."""
+    unit = np.sqrt(np.maximum(np.diag(p), 1e-300))
+    values, vectors = np.linalg.eigh(0.5 * (p + p.T) / np.outer(unit, unit))
+    return np.asarray(unit[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def balanced(
@@ -287,6 +292,10 @@ def _residualised(a: Array, b: Array, c: Array, d: Array, count: int) -> tuple[A
 # --- norms ---
 
 
+AXIS = 1e-2
+"""Share of its size by which an imaginary eigenvalue of a Hamiltonian matrix may be off the axis in floating point."""
+
+
 @dataclass(frozen=True)
 class Peak:
     """The largest singular value over all frequencies and where it is, rad/s (0 and infinity are places)."""
@@ -302,13 +311,54 @@ class Peak:
 def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     """Return the L-infinity norm, max over w of the largest singular value of G(jw), stable or not.
 
-    Two-step bisection on the imaginary eigenvalues of the Hamiltonian matrix (Bruinsma and Steinbuch 1990), which needs
-    no stability; a model with delays is searched on its exact response instead. Raises LinearizationError where a pole
-    that the inputs reach and the outputs see lies on the imaginary axis: the norm is infinite.
+    From the largest value on a grid, two-step bisection on the imaginary eigenvalues of the Hamiltonian matrix (Bruinsma and
+    Steinbuch 1990), which needs no stability; a model with delays is searched on its exact response instead. Raises
+    LinearizationError where a pole that the inputs reach and the outputs see lies on the imaginary axis: the norm is infinite.
     """
     if model.delay_free is not None:
         return _linf_of_delays(model)
-    a, b, c, d = visible(model)
+    a, b, c, d = _clear_of_axis(model)
+
+    def gains(w: Array) -> Array:
+        """The largest singular value at each frequency."""
+        if not a.shape[0] or not d.size:
+            return np.full(w.size, float(np.linalg.norm(d, 2)) if d.size else 0.0)
+        inner = 1j * w[:, None, None] * np.eye(a.shape[0]) - a
+        values = c @ np.linalg.solve(inner, np.broadcast_to(b.astype(complex), (w.size, *b.shape))) + d
+        return np.asarray(np.linalg.svd(values, compute_uv=False)[:, 0])
+
+    def peak(w: Array) -> tuple[float, float]:
+        found = gains(w)
+        k = int(np.argmax(found))
+        return float(found[k]), float(w[k])
+
+    poles = np.linalg.eigvals(a) if a.shape[0] else np.zeros(0)
+    top = float(np.linalg.norm(d, 2)) if d.size else 0.0
+    first = np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag), wide_omega(model)])
+    best, where = max((top, float("inf")), peak(first))
+    if best == 0.0:
+        return Peak(0.0, 0.0)
+    for _ in range(60):
+        crossings = _axis_crossings(a, b, c, d, best * (1.0 + 2.0 * max(tolerance, 1e-12)))
+        if crossings.size < 2:
+            break
+        value, w = peak(np.concatenate([crossings, 0.5 * (crossings[:-1] + crossings[1:])]))
+        if value <= best * (1.0 + tolerance):
+            break
+        best, where = value, w
+    return refined(lambda w: float(gains(np.array([w]))[0]), best, where)
+
+
+def _clear_of_axis(model: LinearModel) -> tuple[Array, Array, Array, Array]:
+    """Return A, B, C, D without poles on the imaginary axis: the model scaled, or where it has such hidden ones the visible part.
+
+    The bases that show what is hidden are orthogonal, and mix states of very different sizes: the model's own keep the
+    digits. Raises LinearizationError for a pole on the axis that the inputs reach and the outputs see.
+    """
+    a, b, c, d = without_sliding_means(model)
+    a, b, c = _scale(a, b, c)
+    if on_axis(np.linalg.eigvals(a), a).any():
+        a, b, c, d = visible(model)
     poles = np.linalg.eigvals(a) if a.shape[0] else np.zeros(0)
     axis = poles[on_axis(poles, a)]
     if axis.size:
@@ -318,29 +368,7 @@ def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
             got=f"eigenvalue {axis[0]:.6g}",
             hint="compare with nu_gap, which takes integrators",
         )
-
-    def gain(w: float) -> float:
-        value = c @ np.linalg.solve(1j * w * np.eye(a.shape[0]) - a, b) + d if a.shape[0] else d
-        return float(np.linalg.norm(value, 2)) if value.size else 0.0
-
-    best, where = float(np.linalg.norm(d, 2)) if d.size else 0.0, float("inf")
-    for w in [0.0, *np.abs(poles), *np.abs(poles.imag)]:
-        best, where = max((best, where), (gain(float(w)), float(w)))
-    if best == 0.0:
-        return Peak(0.0, 0.0)
-    for _ in range(60):
-        level = best * (1.0 + 2.0 * max(tolerance, 1e-12))
-        crossings = _axis_crossings(a, b, c, d, level)
-        if crossings.size < 2:
-            break
-        middles = (
-            np.sqrt(crossings[:-1] * crossings[1:]) if crossings[0] > 0 else 0.5 * (crossings[:-1] + crossings[1:])
-        )
-        value, w = max((gain(float(x)), float(x)) for x in middles)
-        if value <= best * (1.0 + tolerance):
-            break
-        best, where = value, w
-    return refined(gain, best, where)
+    return a, b, c, d
 
 
 def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
@@ -381,7 +409,7 @@ def _linf_of_delays(model: LinearModel) -> Peak:
         raise LinearizationError(
             "the L-infinity norm is infinite: a pole lies on the imaginary axis", where=f"linear model '{model.name}'"
         )
-    grid = np.concatenate([[0.0], default_omega(model, 4000)])
+    grid = np.concatenate([[0.0], wide_omega(model, 4000)])
     return peak_over(lambda w: np.linalg.svd(transfer(model, 1j * w), compute_uv=False)[:, 0], grid)
 
 
@@ -424,15 +452,24 @@ def norms(model: LinearModel) -> dict[str, Any]:
 
 
 def _axis_crossings(a: Array, b: Array, c: Array, d: Array, level: float) -> Array:
-    """Frequencies at which a singular value equals the level."""
+    """Return frequencies among which are all at which a singular value equals the level.
+
+    They are imaginary parts of imaginary eigenvalues of the Hamiltonian matrix, here of those within `AXIS` of the axis: more
+    than rounding moves them. One that is none does no harm, for the gain is computed there.
+    """
     r = level**2 * np.eye(d.shape[1]) - d.T @ d
     inner = np.linalg.solve(r, d.T @ c)
     f = a + b @ inner
     top = b @ np.linalg.solve(r, b.T)
     bottom = -(c.T @ c + c.T @ d @ inner)
-    values = np.linalg.eigvals(np.block([[f, top], [bottom, -f.T]]))
-    on_it = np.abs(values.real) < 1e-8 * np.maximum(np.abs(values), 1e-3 * np.abs(values).max(initial=0.0) * 1e-6)
-    return np.unique(np.abs(values[on_it].imag))
+    # Both sides counted in units in which the two blocks off the diagonal are alike.
+    unit = np.sqrt(max(float(np.abs(bottom).max(initial=0.0)), 1e-300) / max(float(np.abs(top).max(initial=0.0)), 1e-300))
+    values = np.linalg.eigvals(np.block([[f, top * unit], [bottom / unit, -f.T]]))
+    return np.unique(np.abs(values[np.abs(values.real) < AXIS * np.abs(values)].imag))
+
+
+NEAR = 0.05
+"""Logarithm of frequency either side of a peak within which it is refined: the distance of two frequencies of a grid."""
 
 
 def refined(gain: Callable[[float], float], best: float, where: float) -> Peak:
@@ -440,7 +477,7 @@ def refined(gain: Callable[[float], float], best: float, where: float) -> Peak:
     if not 0.0 < where < np.inf:
         return Peak(best, where)
     found = minimize_scalar(
-        lambda x: -gain(float(np.exp(x))), bounds=(np.log(where) - 0.01, np.log(where) + 0.01), method="bounded",
+        lambda x: -gain(float(np.exp(x))), bounds=(np.log(where) - NEAR, np.log(where) + NEAR), method="bounded",
         options={"xatol": 1e-12},
     )  # fmt: skip
     return Peak(-float(found.fun), float(np.exp(found.x))) if -found.fun > best else Peak(best, where)

@@ -16,6 +16,7 @@ import sympy as sp
 
 from hvdc_ident.errors import LinearizationError, require_known, unknown_name
 from hvdc_ident.expression import symbol
+from hvdc_ident.linearize.delays import eliminate
 from hvdc_ident.linearize.loops import signal_values
 from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
 from hvdc_ident.linearize.system import Array
@@ -301,13 +302,18 @@ def _deflate(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Arra
 
 @dataclass(frozen=True, eq=False)
 class TransferFunction:
-    """gain * prod(s - zeros) / prod(s - poles), s in rad/s; cancelled: (pole, zero) pairs that were left out."""
+    """gain * prod(s - zeros) / prod(s - poles), s in rad/s; cancelled: (pole, zero) pairs that were left out.
+
+    dc_gain: the value at s = 0, infinite with a pole there; modes that the input does not reach or the output does not
+    see are no poles of it, though an integrator among them stays in `poles` and `zeros`.
+    """
 
     input: str
     output: str
     zeros: Array
     poles: Array
     gain: float
+    dc_gain: float
     cancelled: tuple[tuple[complex, complex], ...] = ()
 
     def __call__(self, s: complex | Array) -> Array:
@@ -315,13 +321,6 @@ class TransferFunction:
         s = np.asarray(s, dtype=complex)
         top = np.prod(s[..., None] - self.zeros, axis=-1)
         return np.asarray(self.gain * top / np.prod(s[..., None] - self.poles, axis=-1))
-
-    @property
-    def dc_gain(self) -> float:
-        """The value at s = 0; infinite with a pole there."""
-        if (self.poles == 0).any():
-            return float("inf")
-        return float(self(0.0).real)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the transfer function as plain numbers, complex ones as [re, im]."""
@@ -350,12 +349,26 @@ def transfer_function(model: LinearModel, input: str, output: str) -> TransferFu
     a, b, c, d = part.standard()
     if not _connected(a, b, c, d):
         none = np.zeros(0, dtype=complex)
-        return TransferFunction(input, output, none, none, 0.0)
+        return TransferFunction(input, output, none, none, 0.0, 0.0)
     all_poles, all_zeros = np.linalg.eigvals(a).astype(complex), zeros(a, b, c, d)
     hidden = uncontrollable_unobservable(a, b, c)
     kept_poles, kept_zeros, cancelled = _cancel(all_poles, all_zeros, hidden)
     gain = _gain(a, b, c, d, kept_zeros, kept_poles)
-    return TransferFunction(input, output, _paired(kept_zeros), _paired(kept_poles), gain, tuple(cancelled))
+    return TransferFunction(
+        input, output, _paired(kept_zeros), _paired(kept_poles), gain, _dc_gain(part), tuple(cancelled)
+    )
+
+
+def _dc_gain(channel: LinearModel) -> float:
+    """Return D - C A^-1 B; where A is singular that of what the input reaches and the output sees, infinite where it is too."""
+    from hvdc_ident.linearize.reduction import visible, without_sliding_means
+
+    for part in (without_sliding_means, visible):
+        a, b, c, d = part(channel)
+        at_rest = eliminate(np.block([[d, c], [b, a]]), 1, 1)
+        if np.isfinite(at_rest.condition):
+            return float(at_rest.result[0, 0])
+    return float("inf")
 
 
 def _connected(a: Array, b: Array, c: Array, d: Array) -> bool:
