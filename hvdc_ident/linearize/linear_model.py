@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.display import Shown, Table, first_rows
-from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.errors import LinearizationError, ModelError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.delays import DelayFreePart, eliminate
 from hvdc_ident.linearize.operating_point import OperatingPoint
@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize.reduction import Reduction
     from hvdc_ident.linearize.stability import Characteristic, Stability
     from hvdc_ident.linearize.transfer_function import TransferFunction
+
+
+SCHEMA = 1
+KINDS = ("state", "input", "output")
+"""What has names and units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,7 +364,7 @@ class LinearModel(Shown):
         return balanced(self, order, tolerance, match_dc=match_dc)
 
     def save(self, path: str | Path) -> Path:
-        """Write the model in the format of the path's ending (.mat, .json, .csv, .m, .mo, .tex, .zpk) and return the path."""
+        """Write the model in the format of the path's ending (.mat, .json, .csv, .m, .mo) and return the path."""
         from hvdc_ident.linearize.export import write
 
         return write(self, path)
@@ -385,16 +390,37 @@ class LinearModel(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists, with names, units, operating point and provenance."""
-        from hvdc_ident.linearize.export.json_text import to_dict
-
-        return to_dict(self)
+        point = {} if self.point is None else {"operating_point": self.point.to_dict()}
+        return {
+            "schema": SCHEMA,
+            "kind": "linear-model",
+            "model": self.name,
+            "equation": "E dx/dt = A x + B u, y = C x + D u, deviations from x0, u0, y0; time in s",
+            **{k: getattr(self, k).tolist() for k in "ABCDE"},
+            **{f"{k}_{w}": list(getattr(self, f"{k}_{w}")) for w in ("names", "units") for k in KINDS},
+            **{k: list(getattr(self, k)) for k in ("x0", "u0", "y0")},
+            "provenance": dict(self.provenance),
+            **point,
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LinearModel:
         """Return the model that `to_dict` wrote, without its operating point. Raises ModelError for anything else."""
-        from hvdc_ident.linearize.export.json_text import from_dict
-
-        return from_dict(dict(data))
+        if not isinstance(data, Mapping) or data.get("schema") != SCHEMA or "A" not in data:
+            raise ModelError(
+                "this is no linear model",
+                where="linear model",
+                expected=f"a JSON object with schema {SCHEMA} and A, B, C, D",
+            )
+        try:
+            fields: dict[str, Any] = {k: data[k] for k in "ABCDE"}
+            fields |= {f"{k}_{w}": tuple(data[f"{k}_{w}"]) for k in KINDS for w in ("names", "units")}
+            fields |= {k: tuple(data[k]) for k in ("x0", "u0", "y0")}
+            return cls(**fields, name=data["model"], provenance=FrozenMap(data.get("provenance", {})))
+        except (KeyError, TypeError, ValueError) as e:
+            raise ModelError(
+                "the linear model is incomplete", where="linear model", got=f"{type(e).__name__}: {e}"
+            ) from None
 
 
 def _eigenvalue(value: complex) -> str:
