@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
-    from hvdc_ident.linearize.distance import ModelDistance, NuGap, compare, gap, ncf_margin, nu_gap
+    from hvdc_ident.linearize.distance import ModelDistance, NuGap, compare, ncf_margin, nu_gap
     from hvdc_ident.linearize.frequency import FrequencyResponse, frequency_response
     from hvdc_ident.linearize.impedance import (
         MeasuredResponse,
@@ -36,7 +36,7 @@ else:
     __getattr__ = offered(
         __name__,
         {
-            "distance": "ModelDistance NuGap compare gap ncf_margin nu_gap",
+            "distance": "ModelDistance NuGap compare ncf_margin nu_gap",
             "frequency": "FrequencyResponse frequency_response",
             "impedance": "MeasuredResponse Port port_admittance port_impedance response_at_tones response_from_record "
             "simulated_response",
@@ -73,7 +73,6 @@ __all__ = [
     "continuation",
     "find_operating_point",
     "frequency_response",
-    "gap",
     "h2_norm",
     "hinf_norm",
     "jacobian_error",

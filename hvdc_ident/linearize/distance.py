@@ -1,4 +1,4 @@
-"""Distances between two linear models: nu-gap, gap and L-infinity difference, and the coprime factor margin."""
+"""The distance of two linear models, the nu-gap, their largest difference of gain, and the coprime factor margin."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from hvdc_ident.errors import LinearizationError
@@ -25,10 +24,7 @@ from hvdc_ident.linearize.reduction import (
 from hvdc_ident.linearize.stability import Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array
 
-Complex = NDArray[np.complex128]
 StateSpace = tuple[Array, Array, Array, Array]
-LARGEST = 512
-"""Coefficients of the truncated operator behind the gap."""
 
 
 @dataclass(frozen=True)
@@ -137,24 +133,6 @@ def _count(a: Array) -> tuple[int, int]:
     return int(((values.real > 0) & ~axis).sum()), int(axis.sum())
 
 
-def gap(first: LinearModel, second: LinearModel, tolerance: float = 1e-4) -> float:
-    """Return the gap (Georgiou 1988), in [0, 1]: 0 for equal plants, never below the nu-gap, and 1 where that is 1.
-
-    The graph of a plant is the range of G = [M; N], its normalised right coprime factors. The directed gap is
-    sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of G2* G1, here over inputs of a finite
-    number of coefficients: a bound from below that is raised until less than the tolerance is still to come. Delays are in
-    their Pade form. Raises LinearizationError for models of other sizes, or where it does not settle.
-    """
-    near = nu_gap(first, second).value
-    if near >= 1.0:
-        return 1.0
-    graphs = [_graph(m) for m in (first, second)]
-    scale = _scale(graphs)
-    first_on, second_on = (_on_circle(graph, scale) for graph in graphs)
-    there = _directed(first_on, second_on, tolerance, near)
-    return max(there, _directed(second_on, first_on, tolerance, near))
-
-
 def _graph(model: LinearModel) -> StateSpace:
     """A, B, C, D of the normalised right coprime factors [M; N], from the Riccati equation (Vidyasagar 1988)."""
     a, b, c, d = visible(model)
@@ -176,71 +154,6 @@ def _graph(model: LinearModel) -> StateSpace:
     return a + b @ f, b @ root, np.vstack([f, c + d @ f]), np.vstack([root, d @ root])
 
 
-def _scale(graphs: list[StateSpace]) -> float:
-    """Return the frequency that the bilinear map sends to the middle of the circle: between the graphs' poles, rad/s."""
-    poles = np.concatenate([np.abs(np.linalg.eigvals(a)) for a, _, _, _ in graphs if a.shape[0]] or [np.ones(1)])
-    poles = poles[poles > 0]
-    return float(np.exp(np.mean(np.log(poles)))) if poles.size else 1.0
-
-
-def _on_circle(graph: StateSpace, scale: float) -> Complex:
-    """Return (points, rows, inputs) of [M; N] over the whole circle: the upper half, then its conjugate, mirrored."""
-    a, b, c, d = graph
-    points = 8 * LARGEST
-    omega = scale * np.tan((np.arange(points // 2) + 0.5) * np.pi / points)
-    if a.shape[0] == 0:
-        upper = np.broadcast_to(d.astype(complex), (omega.size, *d.shape))
-    else:
-        inner = 1j * omega[:, None, None] * np.eye(a.shape[0]) - a
-        upper = c @ np.linalg.solve(inner, np.broadcast_to(b, (omega.size, *b.shape))) + d
-    return np.concatenate([np.conj(upper[::-1]), upper])
-
-
-def _directed(graph: Complex, other: Complex, tolerance: float, least: float) -> float:
-    """sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of other* graph, and not below `least`.
-
-    Where the operator's spectrum reaches down to s no sequence attains it and the bound rises as 1/size^2 at worst, so
-    that a third of the last rise is still to come: where that does not lead above the nu-gap, the gap is the nu-gap.
-    """
-    product = np.conj(np.swapaxes(other, 1, 2)) @ graph
-    points = product.shape[0]
-    squared = np.conj(np.swapaxes(product, 1, 2)) @ product
-    # T'T = Toeplitz(product* product) - H'H, H the Hankel operator of the coefficients before 0: all rows of T at once.
-    symbol, whole = _coefficients(product), _coefficients(squared)
-    m, best, size, settled = product.shape[1], -np.inf, 16, 0
-    while True:
-        lag = np.subtract.outer(np.arange(size), np.arange(size))
-        toeplitz = whole[lag % points].transpose(0, 2, 1, 3).reshape(size * m, size * m)
-        before_zero = -1 - np.add.outer(np.arange(LARGEST), np.arange(size))
-        rows = symbol[before_zero % points].transpose(0, 2, 1, 3).reshape(LARGEST * m, size * m)
-        smallest = float(np.linalg.eigvalsh(toeplitz - rows.T @ rows)[0])
-        before, best = best, float(np.sqrt(1.0 - min(max(smallest, 0.0), 1.0)))
-        to_come = abs(best - before) / 3.0
-        settled = settled + 1 if min(to_come, best + to_come - least) < tolerance else 0
-        if settled == 2:
-            return max(best, least)
-        if size == LARGEST:
-            break
-        size *= 2
-    raise LinearizationError(
-        "the gap does not settle",
-        expected=f"a value that stands still with {LARGEST} coefficients",
-        got=f"{best:.6g}, {abs(best - before):.2g} from the one before",
-        hint="ask for a coarser tolerance, compare reduced models, or use nu_gap",
-    )
-
-
-def _coefficients(values: Complex) -> Array:
-    """Fourier coefficients over the circle, those of negative order at the end.
-
-    s = scale (1 - z)/(1 + z) makes stable factors power series in z.
-    """
-    n = values.shape[0]
-    order = np.fft.fftfreq(n, 1.0 / n)
-    shift = np.exp(1j * order * (np.pi / n - np.pi))
-    return np.real(shift[:, None, None] * np.fft.ifft(values, axis=0))
-
-
 # --- the margin ---
 
 
@@ -248,7 +161,7 @@ def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Pea
     """Return the normalised coprime factor margin b(P, C) of a negative feedback loop, in [0, 1], and where it is least.
 
     1/b is the H-infinity norm of [I; C] (I + P C)^-1 [I, P]; b is 0 where the loop is not stable. A controller with
-    margin b suits every plant within a gap or nu-gap below b of P. Without a controller: the largest margin that any
+    margin b suits every plant within a nu-gap below b of P. Without a controller: the largest margin that any
     controller attains, sqrt(1 - |[M; N]|_H^2) (Glover and McFarlane 1989), whose omega is nan. Scale first, as for
     `nu_gap`. Raises LinearizationError where the sizes do not fit, or the loop is ill-posed.
     """
@@ -342,7 +255,7 @@ def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:
 class ModelDistance:
     """Distance of a second model from a first one, between the same inputs and outputs.
 
-    nu_gap: in [0, 1], with its winding condition. gap: in [0, 1], None where it was not found. attainable: the largest
+    nu_gap: in [0, 1], with its winding condition. attainable: the largest
     normalised coprime factor margin that any controller of the first attains: where the nu-gap is below it, one
     controller can suit both. difference: L-infinity norm of first - second, in output per input units, None where it is
     infinite. relative: that over the norm of the first, None where there is none. notes: why a number is missing.
@@ -351,7 +264,6 @@ class ModelDistance:
     first: str
     second: str
     nu_gap: NuGap
-    gap: float | None
     attainable: float | None
     difference: Peak | None
     relative: float | None
@@ -363,7 +275,6 @@ class ModelDistance:
             "model": self.first,
             "other": self.second,
             **self.nu_gap.to_dict(),
-            "gap": self.gap,
             "attainable_margin": self.attainable,
             "difference": None if self.difference is None else self.difference.to_dict(),
             "relative_difference": self.relative,
@@ -403,13 +314,11 @@ def compare(first: LinearModel, second: LinearModel) -> ModelDistance:
     """
     far = nu_gap(first, second)
     notes: list[str] = []
-    both: float | None = None
     attainable: float | None = None
     try:
         attainable = ncf_margin(first).value
-        both = gap(first, second)
     except LinearizationError as e:
-        notes.append(f"gap: {e.what}")
+        notes.append(f"attainable margin: {e.what}")
     apart, relative = None, None
     try:
         apart = linf_norm(difference(first, second))
@@ -417,7 +326,7 @@ def compare(first: LinearModel, second: LinearModel) -> ModelDistance:
         relative = apart.value / size if size > 0 else None
     except LinearizationError as e:
         notes.append(f"difference: {e.what}")
-    return ModelDistance(first.name, second.name, far, both, attainable, apart, relative, tuple(notes))
+    return ModelDistance(first.name, second.name, far, attainable, apart, relative, tuple(notes))
 
 
 def difference(first: LinearModel, second: LinearModel) -> LinearModel:

@@ -1,7 +1,7 @@
 """Transfer functions: invariant zeros, zeros, poles and gain of a channel, and formulas in a few parameters.
 
-Zeros come from the system matrix, never from polynomials; python-control 0.10.2 without Slycot gives a false zero on 5 of 20
-badly scaled systems.
+Zeros come from the system matrix, scaled, never from polynomials; those of python-control 0.10.2 with Slycot 0.7.1 are off by more
+than 1e-6 on 36 of 100 badly scaled systems (`benchmarks/linear_library.py`).
 """
 
 from __future__ import annotations
