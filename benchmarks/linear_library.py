@@ -26,8 +26,9 @@ from test_badly_scaled import random_system
 
 from hvdc_ident.linearize import LinearModel, balanced, h2_norm, linf_norm
 from hvdc_ident.linearize.loops import structured_singular_value
-from hvdc_ident.linearize.reduction import hankel, scaled_states
-from hvdc_ident.linearize.transfer_function import zeros
+from hvdc_ident.linearize.realisation import scaled_states
+from hvdc_ident.linearize.reduction import hankel
+from hvdc_ident.linearize.zeros import zeros
 
 Array = Any
 W = np.logspace(-3, 5, 200)

@@ -12,15 +12,8 @@ from scipy.optimize import minimize_scalar
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.reduction import (
-    Peak,
-    hankel,
-    linf_norm,
-    on_axis,
-    peak_over,
-    visible,
-    without_sliding_means,
-)
+from hvdc_ident.linearize.realisation import on_axis, visible
+from hvdc_ident.linearize.reduction import Peak, difference, hankel, linf_norm, peak_over, same_channels
 from hvdc_ident.linearize.stability import Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array
 
@@ -43,18 +36,6 @@ class NuGap:
     def to_dict(self) -> dict[str, Any]:
         """Return the gap as plain numbers."""
         return {"nu_gap": self.value, "omega": self.omega, "winding": self.winding, "chordal_distance": self.distance}
-
-
-def same_channels(first: LinearModel, second: LinearModel) -> None:
-    """Raise LinearizationError where two models differ in their number of inputs or outputs."""
-    shapes = [(len(m.output_names), len(m.input_names)) for m in (first, second)]
-    if shapes[0] != shapes[1]:
-        raise LinearizationError(
-            "the models have other inputs or outputs",
-            where=f"'{first.name}' against '{second.name}'",
-            expected=f"{shapes[0][0]} outputs and {shapes[0][1]} inputs",
-            got=f"{shapes[1][0]} and {shapes[1][1]}",
-        )
 
 
 def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
@@ -329,16 +310,3 @@ def compare(first: LinearModel, second: LinearModel) -> ModelDistance:
     return ModelDistance(first.name, second.name, far, attainable, apart, relative, tuple(notes))
 
 
-def difference(first: LinearModel, second: LinearModel) -> LinearModel:
-    """Return the model first - second, delays in their Pade form. Raises LinearizationError where the sizes differ."""
-    same_channels(first, second)
-    a1, b1, c1, d1 = without_sliding_means(first)
-    a2, b2, c2, d2 = without_sliding_means(second)
-    return first.with_matrices(
-        scipy.linalg.block_diag(a1, a2) if a1.size or a2.size else np.zeros((0, 0)),
-        np.concatenate([b1, b2]),
-        np.concatenate([c1, -c2], axis=1),
-        d1 - d2,
-        point=None,
-        name=f"{first.name} - {second.name}",
-    )

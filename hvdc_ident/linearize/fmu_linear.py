@@ -21,7 +21,7 @@ from hvdc_ident.fmu import FmuModel, FmuPoint, at_point, smooth_inputs
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import At, newton
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-from hvdc_ident.linearize.operating_point import Bounds, OperatingPoint
+from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import External
 
@@ -49,7 +49,7 @@ def find_point(
     given: External,
     fixed: Mapping[str, float],
     free: Collection[str],
-    bounds: Bounds,
+    bounds: Mapping[str, tuple[float, float]],
     guess: Mapping[str, float],
     at: At,
     moving: Collection[str],
@@ -71,7 +71,7 @@ class _FmuSearch:
         model: FmuModel,
         fixed: dict[str, float],
         free: tuple[str, ...],
-        bounds: Bounds,
+        bounds: Mapping[str, tuple[float, float]],
         guess: dict[str, float],
         at: At,
         moving: tuple[str, ...],

@@ -11,12 +11,13 @@ import numpy as np
 from hvdc_ident.codec import read_fields
 from hvdc_ident.display import Shown, Table, data_frame, first_rows
 from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.linearize import plot
+from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles, gradient_of
+from hvdc_ident.linearize.stability import ZERO
 from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:
     import xarray
-
-    from hvdc_ident.linearize.linear_model import LinearModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +118,7 @@ class FrequencyResponse(Shown):
 
     def plot(self, ax: Any = None) -> Any:
         """Return the two axes of a Bode diagram, gain and phase. ax: two axes to draw on."""
-        from hvdc_ident.linearize.plot import bode
-
-        return bode([self], ax=ax)
+        return plot.bode([self], ax=ax)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the response as plain lists."""
@@ -161,6 +160,11 @@ def transfer(model: LinearModel, s: Array) -> Array:
     return np.asarray(model.C @ inner + model.D)
 
 
+def response(model: LinearModel, omega: Array | Sequence[float]) -> Array:
+    """Return (frequencies, outputs, inputs) complex transfer matrix at omega in rad/s, delays exact."""
+    return transfer(model, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
+
+
 def transfer_slope(model: LinearModel, s: Array) -> Array:
     """Return (points, outputs, inputs) derivative of the transfer matrix by s; delays exact."""
     if model.delay_free is not None:
@@ -194,9 +198,6 @@ def wide_omega(model: LinearModel, points: int = 400) -> Array:
 
 
 def _poles_apart_from_0(model: LinearModel) -> Array:
-    from hvdc_ident.linearize.modal import approximate_poles
-    from hvdc_ident.linearize.operating_point import ZERO
-
     poles = approximate_poles(model)
     return poles[np.abs(poles) > ZERO * max(1.0, float(np.abs(poles).max(initial=0.0)))]
 
@@ -244,8 +245,6 @@ def followed_phase(model: LinearModel, omega: Array) -> Array:
     The angles alone leave whole turns open, of which a delay makes many in one step. The phase's slopes Re(G'/G) at both
     ends tell how many; where they do not agree to `TURN`, the step is parted. A channel that is 0 has 0.
     """
-    from hvdc_ident.linearize.modal import approximate_poles
-
     if omega.size < 2:
         return np.degrees(np.angle(transfer(model, 1j * omega)))
     between = _resonances(approximate_poles(model), omega[0], omega[-1])
@@ -314,8 +313,6 @@ def sensitivity(
     model: LinearModel, omega: Array | Sequence[float], parameters: Sequence[str] | None = None
 ) -> dict[str, Array]:
     """Return by parameter the (n, outputs, inputs) derivatives of the response, with the operating point's shift and delays."""
-    from hvdc_ident.linearize.modal import gradient_of
-
     w = _checked(omega)
     s = 1j * w
     names = list(model.gradients) if parameters is None else list(parameters)
@@ -356,3 +353,20 @@ def bands(
     stacked = np.array([slopes[n] for n in parameters])
     variance = np.einsum("a...,ab,b...->...", stacked.conj(), cov, stacked).real
     return replace(plain, std=np.sqrt(np.maximum(variance, 0.0)))
+
+
+def bode(
+    model: LinearModel,
+    omega: Array | Sequence[float] | None = None,
+    *,
+    covariance: Array | None = None,
+    parameters: Sequence[str] = (),
+) -> FrequencyResponse:
+    """Return the frequency response at omega in rad/s (default: around the poles), with units; it draws itself.
+
+    covariance: (k, k) of parameters in their units, in the order of `parameters`, whose derivatives the model must
+    have (`linearize(..., sensitivities=...)`): the response then has the standard deviation that follows, as a band.
+    """
+    if covariance is None:
+        return frequency_response(model, omega)
+    return bands(model, default_omega(model) if omega is None else omega, covariance, parameters)

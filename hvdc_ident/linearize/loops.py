@@ -20,10 +20,11 @@ from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, transfer, wide_omega
 from hvdc_ident.linearize.gain_limits import FLOOR, NONE, Closing, Crossing, crossing_frequencies, refined
-from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point, point_at
-from hvdc_ident.linearize.reduction import without_sliding_means
+from hvdc_ident.linearize.linearisation import linearize
+from hvdc_ident.linearize.operating_point import find_operating_point, point_at, signal_value
+from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.realisation import without_sliding_means
 from hvdc_ident.linearize.stability import Characteristic, Stability, sliding_means, stability
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import Model, Output, State, driven, fresh
@@ -179,25 +180,6 @@ def plant_and_controller(
     plant = back.channel(list(inputs), list(returned_outputs))
     controller = both.channel(list(outputs), list(returned_inputs))
     return plant, controller
-
-
-def signal_value(model: Model, point: OperatingPoint, name: str) -> float:
-    """Return the value of any name at an operating point."""
-    return signal_values(model, point, (name,))[name]
-
-
-def signal_values(model: Model, point: OperatingPoint, names: Sequence[str]) -> dict[str, float]:
-    """Return the values of any names at an operating point."""
-    from hvdc_ident.linearize.system import system
-
-    known = {**point.states, **point.unknowns, **point.extras, **point.inputs, **point.parameters}
-    asked = tuple(n for n in names if n not in known)
-    found = {n: float(known[n]) for n in names if n in known}
-    if asked:
-        s = system(model, asked)
-        shown = s.values(point.y, point.w, point.p, s.modes(point.y, point.w, point.p))[s.layout.n + s.layout.ne :]
-        found |= {n: float(v) for n, v in zip(s.outputs, shown, strict=False)}
-    return found
 
 
 # --- stability margins ---
@@ -389,6 +371,24 @@ def margins(loop: Loop | LinearModel, omega: Array | None = None) -> Margins:
 
     closing = Closing(open_equation(model), 0)
     return _of_curve(values, _grid(model, closing, omega), closing)
+
+
+def margins_of(model: LinearModel, break_at: str | Sequence[str] | None = None) -> Margins | LoopMargins:
+    """Return gain, phase, delay, modulus and disk margins; of several loops together with their common disk margin.
+
+    break_at: the signal (or signals) of the model at which its closed loops are opened. Without it this linear model
+    is taken for an open loop L with negative unit feedback. Raises LinearizationError where it is neither.
+    """
+    if break_at is None:
+        return margins(model) if model.B.shape[1] == model.C.shape[0] == 1 else loop_margins(model)
+    if model.point is None or not isinstance(model.point.model, Model):
+        raise LinearizationError(
+            "a loop can be opened only in a model with equations",
+            where=f"linear model '{model.name}'",
+            hint="margins() without a signal takes this linear model for the open loop",
+        )
+    opened = loop(model.point.model, break_at, model.point)
+    return margins(opened) if isinstance(break_at, str) else loop_margins(opened)
 
 
 def open_equation(model: LinearModel) -> Characteristic:

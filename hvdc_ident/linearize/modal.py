@@ -8,70 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import scipy.linalg
 from scipy.optimize import linear_sum_assignment
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.linearize import delayed_modes
 from hvdc_ident.linearize.delayed_locus import crossings, followed
+from hvdc_ident.linearize.derivatives import characteristic, state_matrix
 from hvdc_ident.linearize.equilibrium import EquilibriumSearch
-from hvdc_ident.linearize.jacobian import characteristic, state_matrix
-from hvdc_ident.linearize.operating_point import ZERO, steady
-from hvdc_ident.linearize.stability import Characteristic, Stability, stability
+from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles
+from hvdc_ident.linearize.mode import Mode
+from hvdc_ident.linearize.operating_point import steady
+from hvdc_ident.linearize.plot import locus
+from hvdc_ident.linearize.stability import ZERO, Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array, CompiledSystem
 from hvdc_ident.model import Model
 
-if TYPE_CHECKING:
-    from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-
-
 ON_AXIS = (1e-9, 1e-6)
 """1/s left and right of the imaginary axis within which an eigenvalue of A counts as on it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Mode:
-    """One eigenvalue in rad/s, with damping, participation, shape and kind.
-
-    frequency_hz: of the oscillation, 0 for a real one. damping: -Re/|lambda|, 0 for a zero eigenvalue.
-    participation: share of each state, they sum to 1. shape: the right eigenvector, its largest entry 1.
-    sensitivity: d(lambda)/dp by parameter. kind: "oscillation", "decay", "growth", "growing oscillation",
-    or what a zero eigenvalue is: "free integrator", "hidden integrator" (nothing reaches it), "saturated state", "angle
-    reference or unobserved integrator", "undriven integrator", "sliding mean (cancelled by its delay)".
-    """
-
-    eigenvalue: complex
-    frequency_hz: float
-    damping: float
-    participation: FrozenMap[float]
-    shape: FrozenMap[complex]
-    sensitivity: FrozenMap[complex]
-    kind: str
-
-    @property
-    def time_constant(self) -> float:
-        """1/|Re lambda| in s, infinite on the imaginary axis."""
-        return 1.0 / abs(self.eigenvalue.real) if self.eigenvalue.real else float("inf")
-
-    @property
-    def dominant(self) -> str:
-        """The state that takes part most."""
-        return max(self.participation, key=lambda n: self.participation[n])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the mode as plain numbers."""
-        pair = {n: [v.real, v.imag] for n, v in self.sensitivity.items()}
-        return {
-            "eigenvalue": [self.eigenvalue.real, self.eigenvalue.imag],
-            "frequency_hz": self.frequency_hz,
-            "damping": self.damping,
-            "participation": dict(self.participation),
-            "kind": self.kind,
-            **({"sensitivity": pair} if pair else {}),
-        }
 
 
 def poles(model: LinearModel) -> Array:
@@ -82,16 +39,6 @@ def poles(model: LinearModel) -> Array:
     if model.delay_free is not None:
         return model.characteristic.roots.values
     return approximate_poles(model)
-
-
-def approximate_poles(model: LinearModel) -> Array:
-    """Return (n,) complex eigenvalues of the state space, rad/s, in which a delay stands as its Pade approximant."""
-    if model.A.shape[0] == 0:
-        return np.zeros(0, dtype=complex)
-    if not model.is_descriptor:
-        return np.asarray(np.linalg.eigvals(model.A), dtype=complex)
-    alpha, beta = scipy.linalg.eigvals(model.A, model.E, homogeneous_eigvals=True)
-    return np.asarray(alpha[finite(alpha, beta)] / beta[finite(alpha, beta)], dtype=complex)
 
 
 def stability_of(model: LinearModel) -> Stability:
@@ -106,11 +53,6 @@ def stability_of(model: LinearModel) -> Stability:
         "stable" if first.real < -ON_AXIS[0] else "on the limit of stability" if first.real < ON_AXIS[1] else "unstable"
     )
     return Stability(verdict, int((values.real >= ON_AXIS[1]).sum()), first)
-
-
-def finite(alpha: Array, beta: Array) -> Array:
-    """Return a mask of the generalised eigenvalues alpha/beta that are finite."""
-    return np.asarray(np.abs(beta) > 1e-10 * np.maximum(np.abs(alpha), np.abs(beta)).clip(1e-300) * 1e-2)
 
 
 def eigen(a: Array) -> tuple[Array, Array, Array]:
@@ -135,9 +77,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     A model with delays has infinitely many; these are the rightmost ones, at least as many as it has states.
     """
     if model.delay_free is not None:
-        from hvdc_ident.linearize.delayed_modes import modes as delayed
-
-        return delayed(model)
+        return delayed_modes.modes(model)
     names = model.state_names
     if model.is_descriptor:
         a, b, c, d = model.standard()
@@ -215,19 +155,6 @@ def sensitivities(values: Array, right: Array, left: Array, da: Array) -> Array:
         sound = np.linalg.norm(left[cluster], axis=1).max() * np.linalg.norm(right[:, cluster], axis=0).max() < 1e6
         slope[cluster] = np.linalg.eigvals(block) if sound else np.trace(block) / cluster.size
     return np.asarray(slope)
-
-
-def gradient_of(model: LinearModel, parameter: str) -> Gradient:
-    """Return the derivatives of A, B, C, D by a parameter; raises where the model was linearised without it."""
-    if parameter not in model.gradients:
-        if model.point is not None and parameter in model.point.parameters:
-            raise LinearizationError(
-                f"the derivatives by '{parameter}' were not asked for",
-                where=f"linear model '{model.name}'",
-                hint=f"linearize(..., sensitivities=['{parameter}'])",
-            )
-        raise unknown_name("parameter", parameter, model.gradients, where=f"linear model '{model.name}'")
-    return model.gradients[parameter]
 
 
 # --- names ---
@@ -309,8 +236,6 @@ class RootLocus:
 
     def plot(self, ax: Any = None) -> Any:
         """Return the axes with the locus."""
-        from hvdc_ident.linearize.plot import locus
-
         return locus(self, ax=ax)
 
     def to_dict(self) -> dict[str, Any]:

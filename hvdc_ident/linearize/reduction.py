@@ -18,10 +18,9 @@ from scipy.optimize import minimize_scalar
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.realisation import TOLERANCE, kalman, on_axis, scaled_states, visible, without_sliding_means
 from hvdc_ident.linearize.stability import sliding_means, stability
 from hvdc_ident.linearize.system import Array
-
-TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +42,6 @@ class Reduction:
     @property
     def error(self) -> Peak:
         """The L-infinity norm of whole - reduced, and where it is: between the stable parts, for the rest is kept."""
-        from hvdc_ident.linearize.distance import difference
-
         return Peak(0.0, 0.0) if self.stable is None else linf_norm(difference(*self.stable))
 
     def __str__(self) -> str:
@@ -70,47 +67,13 @@ class Reduction:
         }
 
 
-def staircase(a: Array, b: Array, tolerance: float = TOLERANCE) -> tuple[Array, int]:
-    """Return (orthogonal basis, k): its first k columns span what the inputs reach."""
-    n = a.shape[0]
-    basis, at, reached = np.eye(n), a.copy(), 0
-    block, size = b.copy(), max(float(np.linalg.norm(b)), 1e-300)
-    while reached < n and block.size:
-        u, values, _ = np.linalg.svd(block)
-        r = int((values > tolerance * size).sum())
-        if r == 0:
-            break
-        turn = scipy.linalg.block_diag(np.eye(reached), u)
-        basis, at = basis @ turn, turn.T @ at @ turn
-        block = at[reached + r :, reached : reached + r]
-        size = max(float(np.linalg.norm(a)), 1e-300)
-        reached += r
-    return basis, reached
-
-
-def _kalman(
-    a: Array, b: Array, c: Array, tolerance: float = TOLERANCE
-) -> tuple[tuple[Array, Array, Array], tuple[Array, Array]]:
-    """Return A, B, C of the controllable and observable part, and the uncontrollable and unobservable eigenvalues."""
-    hidden = []
-    for transposed in (False, True):
-        basis, k = staircase(a.T if transposed else a, c.T if transposed else b, tolerance)
-        if k == a.shape[0]:  # nothing is hidden: the model's own states keep the digits that a basis would mix
-            hidden.append(np.zeros(0))
-            continue
-        hidden.append(np.linalg.eigvals((basis.T @ a @ basis)[k:, k:]))
-        keep = basis[:, :k]
-        a, b, c = keep.T @ a @ keep, keep.T @ b, c @ keep
-    return (a, b, c), (hidden[0], hidden[1])
-
-
 def minimal(model: LinearModel, tolerance: float = TOLERANCE) -> Reduction:
     """Return the controllable and observable part, and the eigenvalues that were removed.
 
     Raises LinearizationError where an unstable or undamped mode would be cancelled: it is hidden, not gone.
     """
     a, b, c, d = model.standard()
-    part, hidden = _kalman(*scaled_states(a, b, c), tolerance)
+    part, hidden = kalman(*scaled_states(a, b, c), tolerance)
     for eigenvalues, verb in zip(hidden, ("control", "observe"), strict=True):
         bad = eigenvalues[eigenvalues.real > -1e-9 * np.maximum(1.0, np.abs(eigenvalues))]
         if bad.size:
@@ -123,59 +86,6 @@ def minimal(model: LinearModel, tolerance: float = TOLERANCE) -> Reduction:
             )
     removed = tuple(complex(v) for v in np.concatenate(hidden))
     return Reduction(_renamed(model, *part, d, "minimal"), removed, (), 0.0)
-
-
-def uncontrollable_unobservable(a: Array, b: Array, c: Array) -> Array:
-    """Return the eigenvalues of the modes that no input reaches or no output sees, by orthogonal staircases."""
-    return np.concatenate(_kalman(*scaled_states(a, b, c))[1]).astype(complex)
-
-
-def scaled_states(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
-    """Return the system with states scaled by powers of two so that rows and columns of A are alike."""
-    if a.shape[0] == 0:
-        return a, b, c
-    _, (scale, _) = scipy.linalg.matrix_balance(a, permute=False, separate=True)
-    return a * scale[None, :] / scale[:, None], b / scale[:, None], c * scale[None, :]
-
-
-def without_sliding_means(model: LinearModel) -> tuple[Array, Array, Array, Array]:
-    """Return A, B, C, D without the zero eigenvalues that a Pade approximant leaves where a sliding mean stands.
-
-    y' = (u - u(t - T))/T has no pole at 0; with the delay approximated it has one that no input reaches: what it keeps
-    is the difference between y and the mean, which is 0 for ever. Models without delays are left as they are.
-    """
-    a, b, c, d = model.standard()
-    if model.delay_free is None or a.shape[0] == 0:
-        return a, b, c, d
-    a, b, c = scaled_states(a, b, c)
-    rows = scipy.linalg.null_space(a.T, rcond=1e-13).T
-    if rows.shape[0] == 0:
-        return a, b, c, d
-    # Within the left null space, the combinations that no input drives.
-    driven = rows @ b
-    u, sizes, _ = np.linalg.svd(driven, full_matrices=True)
-    rank = int((sizes > 1e-9 * max(float(np.linalg.norm(b)), 1e-300)).sum())
-    free = u[:, rank:].T @ rows
-    if free.shape[0] == 0:
-        return a, b, c, d
-    keep = scipy.linalg.null_space(free)
-    return keep.T @ a @ keep, keep.T @ b, c @ keep, d
-
-
-def on_axis(poles: Array, a: Array) -> Array:
-    """Return a mask of the eigenvalues of a matrix that lie on the imaginary axis, as far as rounding errors tell.
-
-    Eigenvalues computed in floating point are those of a matrix within n eps |A|, which moves a simple one by about so
-    much; 1e-9 of its size stands for worse conditioned ones.
-    """
-    size = float(np.linalg.norm(a, 2)) if a.size else 0.0
-    return np.asarray(np.abs(poles.real) <= 1e-9 * np.abs(poles) + 10 * len(poles) * np.finfo(float).eps * size)
-
-
-def visible(model: LinearModel) -> tuple[Array, Array, Array, Array]:
-    """Return A, B, C, D of the part that inputs reach and outputs see, the transfer function's, be the rest stable or not."""
-    a, b, c, d = without_sliding_means(model)
-    return *_kalman(*scaled_states(a, b, c))[0], d
 
 
 def _renamed(model: LinearModel, a: Array, b: Array, c: Array, d: Array, how: str) -> LinearModel:
@@ -254,6 +164,13 @@ def balanced(
     return Reduction(reduced, (*source.removed, *gone), hankel_values, float(tails[count]), kept, match_dc, parts)
 
 
+def reduced(
+    model: LinearModel, order: int | None = None, tolerance: float | None = None, *, match_dc: bool = False
+) -> Reduction:
+    """Return a balanced model of fewer states: so many, or as few as keep the error within the tolerance. See `balanced`."""
+    return balanced(model, order, tolerance, match_dc=match_dc)
+
+
 def _stable_last(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array, int]:
     """Return a block diagonal with the modes that are not stable first, B and C to match, and the number of their states."""
     if a.shape[0] == 0:
@@ -287,6 +204,33 @@ def _residualised(a: Array, b: Array, c: Array, d: Array, count: int) -> tuple[A
         b[:count] - first @ drive,
         c[:, :count] - c[:, count:] @ slow,
         d - c[:, count:] @ drive,
+    )
+
+
+def same_channels(first: LinearModel, second: LinearModel) -> None:
+    """Raise LinearizationError where two models differ in their number of inputs or outputs."""
+    shapes = [(len(m.output_names), len(m.input_names)) for m in (first, second)]
+    if shapes[0] != shapes[1]:
+        raise LinearizationError(
+            "the models have other inputs or outputs",
+            where=f"'{first.name}' against '{second.name}'",
+            expected=f"{shapes[0][0]} outputs and {shapes[0][1]} inputs",
+            got=f"{shapes[1][0]} and {shapes[1][1]}",
+        )
+
+
+def difference(first: LinearModel, second: LinearModel) -> LinearModel:
+    """Return the model first - second, delays in their Pade form. Raises LinearizationError where the sizes differ."""
+    same_channels(first, second)
+    a1, b1, c1, d1 = without_sliding_means(first)
+    a2, b2, c2, d2 = without_sliding_means(second)
+    return first.with_matrices(
+        scipy.linalg.block_diag(a1, a2) if a1.size or a2.size else np.zeros((0, 0)),
+        np.concatenate([b1, b2]),
+        np.concatenate([c1, -c2], axis=1),
+        d1 - d2,
+        point=None,
+        name=f"{first.name} - {second.name}",
     )
 
 

@@ -237,8 +237,8 @@ def _members(kind: type) -> Iterator[str]:
     """Yield a table of the public methods and properties of a class, with the first line of each."""
     rows = []
     for name in sorted(dir(kind)):
-        member = inspect.getattr_static(kind, name)
         doc = inspect.getdoc(getattr(kind, name, None)) or ""
+        member = inspect.getattr_static(kind, name)  # a method that is bound when it is asked for is there by now
         if name.startswith("_") or (
             not isinstance(member, property | classmethod | staticmethod) and not callable(member)
         ):

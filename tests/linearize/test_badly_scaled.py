@@ -7,7 +7,7 @@ from helpers import linear
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 
 from hvdc_ident.linearize import balanced, h2_norm, linf_norm
-from hvdc_ident.linearize.transfer_function import zeros
+from hvdc_ident.linearize.zeros import zeros
 
 
 def random_system(seed):

@@ -26,7 +26,7 @@ from hvdc_ident.linearize import (
 )
 from hvdc_ident.linearize.delays import pade, response
 from hvdc_ident.linearize.frequency import bands, sensitivity, sigma
-from hvdc_ident.linearize.transfer_function import zeros
+from hvdc_ident.linearize.zeros import zeros
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
 

@@ -20,9 +20,8 @@ from hvdc_ident.linearize import (
     nu_gap,
     plant_and_controller,
 )
-from hvdc_ident.linearize.distance import difference
 from hvdc_ident.linearize.loops import structured_singular_value
-from hvdc_ident.linearize.reduction import norms
+from hvdc_ident.linearize.reduction import difference, norms
 from hvdc_ident.models import load_model
 
 
