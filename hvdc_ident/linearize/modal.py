@@ -301,7 +301,7 @@ class _Along:
         self.model, self.parameter = model, parameter
         own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
         start = {parameter: own.value}
-        self._search = EquilibriumSearch.of(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
+        self._search = EquilibriumSearch.of_model(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
         names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
         self._place = names.index(parameter)
 
@@ -319,6 +319,7 @@ class _Along:
             root, _ = steady(self.model, search)
         except SteadyStateError as e:
             raise e.at(f"{self.parameter} = {value:g}") from None
+        assert isinstance(search.system, CompiledSystem)
         return search.system, search.vectors(root.v)
 
     def matrix(self, value: float) -> Array:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
 from hvdc_ident.errors import SteadyStateError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.derivatives import constants
-from hvdc_ident.linearize.equilibrium import At, Equations, EquilibriumSearch, Root, homotopy, newton, weights
+from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root, solved, weights
 from hvdc_ident.linearize.jacobian import linear_at
-from hvdc_ident.linearize.limits import limits
 from hvdc_ident.linearize.point import Branch, OperatingPoint
 from hvdc_ident.linearize.system import Array, system
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate import ACCURACY, equilibria, resting
+from hvdc_ident.simulate import equilibria, resting
 
 Bounds = Mapping[str, tuple[float, float]]
 
@@ -61,12 +60,13 @@ def find_operating_point(
             free = freed_inputs(model, base, outputs, fixed)
             guess = {**base.states, **base.unknowns, **base.extras, **(guess or {})}
         fixed = {**fixed, **(outputs or {})}
-    if not isinstance(model, Model):
-        from hvdc_ident.linearize.fmu_linear import find_point
+    if isinstance(model, Model):
+        search = EquilibriumSearch.of_model(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
+        return solve(model, search, guess or {})
+    from hvdc_ident.linearize.fmu_linear import fmu_search
 
-        return find_point(model, fixed or {}, free, bounds or {}, guess or {}, at, moving, time)
-    search = EquilibriumSearch.of(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
-    return solve(model, search, guess or {})
+    recorded, search = fmu_search(model, fixed or {}, free, bounds or {}, guess or {}, at=at, moving=moving, time=time)
+    return point_of(recorded, search, solved(recorded.name, search, guess or {}), "trimmed")
 
 
 def solve(model: Model, search: EquilibriumSearch, guess: Mapping[str, float] | None = None) -> OperatingPoint:
@@ -74,7 +74,7 @@ def solve(model: Model, search: EquilibriumSearch, guess: Mapping[str, float] | 
     if search.is_plain and not guess:
         return point_of(model, search, *steady(model, search))
     own = _own(model, search)
-    root = _constrained(model, search, guess or {}, own)
+    root = solved(model.name, search, guess or {}, own)
     if not search.is_plain:
         return point_of(model, search, root, "trimmed")
     same = own is not None and np.allclose(
@@ -114,48 +114,11 @@ def _own(model: Model, search: EquilibriumSearch) -> Array | None:
         return None
 
 
-def _constrained(model: Model, search: EquilibriumSearch, guess: Mapping[str, float], own: Array | None) -> Root:
-    """Return the root that the guess leads to, else one near the model's own steady state, else near its guesses."""
-    best: Root | None = None
-    starts = search.guesses(guess)
-    near = (
-        None if own is None else search.guesses({**dict(zip(search.variables, own.tolist(), strict=False)), **guess})[0]
-    )
-    tries: list[tuple[Callable[[Equations, Array, Array, Array], Root], Array | None]]
-    tries = [(newton, v) for v in ([*starts[:1], near, *starts[1:]] if guess else [near, *starts])]
-    tries += [(homotopy, v) for v in (near, *starts[:1])]
-    with np.errstate(all="ignore"):
-        for solve, v in tries:
-            if v is None:
-                continue
-            root = solve(search.equations, v, search.low, search.high)
-            if root.found:
-                return root
-            best = root if best is None or root.shares.max() < best.shares.max() else best
-    assert best is not None
-    raise _not_found(model, search, best)
-
-
-def _not_found(model: Model, search: EquilibriumSearch, root: Root) -> SteadyStateError:
-    worst = int(np.argmax(root.shares))
-    names = search.variables
-    on_bound = [n for n, v, a, b in zip(names, root.v, search.low, search.high, strict=True) if v in (a, b)]
-    bound = f"; on its bound: {', '.join(on_bound)}" if on_bound else ""
-    hint = "check the fixed values and limits, give a guess near the solution, or free another input"
-    return SteadyStateError(
-        "no operating point was found",
-        where=f"model '{model.name}'",
-        expected=f"every equation met to {ACCURACY:g} of its terms",
-        got=f"{search.rows[worst]} left with {root.residual[worst]:.3g} (scaled {root.shares[worst]:.2g}){bound}",
-        hint=hint if search.at == "start" else hint + "; states that need not rest can be named in `moving`",
-    )
-
-
-def point_of(model: Model, search: EquilibriumSearch, root: Root, branch: Branch = "own") -> OperatingPoint:
+def point_of(model: AnyModel, search: EquilibriumSearch, root: Root, branch: Branch = "own") -> OperatingPoint:
     """Return the point of a solved search."""
     y, w, p = search.vectors(root.v)
     s, size = search.system, search.system.layout
-    values = s.values(y, w, p, s.modes(y, w, p))
+    values, _ = s.evaluate(y, w, p)
     shown = values[size.n + size.ne : size.main]
     wanted = {n: float(v) for n, v in zip(s.outputs, shown, strict=True) if n in model.outputs}
     n_extra = 1 + size.nu
@@ -169,7 +132,7 @@ def point_of(model: Model, search: EquilibriumSearch, root: Root, branch: Branch
         FrozenMap(wanted),
         _named(s.parameters, p),
         float(root.shares.max(initial=0.0)),
-        limits(s.structure, s.conditions, s.switches(y, w, p)),
+        s.limits(y, w, p),
         root.iterations,
         method,
         search.at,

@@ -17,7 +17,7 @@ from hvdc_ident.linearize.derivatives import characteristic
 from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.stability import ZERO, Characteristic, stability
-from hvdc_ident.linearize.system import Array
+from hvdc_ident.linearize.system import Array, CompiledSystem
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import Equilibria, equilibria, resting
 
@@ -69,7 +69,7 @@ class OperatingPoint(Shown):
     def stable(self) -> bool | None:
         """True where no eigenvalue of the linear model lies right of the imaginary axis, delays exact.
 
-        None for an FMU, on a kink, and where a gain around a delay leaves it undecided.
+        None on a kink, and where a gain around a delay leaves it undecided. An FMU's delays are not seen.
         """
         return None if self.search is None else _stable(self, self.y, self.w)
 
@@ -118,10 +118,11 @@ def _notes(point: OperatingPoint) -> tuple[str, ...]:
 
     Each names the other steady state where one is found: the model's own one, or those that the model runs to from here.
     """
-    model = point.model
-    if point.search is None or point.at != "steady" or not isinstance(model, Model):
+    if point.search is None or point.at != "steady":
         return ()
-    model = resting(model)
+    if not isinstance(point.model, Model):
+        return (f"Unstable: {_fastest(point)}.",) if point.stable is False else ()
+    model = resting(point.model)
     at = equilibria(model)
     v = np.array([*point.y, *point.extras.values()])
     found = []
@@ -142,11 +143,19 @@ def _notes(point: OperatingPoint) -> tuple[str, ...]:
 
 
 def _equation(point: OperatingPoint, y: Array, w: Array) -> Characteristic | None:
-    assert point.search is not None and isinstance(point.model, Model)
-    try:
-        return characteristic(point.model, point.search.system, y, w, point.p)
-    except LinearizationError:
-        return None
+    """Return the characteristic equation at values of a point's model; None where it has no linear model there."""
+    assert point.search is not None
+    s = point.search.system
+    if isinstance(point.model, Model):
+        assert isinstance(s, CompiledSystem)
+        try:
+            return characteristic(point.model, s, y, w, point.p)
+        except LinearizationError:
+            return None
+    n = s.layout.nx
+    a = s.evaluate(y, w, point.p)[1][:n, :n]
+    none = np.zeros((0, 0))
+    return Characteristic(a, n, (), np.zeros((n, 0)), np.zeros((0, n)), none) if np.isfinite(a).all() else None
 
 
 def _stable(point: OperatingPoint, y: Array, w: Array) -> bool | None:
