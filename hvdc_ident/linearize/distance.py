@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from scipy.optimize import minimize_scalar
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import transfer, wide_omega
@@ -52,19 +51,10 @@ def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
     def distances(w: Array) -> Array:
         return _chordal(transfer(first, 1j * w), transfer(second, 1j * w))
 
-    values = distances(grid)
-    k = int(np.argmax(values))
-    low, high = np.log(grid[max(k - 1, 0)]), np.log(grid[min(k + 1, grid.size - 1)])
-    found = minimize_scalar(
-        lambda x: -float(distances(np.array([np.exp(x)]))[0]),
-        bounds=(low, high),
-        method="bounded",
-        options={"xatol": 1e-10},
-    )
-    value, omega = max((float(values[k]), float(grid[k])), (-float(found.fun), float(np.exp(found.x))))
+    peak = peak_over(distances, grid)
     winding = winding_count(first, second)
-    value = min(value, 1.0)
-    return NuGap(1.0 if winding else value, omega, winding, value)
+    value = min(peak.value, 1.0)
+    return NuGap(1.0 if winding else value, peak.omega, winding, value)
 
 
 def _chordal(p1: Array, p2: Array) -> Array:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.codec import plain_fields
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.delays import eliminate
 from hvdc_ident.linearize.linear_model import LinearModel
@@ -38,19 +39,8 @@ class TransferFunction:
         return np.asarray(self.gain * top / np.prod(s[..., None] - self.poles, axis=-1))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the transfer function as plain numbers, complex ones as [re, im]."""
-
-        def pairs(values: Array) -> list[list[float]]:
-            return [[float(v.real), float(v.imag)] for v in values]
-
-        return {
-            "input": self.input,
-            "output": self.output,
-            "zeros": pairs(self.zeros),
-            "poles": pairs(self.poles),
-            "gain": self.gain,
-            "cancelled": [[[p.real, p.imag], [z.real, z.imag]] for p, z in self.cancelled],
-        }
+        """Return the transfer function as plain numbers, complex ones as [re, im], an infinite gain as None."""
+        return plain_fields(self)
 
 
 def transfer_function(model: LinearModel, input: str | None = None, output: str | None = None) -> TransferFunction:
