@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 MOVED: dict[str, str] = {
-    "linear": "MeasuredResponse Port balanced compare continuation gap h2_norm hinf_norm linear_sensitivities linf_norm loop loop_margins "
+    "linear": "MeasuredResponse Port balanced compare continuation h2_norm hinf_norm linear_sensitivities linf_norm loop loop_margins "
     "margins ncf_margin nu_gap one_sided plant_and_controller point_at port_admittance port_impedance read_response response_at_tones "
     "response_from_record root_locus simulated_response symbolic_transfer",
     "sensitivity": "morris sobol",

@@ -509,7 +509,7 @@ def export(
 ) -> Path:
     """Write a model or its linear model in the format of the path's ending, and return the path.
 
-    .toml, .fmu and .mo are the model, .ssv its parameters, .mat, .json, .csv, .m and .tex its linear model.
+    .toml, .fmu and .mo are the model, .ssv its parameters, .mat, .json, .csv and .m its linear model.
     source: a Study, a Model, a shipped name, a path, or a LinearModel. linear: the linear model even for .mo.
     fmu: version and kinds of an FMU. values: of a study "given", "start" or "fitted" (left out, the fitted ones where a fit
     stands in its folder of results, `folder`); or a FitResult, or values by name. "fitted" are the values that count: with the

@@ -268,7 +268,7 @@ def export(
         option(
             "--to",
             "FILE",
-            ".fmu .mo .toml (the model); .ssv (its parameters); .mat .json .csv .m .tex .zpk (the linear model).",
+            ".fmu .mo .toml (the model); .ssv (its parameters); .mat .json .csv .m (the linear model).",
         ),
     ],
     linear: Annotated[

@@ -22,7 +22,12 @@ INSIDE = {
     "discrepancy": """
 options result candidates movable nominal prediction hypothesis screen location residual_checks implied evidence pushes rounds explain
 stand_ins moves remainder forms size_search search candidate_table classes findings verdict diagnosis
-"""
+""",
+    "linearize": """
+limits system delays sampling characteristic stability equilibrium plot derivatives point linear_model zeros realisation frequency
+fmu_linear jacobian operating_point linearisation mode delayed_modes delayed_locus modal gain_limits loops reduction distance
+transfer_function formula impedance response_file export
+""",
 }
 
 ALLOWED = {

@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
-    from hvdc_ident.linearize.distance import ModelDistance, NuGap, compare, gap, ncf_margin, nu_gap
+    from hvdc_ident.linearize.derivatives import Side
+    from hvdc_ident.linearize.distance import ModelDistance, NuGap, compare, ncf_margin, nu_gap
+    from hvdc_ident.linearize.formula import symbolic_transfer
     from hvdc_ident.linearize.frequency import FrequencyResponse, frequency_response
     from hvdc_ident.linearize.impedance import (
         MeasuredResponse,
@@ -16,8 +18,8 @@ if TYPE_CHECKING:
         response_from_record,
         simulated_response,
     )
-    from hvdc_ident.linearize.jacobian import Side, jacobian_error, linearize, one_sided
     from hvdc_ident.linearize.linear_model import LinearModel
+    from hvdc_ident.linearize.linearisation import jacobian_error, linearize, one_sided
     from hvdc_ident.linearize.loops import (
         Loop,
         LoopMargins,
@@ -27,27 +29,33 @@ if TYPE_CHECKING:
         margins,
         plant_and_controller,
     )
-    from hvdc_ident.linearize.modal import Mode, RootLocus, named, named_modes, parts_of, root_locus
-    from hvdc_ident.linearize.operating_point import OperatingPoint, continuation, find_operating_point, point_at
+    from hvdc_ident.linearize.modal import RootLocus, named, named_modes, parts_of, root_locus
+    from hvdc_ident.linearize.mode import Mode
+    from hvdc_ident.linearize.operating_point import continuation, find_operating_point, point_at
+    from hvdc_ident.linearize.point import OperatingPoint
     from hvdc_ident.linearize.reduction import Reduction, balanced, h2_norm, hinf_norm, linf_norm
     from hvdc_ident.linearize.response_file import ResponseFile, read_response
-    from hvdc_ident.linearize.transfer_function import TransferFunction, symbolic_transfer
+    from hvdc_ident.linearize.transfer_function import TransferFunction
 else:
     __getattr__ = offered(
         __name__,
         {
-            "distance": "ModelDistance NuGap compare gap ncf_margin nu_gap",
+            "distance": "ModelDistance NuGap compare ncf_margin nu_gap",
             "frequency": "FrequencyResponse frequency_response",
             "impedance": "MeasuredResponse Port port_admittance port_impedance response_at_tones response_from_record "
             "simulated_response",
-            "jacobian": "Side jacobian_error linearize one_sided",
+            "derivatives": "Side",
+            "formula": "symbolic_transfer",
+            "linearisation": "jacobian_error linearize one_sided",
             "linear_model": "LinearModel",
             "loops": "Loop LoopMargins Margins loop loop_margins margins plant_and_controller",
-            "modal": "Mode RootLocus named named_modes parts_of root_locus",
-            "operating_point": "OperatingPoint continuation find_operating_point point_at",
+            "mode": "Mode",
+            "modal": "RootLocus named named_modes parts_of root_locus",
+            "point": "OperatingPoint",
+            "operating_point": "continuation find_operating_point point_at",
             "reduction": "Reduction balanced h2_norm hinf_norm linf_norm",
             "response_file": "ResponseFile read_response",
-            "transfer_function": "TransferFunction symbolic_transfer",
+            "transfer_function": "TransferFunction",
         },
     )
 
@@ -73,7 +81,6 @@ __all__ = [
     "continuation",
     "find_operating_point",
     "frequency_response",
-    "gap",
     "h2_norm",
     "hinf_norm",
     "jacobian_error",

@@ -11,9 +11,8 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.characteristic import Part
 from hvdc_ident.linearize.delays import DelayFreePart
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-from hvdc_ident.linearize.modal import Mode
-from hvdc_ident.linearize.operating_point import ZERO
-from hvdc_ident.linearize.stability import Characteristic, sliding_means
+from hvdc_ident.linearize.mode import Mode
+from hvdc_ident.linearize.stability import ZERO, Characteristic, sliding_means
 from hvdc_ident.linearize.system import Array
 
 ALIKE = 1e-7

@@ -237,21 +237,31 @@ class DelayFreePart:
     def response(self, s: Array) -> Array:
         """Return (frequencies, outputs, inputs) exact transfer matrix at complex frequencies s, rad/s."""
         try:
-            return self._solve(s, None, ())
+            return self._solve(s)
         except LinearizationError:
             if not (s == 0).any():
                 raise
         # A sliding mean is 0/0 at s = 0: the even part of the response beside it is its limit there, to 1e-10.
         beside = 1e-5j / (max(c.total for c in self.channels) or 1.0)
-        found = self._solve(np.where(s == 0, beside, s), None, ())
+        found = self._solve(np.where(s == 0, beside, s))
         found[s == 0] = found[s == 0].real
         return found
 
     def response_along(self, s: Array, change: Array, times: tuple[Array, ...]) -> Array:
         """Return the derivative of the response for a derivative of the matrix and of each channel's times."""
-        return self._solve(s, change, times)
+        slopes = np.zeros((len(self.channels), s.size), dtype=complex)
+        for i, c in enumerate(self.channels):
+            by_time, by_compute = response_slopes(c.kind, c.time, c.compute, s)
+            slopes[i] = by_time * times[i][0] + (by_compute * times[i][1] if len(times[i]) > 1 else 0.0)
+        return self._solve(s, (change, slopes, 0.0))
 
-    def _solve(self, s: Array, change: Array | None, times: tuple[Array, ...]) -> Array:
+    def response_by_s(self, s: Array) -> Array:
+        """Return the derivative of the response by s."""
+        slopes = [response_by_s(c.kind, c.time, c.compute, s) for c in self.channels]
+        return self._solve(s, (np.zeros_like(self.matrix), np.array(slopes), 1.0))
+
+    def _solve(self, s: Array, along: tuple[Array, Array, float] | None = None) -> Array:
+        """Return the response, or its derivative along a change of the matrix, of each delay's factor, and of s."""
         n, o, u, e = self.nx, self.no, self.nu, len(self.channels)
         m = self.matrix
         exact = np.array([response(c.kind, c.time, c.compute, s) for c in self.channels])  # (e, f)
@@ -270,15 +280,12 @@ class DelayFreePart:
             right = np.linalg.solve(unknown, given)
         except np.linalg.LinAlgError:
             raise LinearizationError("a frequency lies exactly on a pole", hint="leave this frequency out") from None
-        if change is None:
+        if along is None:
             return np.asarray(m[out, inp] - read @ right)
-        slopes = np.zeros((e, k), dtype=complex)
-        for i, c in enumerate(self.channels):
-            by_time, by_compute = response_slopes(c.kind, c.time, c.compute, s)
-            slopes[i] = by_time * times[i][0] + (by_compute * times[i][1] if len(times[i]) > 1 else 0.0)
+        change, slopes, by_s = along
         dfactor = slopes.T[:, :, None]
         d_unknown = np.zeros_like(unknown)
-        d_unknown[:, :n, :n], d_unknown[:, :n, n:] = change[x, x], change[x, fed]
+        d_unknown[:, :n, :n], d_unknown[:, :n, n:] = change[x, x] - by_s * np.eye(n), change[x, fed]
         d_unknown[:, n:, :n] = factor * change[src, x] + dfactor * m[src, x]
         d_unknown[:, n:, n:] = factor * change[src, fed] + dfactor * m[src, fed]
         d_given = np.concatenate(

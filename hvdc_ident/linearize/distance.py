@@ -1,4 +1,4 @@
-"""Distances between two linear models: nu-gap, gap and L-infinity difference, and the coprime factor margin."""
+"""The distance of two linear models, the nu-gap, their largest difference of gain, and the coprime factor margin."""
 
 from __future__ import annotations
 
@@ -6,29 +6,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.frequency import default_omega, transfer
+from hvdc_ident.linearize.frequency import transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.reduction import (
-    Peak,
-    hankel,
-    linf_norm,
-    on_axis,
-    peak_over,
-    visible,
-    without_sliding_means,
-)
+from hvdc_ident.linearize.realisation import on_axis, visible
+from hvdc_ident.linearize.reduction import Peak, difference, hankel, linf_norm, peak_over, same_channels
 from hvdc_ident.linearize.stability import Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array
 
-Complex = NDArray[np.complex128]
 StateSpace = tuple[Array, Array, Array, Array]
-LARGEST = 512
-"""Coefficients of the truncated operator behind the gap."""
 
 
 @dataclass(frozen=True)
@@ -45,19 +33,6 @@ class NuGap(Coded):
     distance: float = field(metadata=stored_as("chordal_distance"))
 
 
-
-def same_channels(first: LinearModel, second: LinearModel) -> None:
-    """Raise LinearizationError where two models differ in their number of inputs or outputs."""
-    shapes = [(len(m.output_names), len(m.input_names)) for m in (first, second)]
-    if shapes[0] != shapes[1]:
-        raise LinearizationError(
-            "the models have other inputs or outputs",
-            where=f"'{first.name}' against '{second.name}'",
-            expected=f"{shapes[0][0]} outputs and {shapes[0][1]} inputs",
-            got=f"{shapes[1][0]} and {shapes[1][1]}",
-        )
-
-
 def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
     """Return the nu-gap metric with its winding condition (Vinnicombe 1993, doi 10.1109/9.231459); delays exact on the axis.
 
@@ -65,26 +40,17 @@ def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
     where the numbers of channels differ.
     """
     same_channels(first, second)
-    grid = np.unique(np.concatenate([default_omega(first, 2000), default_omega(second, 2000)]))
+    grid = np.unique(np.concatenate([wide_omega(first, 2000), wide_omega(second, 2000)]))
     far = 1e6 * grid[-1]
     grid = np.concatenate([grid[0] * np.logspace(-8, -0.01, 100), grid, [far]])
 
     def distances(w: Array) -> Array:
         return _chordal(transfer(first, 1j * w), transfer(second, 1j * w))
 
-    values = distances(grid)
-    k = int(np.argmax(values))
-    low, high = np.log(grid[max(k - 1, 0)]), np.log(grid[min(k + 1, grid.size - 1)])
-    found = minimize_scalar(
-        lambda x: -float(distances(np.array([np.exp(x)]))[0]),
-        bounds=(low, high),
-        method="bounded",
-        options={"xatol": 1e-10},
-    )
-    value, omega = max((float(values[k]), float(grid[k])), (-float(found.fun), float(np.exp(found.x))))
+    peak = peak_over(distances, grid)
     winding = winding_count(first, second)
-    value = min(value, 1.0)
-    return NuGap(1.0 if winding else value, omega, winding, value)
+    value = min(peak.value, 1.0)
+    return NuGap(1.0 if winding else value, peak.omega, winding, value)
 
 
 def _chordal(p1: Array, p2: Array) -> Array:
@@ -134,24 +100,6 @@ def _count(a: Array) -> tuple[int, int]:
     return int(((values.real > 0) & ~axis).sum()), int(axis.sum())
 
 
-def gap(first: LinearModel, second: LinearModel, tolerance: float = 1e-4) -> float:
-    """Return the gap (Georgiou 1988), in [0, 1]: 0 for equal plants, never below the nu-gap, and 1 where that is 1.
-
-    The graph of a plant is the range of G = [M; N], its normalised right coprime factors. The directed gap is
-    sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of G2* G1, here over inputs of a finite
-    number of coefficients: a bound from below that is raised until less than the tolerance is still to come. Delays are in
-    their Pade form. Raises LinearizationError for models of other sizes, or where it does not settle.
-    """
-    near = nu_gap(first, second).value
-    if near >= 1.0:
-        return 1.0
-    graphs = [_graph(m) for m in (first, second)]
-    scale = _scale(graphs)
-    first_on, second_on = (_on_circle(graph, scale) for graph in graphs)
-    there = _directed(first_on, second_on, tolerance, near)
-    return max(there, _directed(second_on, first_on, tolerance, near))
-
-
 def _graph(model: LinearModel) -> StateSpace:
     """A, B, C, D of the normalised right coprime factors [M; N], from the Riccati equation (Vidyasagar 1988)."""
     a, b, c, d = visible(model)
@@ -173,71 +121,6 @@ def _graph(model: LinearModel) -> StateSpace:
     return a + b @ f, b @ root, np.vstack([f, c + d @ f]), np.vstack([root, d @ root])
 
 
-def _scale(graphs: list[StateSpace]) -> float:
-    """Return the frequency that the bilinear map sends to the middle of the circle: between the graphs' poles, rad/s."""
-    poles = np.concatenate([np.abs(np.linalg.eigvals(a)) for a, _, _, _ in graphs if a.shape[0]] or [np.ones(1)])
-    poles = poles[poles > 0]
-    return float(np.exp(np.mean(np.log(poles)))) if poles.size else 1.0
-
-
-def _on_circle(graph: StateSpace, scale: float) -> Complex:
-    """Return (points, rows, inputs) of [M; N] over the whole circle: the upper half, then its conjugate, mirrored."""
-    a, b, c, d = graph
-    points = 8 * LARGEST
-    omega = scale * np.tan((np.arange(points // 2) + 0.5) * np.pi / points)
-    if a.shape[0] == 0:
-        upper = np.broadcast_to(d.astype(complex), (omega.size, *d.shape))
-    else:
-        inner = 1j * omega[:, None, None] * np.eye(a.shape[0]) - a
-        upper = c @ np.linalg.solve(inner, np.broadcast_to(b, (omega.size, *b.shape))) + d
-    return np.concatenate([np.conj(upper[::-1]), upper])
-
-
-def _directed(graph: Complex, other: Complex, tolerance: float, least: float) -> float:
-    """sqrt(1 - s^2) with s the smallest singular value of the Toeplitz operator of other* graph, and not below `least`.
-
-    Where the operator's spectrum reaches down to s no sequence attains it and the bound rises as 1/size^2 at worst, so
-    that a third of the last rise is still to come: where that does not lead above the nu-gap, the gap is the nu-gap.
-    """
-    product = np.conj(np.swapaxes(other, 1, 2)) @ graph
-    points = product.shape[0]
-    squared = np.conj(np.swapaxes(product, 1, 2)) @ product
-    # T'T = Toeplitz(product* product) - H'H, H the Hankel operator of the coefficients before 0: all rows of T at once.
-    symbol, whole = _coefficients(product), _coefficients(squared)
-    m, best, size, settled = product.shape[1], -np.inf, 16, 0
-    while True:
-        lag = np.subtract.outer(np.arange(size), np.arange(size))
-        toeplitz = whole[lag % points].transpose(0, 2, 1, 3).reshape(size * m, size * m)
-        before_zero = -1 - np.add.outer(np.arange(LARGEST), np.arange(size))
-        rows = symbol[before_zero % points].transpose(0, 2, 1, 3).reshape(LARGEST * m, size * m)
-        smallest = float(np.linalg.eigvalsh(toeplitz - rows.T @ rows)[0])
-        before, best = best, float(np.sqrt(1.0 - min(max(smallest, 0.0), 1.0)))
-        to_come = abs(best - before) / 3.0
-        settled = settled + 1 if min(to_come, best + to_come - least) < tolerance else 0
-        if settled == 2:
-            return max(best, least)
-        if size == LARGEST:
-            break
-        size *= 2
-    raise LinearizationError(
-        "the gap does not settle",
-        expected=f"a value that stands still with {LARGEST} coefficients",
-        got=f"{best:.6g}, {abs(best - before):.2g} from the one before",
-        hint="ask for a coarser tolerance, compare reduced models, or use nu_gap",
-    )
-
-
-def _coefficients(values: Complex) -> Array:
-    """Fourier coefficients over the circle, those of negative order at the end.
-
-    s = scale (1 - z)/(1 + z) makes stable factors power series in z.
-    """
-    n = values.shape[0]
-    order = np.fft.fftfreq(n, 1.0 / n)
-    shift = np.exp(1j * order * (np.pi / n - np.pi))
-    return np.real(shift[:, None, None] * np.fft.ifft(values, axis=0))
-
-
 # --- the margin ---
 
 
@@ -245,7 +128,7 @@ def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Pea
     """Return the normalised coprime factor margin b(P, C) of a negative feedback loop, in [0, 1], and where it is least.
 
     1/b is the H-infinity norm of [I; C] (I + P C)^-1 [I, P]; b is 0 where the loop is not stable. A controller with
-    margin b suits every plant within a gap or nu-gap below b of P. Without a controller: the largest margin that any
+    margin b suits every plant within a nu-gap below b of P. Without a controller: the largest margin that any
     controller attains, sqrt(1 - |[M; N]|_H^2) (Glover and McFarlane 1989), whose omega is nan. Scale first, as for
     `nu_gap`. Raises LinearizationError where the sizes do not fit, or the loop is ill-posed.
     """
@@ -332,14 +215,14 @@ def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:
         middle = np.linalg.solve(eye + p @ c, np.concatenate([eye, p], axis=2))
         return np.linalg.svd(np.concatenate([middle, c @ middle], axis=1), compute_uv=False)[:, 0]
 
-    return peak_over(blocks, np.unique(np.concatenate([default_omega(m, 4000) for m in (plant, controller)])))
+    return peak_over(blocks, np.unique(np.concatenate([wide_omega(m, 4000) for m in (plant, controller)])))
 
 
 @dataclass(frozen=True)
 class ModelDistance(Coded):
     """Distance of a second model from a first one, between the same inputs and outputs.
 
-    nu_gap: in [0, 1], with its winding condition. gap: in [0, 1], None where it was not found. attainable: the largest
+    nu_gap: in [0, 1], with its winding condition. attainable: the largest
     normalised coprime factor margin that any controller of the first attains: where the nu-gap is below it, one
     controller can suit both. difference: L-infinity norm of first - second, in output per input units, None where it is
     infinite. relative: that over the norm of the first, None where there is none. notes: why a number is missing.
@@ -348,7 +231,6 @@ class ModelDistance(Coded):
     first: str = field(metadata=stored_as("model"))
     second: str = field(metadata=stored_as("other"))
     nu_gap: NuGap = field(metadata=INLINE)
-    gap: float | None
     attainable: float | None = field(metadata=stored_as("attainable_margin"))
     difference: Peak | None
     relative: float | None = field(metadata=stored_as("relative_difference"))
@@ -387,13 +269,11 @@ def compare(first: LinearModel, second: LinearModel) -> ModelDistance:
     """
     far = nu_gap(first, second)
     notes: list[str] = []
-    both: float | None = None
     attainable: float | None = None
     try:
         attainable = ncf_margin(first).value
-        both = gap(first, second)
     except LinearizationError as e:
-        notes.append(f"gap: {e.what}")
+        notes.append(f"attainable margin: {e.what}")
     apart, relative = None, None
     try:
         apart = linf_norm(difference(first, second))
@@ -401,19 +281,4 @@ def compare(first: LinearModel, second: LinearModel) -> ModelDistance:
         relative = apart.value / size if size > 0 else None
     except LinearizationError as e:
         notes.append(f"difference: {e.what}")
-    return ModelDistance(first.name, second.name, far, both, attainable, apart, relative, tuple(notes))
-
-
-def difference(first: LinearModel, second: LinearModel) -> LinearModel:
-    """Return the model first - second, delays in their Pade form. Raises LinearizationError where the sizes differ."""
-    same_channels(first, second)
-    a1, b1, c1, d1 = without_sliding_means(first)
-    a2, b2, c2, d2 = without_sliding_means(second)
-    return first.with_matrices(
-        scipy.linalg.block_diag(a1, a2) if a1.size or a2.size else np.zeros((0, 0)),
-        np.concatenate([b1, b2]),
-        np.concatenate([c1, -c2], axis=1),
-        d1 - d2,
-        point=None,
-        name=f"{first.name} - {second.name}",
-    )
+    return ModelDistance(first.name, second.name, far, attainable, apart, relative, tuple(notes))

@@ -1,20 +1,22 @@
 """Equations of an operating point with values fixed, free or bounded, and Newton's method and a homotopy that solve them.
 
-A plain steady state is found where simulation finds it, in `hvdc_ident.simulate.steady_state`.
+They are those of a model's graph and of an FMU alike: both answer `System.evaluate`. A plain steady state of a graph is found
+where simulation finds it, in `hvdc_ident.simulate.steady_state`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from typing import Literal, Protocol
 
 import numpy as np
 
 from hvdc_ident.errors import ModelError, SteadyStateError, require_known, unknown_name
-from hvdc_ident.linearize.system import Array, CompiledSystem, system
-from hvdc_ident.model import Model
-from hvdc_ident.simulate import ACCURACY
+from hvdc_ident.linearize.limits import Limit
+from hvdc_ident.linearize.system import Array, CompiledSystem, Layout, system
+from hvdc_ident.model import AnyModel, Model
 
 Equations = Callable[[Array], tuple[Array, Array]]
 SHORTEST = 2.0**-10
@@ -31,10 +33,9 @@ class Root:
     iterations: int
     method: str
 
-    @property
-    def found(self) -> bool:
-        """True where every scaled residual is below ACCURACY."""
-        return bool((self.shares < ACCURACY).all())
+    def reaches(self, accuracy: float) -> bool:
+        """Return whether every scaled residual is below the accuracy."""
+        return bool((self.shares < accuracy).all())
 
 
 def weights(jacobian: Array, v: Array) -> Array:
@@ -46,7 +47,7 @@ def weights(jacobian: Array, v: Array) -> Array:
 
 
 def newton(equations: Equations, v: Array, low: Array, high: Array, limit: int = 60) -> Root:
-    """Return the root near v within [low, high], or the best point reached: read `found`.
+    """Return the root near v within [low, high], or the best point reached: read `reaches`.
 
     Steps are exact Newton steps where the Jacobian is square and regular, else of least norm; each is halved until the
     scaled residual falls. A variable on a bound that the step would leave is held there.
@@ -114,8 +115,8 @@ def _step(jac: Array, r: Array, weight: Array, v: Array, low: Array, high: Array
     return step
 
 
-def homotopy(equations: Equations, v: Array, low: Array, high: Array) -> Root:
-    """Return the root reached from v while the residual at v is reduced to 0 step by step: read `found`.
+def homotopy(equations: Equations, v: Array, low: Array, high: Array, accuracy: float) -> Root:
+    """Return the root reached from v while the residual at v is reduced to 0 step by step: read `reaches`.
 
     For what Newton's method does not reach at once from a known operating point: each part of the way is solved from the
     one before, and halved where it is not.
@@ -132,7 +133,7 @@ def homotopy(equations: Equations, v: Array, low: Array, high: Array) -> Root:
 
         root = newton(shifted, v, low, high, 20)
         steps += root.iterations
-        if root.found:
+        if root.reaches(accuracy):
             v, share, part = root.v, ahead, 2.0 * part
         else:
             part *= 0.5
@@ -143,6 +144,32 @@ def homotopy(equations: Equations, v: Array, low: Array, high: Array) -> Root:
 At = Literal["steady", "start"]
 
 
+class System(Protocol):
+    """What a search for a point asks of a model, be it a graph or an FMU: names, and values and derivatives at a point.
+
+    accuracy: largest scaled residual that counts as a solution. with_rest, with_start: places of the states that have one.
+    """
+
+    states: tuple[str, ...]
+    unknowns: tuple[str, ...]
+    inputs: tuple[str, ...]
+    extras: tuple[str, ...]
+    parameters: tuple[str, ...]
+    outputs: tuple[str, ...]
+    layout: Layout
+    with_rest: tuple[int, ...]
+    with_start: tuple[int, ...]
+    accuracy: float
+
+    def evaluate(self, y: Array, w: Array, p: Array, parameters: Sequence[int] = ()) -> tuple[Array, Array]:
+        """Return values (rows,) and Jacobian (rows, columns + parameters), over [x, z, inputs, delays, sampled] and some parameters."""
+        ...
+
+    def limits(self, y: Array, w: Array, p: Array) -> tuple[Limit, ...]:
+        """Return every limiter that matters at the point, with its margin."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class EquilibriumSearch:
     """The unknowns v = [x, z, delays and sampled, freed inputs, freed parameters, bounded signals] and their equations.
@@ -150,7 +177,7 @@ class EquilibriumSearch:
     equation_rows: which rows of the system are asked to be 0, after that come the fixed signals, then the bounded ones.
     """
 
-    system: CompiledSystem
+    system: System
     at: At
     time: float
     u: Array
@@ -167,7 +194,7 @@ class EquilibriumSearch:
     start: Mapping[str, float]
 
     @classmethod
-    def of(
+    def of_model(
         cls,
         model: Model,
         fixed: Mapping[str, float],
@@ -182,6 +209,24 @@ class EquilibriumSearch:
         variables_of = (model.states, model.inputs, model.parameters, model.delays, model.sampled)
         signals = [n for n in (*fixed, *bounds) if not any(n in group for group in variables_of)]
         s = system(model, tuple(dict.fromkeys((*model.outputs, *signals))))
+        p = np.array([fixed.get(n, q.value) for n, q in model.parameters.items()], dtype=float)
+        return cls.of(model, s, fixed, free, bounds, _starts(model, s, p), at=at, moving=moving, time=time)
+
+    @classmethod
+    def of(
+        cls,
+        model: AnyModel,
+        s: System,
+        fixed: Mapping[str, float],
+        free: Collection[str],
+        bounds: Mapping[str, tuple[float, float]],
+        start: Mapping[str, float],
+        *,
+        at: At,
+        moving: Collection[str],
+        time: float,
+    ) -> EquilibriumSearch:
+        """Return the equations of a system that a model has. start: where states and unknowns are sought first. Raises as above."""
         _check(model, s, fixed, free, bounds, moving)
         size = s.layout
         inner = {n: k for k, n in enumerate((*s.states, *s.unknowns, *s.extras))}
@@ -211,7 +256,7 @@ class EquilibriumSearch:
             tuple(first + s.outputs.index(n) for n in bounded_signals),
             low,
             high,
-            _starts(model, s, p, bounds),
+            _all_starts(model, start, bounds),
         )
 
     @property
@@ -265,8 +310,9 @@ class EquilibriumSearch:
         """Return (residual, Jacobian) at v, modes from the values."""
         s, size = self.system, self.system.layout
         y, w, p = self.vectors(v)
-        m = s.modes(y, w, p)
-        values, full = s.values(y, w, p, m), self._columns(y, w, p, m)
+        values, full = s.evaluate(y, w, p, self.freed_p)
+        full = full[:, self._columns]
+        full = np.concatenate([full, np.zeros((size.rows, len(self.bounded_rows)))], axis=1)
         if size.ne:
             extra = slice(size.n, size.n + size.ne)
             values[extra] -= v[extra]
@@ -290,18 +336,12 @@ class EquilibriumSearch:
             jac = np.concatenate([jac, slack])
         return r, jac
 
-    def _columns(self, y: Array, w: Array, p: Array, m: Array) -> Array:
-        """Return (all rows, unknowns) of the Jacobian."""
-        s, size = self.system, self.system.layout
-        jac = s.jacobian(y, w, p, m)
-        if not (self.freed_u or self.freed_p or self.bounded_rows or size.ne):
-            return jac[:, : size.n]
-        columns = [*range(size.n), *range(size.n + size.nu, size.columns), *(size.n + k for k in self.freed_u)]
-        parts = [jac[:, columns]]
-        if self.freed_p:
-            parts.append(s.by_parameters(y, w, p, m)[:, list(self.freed_p)])
-        parts.append(np.zeros((size.rows, len(self.bounded_rows))))
-        return np.concatenate(parts, axis=1)
+    @cached_property
+    def _columns(self) -> list[int]:
+        """Places of the unknowns in a Jacobian, but for the bounded signals."""
+        size = self.system.layout
+        inner = [*range(size.n), *range(size.n + size.nu, size.columns)]
+        return [*inner, *(size.n + k for k in self.freed_u), *range(size.columns, size.columns + len(self.freed_p))]
 
     def by_parameters(self, v: Array, which: list[int]) -> Array:
         """Return (unknowns, parameters) derivatives of the solution by fixed parameters, by implicit differentiation.
@@ -309,10 +349,8 @@ class EquilibriumSearch:
         Where the Jacobian is singular (a state that rests anywhere) the change of least norm.
         """
         s = self.system
-        y, w, p = self.vectors(v)
-        m = s.modes(y, w, p)
         jac = self.equations(v)[1]
-        full = s.by_parameters(y, w, p, m)[:, which]
+        full = s.evaluate(*self.vectors(v), which)[1][:, s.layout.columns :]
         n_inner = len(self.fixed_places)
         right = np.concatenate(
             [
@@ -352,8 +390,7 @@ class EquilibriumSearch:
         s, size = self.system, self.system.layout
         k = len(self.bounded_rows)
         for _ in range(3 if size.ne or k else 0):
-            y, w, p = self.vectors(v)
-            values = s.values(y, w, p, s.modes(y, w, p))
+            values, _ = s.evaluate(*self.vectors(v))
             v = v.copy()
             if size.ne:
                 v[size.n : size.n + size.ne] = np.nan_to_num(values[size.n : size.n + size.ne])
@@ -362,19 +399,29 @@ class EquilibriumSearch:
         return v
 
 
-def _starts(model: Model, s: CompiledSystem, p: Array, bounds: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Return the starting value of each variable, as far as the model gives one."""
+def _starts(model: Model, s: CompiledSystem, p: Array) -> dict[str, float]:
+    """Return the starting value of each state and unknown, as far as the model gives one."""
     found = {n: st.guess for n, st in model.states.items() if st.guess is not None}
     found |= {s.states[k]: v for k, v in s.start_values(p).items() if np.isfinite(v)}
-    found |= {n: model.algebraic[n].start for n in s.unknowns}
-    found |= {n: i.value for n, i in model.inputs.items()} | {n: q.value for n, q in model.parameters.items()}
+    return found | {n: model.algebraic[n].start for n in s.unknowns}
+
+
+def _all_starts(
+    model: AnyModel, start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
+) -> dict[str, float]:
+    """Return these, the values of inputs and parameters, and the middle of bounds of what has none."""
+    found = {
+        **start,
+        **{n: i.value for n, i in model.inputs.items()},
+        **{n: q.value for n, q in model.parameters.items()},
+    }
     for n, (low, high) in bounds.items():
         if n not in found and np.isfinite(low + high):
             found[n] = 0.5 * (low + high)
     return found
 
 
-def _equation_rows(s: CompiledSystem, at: At, moving: Collection[str]) -> tuple[int, ...]:
+def _equation_rows(s: System, at: At, moving: Collection[str]) -> tuple[int, ...]:
     size = s.layout
     rest = {k: size.main + i for i, k in enumerate(s.with_rest)}
     start = {k: size.main + size.n_rest + i for i, k in enumerate(s.with_start)} if at == "start" else {}
@@ -383,8 +430,8 @@ def _equation_rows(s: CompiledSystem, at: At, moving: Collection[str]) -> tuple[
 
 
 def _check(
-    model: Model,
-    s: CompiledSystem,
+    model: AnyModel,
+    s: System,
     fixed: Mapping[str, float],
     free: Collection[str],
     bounds: Mapping[str, tuple[float, float]],
@@ -421,3 +468,48 @@ def _check(
             expected="as many freed inputs, parameters or moving states as fixed states and outputs",
             hint=f"free {len(constraints) - room} more input or parameter",
         )
+
+
+def solved(name: str, search: EquilibriumSearch, guess: Mapping[str, float], own: Array | None = None) -> Root:
+    """Return the root that the guess leads to, else one near the model's own steady state, else near its guesses.
+
+    name: of the model. Raises SteadyStateError, with the worst equation, where there is none.
+    """
+    best: Root | None = None
+    starts = search.guesses(guess)
+    near = (
+        None if own is None else search.guesses({**dict(zip(search.variables, own.tolist(), strict=False)), **guess})[0]
+    )
+    accuracy = search.system.accuracy
+
+    def continued(equations: Equations, v: Array, low: Array, high: Array) -> Root:
+        return homotopy(equations, v, low, high, accuracy)
+
+    tries: list[tuple[Callable[[Equations, Array, Array, Array], Root], Array | None]]
+    tries = [(newton, v) for v in ([*starts[:1], near, *starts[1:]] if guess else [near, *starts])]
+    tries += [(continued, v) for v in (near, *starts[:1])]
+    with np.errstate(all="ignore"):
+        for solve, v in tries:
+            if v is None:
+                continue
+            root = solve(search.equations, v, search.low, search.high)
+            if root.reaches(accuracy):
+                return root
+            best = root if best is None or root.shares.max() < best.shares.max() else best
+    assert best is not None
+    raise _not_found(name, search, best)
+
+
+def _not_found(name: str, search: EquilibriumSearch, root: Root) -> SteadyStateError:
+    worst = int(np.argmax(root.shares))
+    names = search.variables
+    on_bound = [n for n, v, a, b in zip(names, root.v, search.low, search.high, strict=True) if v in (a, b)]
+    bound = f"; on its bound: {', '.join(on_bound)}" if on_bound else ""
+    hint = "check the fixed values and limits, give a guess near the solution, or free another input"
+    return SteadyStateError(
+        "no operating point was found",
+        where=f"model '{name}'",
+        expected=f"every equation met to {search.system.accuracy:g} of its terms",
+        got=f"{search.rows[worst]} left with {root.residual[worst]:.3g} (scaled {root.shares[worst]:.2g}){bound}",
+        hint=hint if search.at == "start" else hint + "; states that need not rest can be named in `moving`",
+    )

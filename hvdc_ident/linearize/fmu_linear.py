@@ -1,4 +1,4 @@
-"""Operating point and linear model of a model-exchange FMU: Newton on its derivatives, its own Jacobian where that agrees.
+"""Equations and linear model of a model-exchange FMU, on its derivatives, and on its own Jacobian where that agrees.
 
 Effects at the FMU's ends are linearised by themselves and put in series with it.
 """
@@ -19,10 +19,11 @@ from hvdc_ident.errors import (
 )
 from hvdc_ident.fmu import FmuModel, FmuPoint, at_point, smooth_inputs
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.equilibrium import At, newton
+from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, solved
+from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-from hvdc_ident.linearize.operating_point import Bounds, OperatingPoint
-from hvdc_ident.linearize.system import Array
+from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.system import Array, Layout
 from hvdc_ident.model import External
 
 ACCURACY = 1e-9
@@ -45,142 +46,77 @@ def fmu_of(model: External) -> FmuModel:
     return model
 
 
-def find_point(
-    given: External,
-    fixed: Mapping[str, float],
-    free: Collection[str],
-    bounds: Bounds,
-    guess: Mapping[str, float],
-    at: At,
-    moving: Collection[str],
-    time: float,
-) -> OperatingPoint:
-    """Return the operating point; arguments as `find_operating_point`. The search begins where the FMU's initialisation ends.
+class FmuSystem:
+    """An FMU as a search for a point sees it (`equilibrium.System`): no unknowns, no delays, switches as they stand."""
 
-    at="start": the FMU stays there. Raises SteadyStateError, with the worst equation, where there is none.
-    """
-    model = fmu_of(given)
-    return _FmuSearch(model, dict(fixed), tuple(free), bounds, dict(guess), at, tuple(moving), time).point()
+    unknowns: tuple[str, ...] = ()
+    extras: tuple[str, ...] = ()
+    with_rest: tuple[int, ...] = ()
+    with_start: tuple[int, ...] = ()
+    accuracy = ACCURACY
 
+    def __init__(self, model: FmuModel) -> None:
+        self.model = model
+        self.states, self.inputs = tuple(model.states), tuple(model.inputs)
+        self.parameters, self.outputs = tuple(model.parameters), tuple(model.outputs)
+        self.layout = Layout(len(self.states), 0, len(self.inputs), 0, len(self.outputs), len(self.parameters), 0, 0)
+        self._smooth = [self.inputs.index(n) for n in smooth_inputs(model)]
 
-class _FmuSearch:
-    """Search for an operating point of an FMU: values held, values sought and their equations."""
+    def evaluate(self, y: Array, w: Array, p: Array, parameters: Sequence[int] = ()) -> tuple[Array, Array]:
+        """Return values (rows,) and Jacobian (rows, columns + parameters), 0 by inputs that change in steps.
 
-    def __init__(
-        self,
-        model: FmuModel,
-        fixed: dict[str, float],
-        free: tuple[str, ...],
-        bounds: Bounds,
-        guess: dict[str, float],
-        at: At,
-        moving: tuple[str, ...],
-        time: float,
-    ) -> None:
-        self.at, self.time = at, time
-        known = [*model.parameters, *model.inputs]
-        model = self.model = model.recording(n for n in fixed if n not in known and model.records(n))
-        for name in (*fixed, *guess, *bounds):
-            if name not in known and name not in model.states and name not in model.outputs:
-                everything = [*known, *model.states, *model.outputs]
-                raise unknown_name("variable", name, everything, where=f"model '{model.name}'")
-        require_known("parameter or input", free, known, f"model '{model.name}', free")
-        require_known("state", moving, model.states, f"model '{model.name}', moving")
-        self.states, self.outputs = list(model.states), list(model.outputs)
-        self.values = {n: v for n, v in fixed.items() if n in known}
-        self.held = {n: v for n, v in fixed.items() if n in model.states}
-        self.wanted = {n: v for n, v in fixed.items() if n in model.outputs and n not in self.held}
-        self.free_inputs = [n for n in free if n in model.inputs]
-        self.free_parameters = [n for n in free if n in model.parameters]
-        smooth = smooth_inputs(model)
-        for name in self.free_inputs:
-            if name not in smooth:
-                raise SteadyStateError(f"'{name}' changes in steps only and cannot be sought", where="free")
-        self.inputs = list(smooth)
-        self.rest = [] if at == "start" else [n for n in self.states if n not in moving]
-        self.open = [] if at == "start" else [n for n in self.states if n not in self.held]
-        self.guess, self.bounds = guess, bounds
-        self.last: FmuPoint | None = None
-
-    def point(self) -> OperatingPoint:
-        first = self._evaluate(self.values, None)
-        x0 = first.x.copy()
-        for name, value in {**self.guess, **self.held}.items():
-            if name in self.states:
-                x0[self.states.index(name)] = value
-        self.x, sought = x0, [*self.open, *self.free_inputs, *self.free_parameters]
-        if not sought:
-            found = self._evaluate(self.values, x0 if self.held or self.guess else None)
-            return self._made(found, self.values, 0.0, 0)
-        own = self.model.values | {n: i.value for n, i in self.model.inputs.items()}
-        start = {**own, **dict(zip(self.states, x0.tolist(), strict=True)), **self.values, **self.guess}
-        v = np.array([start[n] for n in sought])
-        low, high = (np.array([self.bounds.get(n, (-np.inf, np.inf))[k] for n in sought]) for k in (0, 1))
-        with np.errstate(all="ignore"):
-            root = newton(self._equations, v, low, high)
-        assert self.last is not None
-        if not (root.shares < ACCURACY).all():
-            raise self._not_found(root.residual, root.shares)
-        values, x = self._placed(root.v)
-        return self._made(self._evaluate(values, x), values, float(root.shares.max(initial=0.0)), root.iterations)
-
-    def _placed(self, v: Array) -> tuple[dict[str, float], Array]:
-        n = len(self.open)
-        x = self.x.copy()
-        x[[self.states.index(s) for s in self.open]] = v[:n]
-        return {**self.values, **dict(zip([*self.free_inputs, *self.free_parameters], v[n:].tolist(), strict=True))}, x
-
-    def _equations(self, v: Array) -> tuple[Array, Array]:
-        values, x = self._placed(v)
+        Both are nan where the FMU refuses the point. Raises SimulationError where it cannot be run.
+        """
+        size = self.layout
+        jac = np.zeros((size.rows, size.columns + len(parameters)))
+        given = dict(zip((*self.parameters, *self.inputs), (*p.tolist(), *w[1:].tolist()), strict=True))
+        names = [self.parameters[k] for k in parameters]
         try:
-            p = self.last = self._evaluate(values, x)
+            found = at_point(self.model, given, y, self.outputs, names, float(w[0]), check=False)
         except SimulationError as e:
             if "returned" not in e.what:  # the FMU refused the point, which ends nothing: Newton takes a shorter step
                 raise
-            count = len(self.rest) + len(self.wanted)
-            return np.full(count, np.nan), np.full((count, v.size), np.nan)
-        rows = [self.states.index(n) for n in self.rest]
-        lower = [len(self.states) + self.outputs.index(n) for n in self.wanted]
-        nx, nu = len(self.states), len(self.inputs)
-        columns = [
-            *(self.states.index(n) for n in self.open),
-            *(nx + self.inputs.index(n) for n in self.free_inputs),
-            *(nx + nu + k for k in range(len(self.free_parameters))),
-        ]
-        shown = [p.outputs[self.outputs.index(n)] - value for n, value in self.wanted.items()]
-        return np.concatenate([p.derivatives[rows], shown]), p.jacobian[np.ix_([*rows, *lower], columns)]
+            return np.full(size.rows, np.nan), np.full(jac.shape, np.nan)
+        places = [*range(size.nx), *(size.nx + k for k in self._smooth), *range(size.columns, jac.shape[1])]
+        jac[:, places] = found.jacobian
+        return np.concatenate([found.derivatives, found.outputs]), jac
 
-    def _evaluate(self, values: Mapping[str, float], x: Array | None) -> FmuPoint:
-        return at_point(self.model, values, x, self.outputs, self.free_parameters, self.time, check=False)
+    def limits(self, y: Array, w: Array, p: Array) -> tuple[Limit, ...]:
+        """Return none: an FMU does not show them."""
+        return ()
 
-    def _not_found(self, residual: Array, shares: Array) -> SteadyStateError:
-        names = [*(f"d({n})/dt" for n in self.rest), *(f"output {n}" for n in self.wanted)]
-        worst = int(np.argmax(shares))
-        return SteadyStateError(
-            "no operating point was found",
-            where=f"model '{self.model.name}'",
-            expected=f"every derivative at rest to {ACCURACY:g} of its terms",
-            got=f"{names[worst]} left with {residual[worst]:.3g} (scaled {shares[worst]:.2g})",
-            hint="check the fixed values, give a guess near the solution, or name states that need not rest in `moving`",
-        )
 
-    def _made(self, p: FmuPoint, values: Mapping[str, float], residual: float, iterations: int) -> OperatingPoint:
-        m = self.model
-        return OperatingPoint(
-            m,
-            FrozenMap(zip(self.states, p.x.tolist(), strict=True)),
-            FrozenMap(),
-            FrozenMap(),
-            FrozenMap({n: float(values.get(n, i.value)) for n, i in m.inputs.items()}),
-            FrozenMap(zip(self.outputs, p.outputs.tolist(), strict=True)),
-            FrozenMap({n: float(values.get(n, q.value)) for n, q in m.parameters.items()}),
-            residual,
-            (),
-            iterations,
-            "newton" if iterations else "as initialised",
-            self.at,
-            self.time,
-        )
+def fmu_search(
+    given: External,
+    fixed: Mapping[str, float],
+    free: Collection[str],
+    bounds: Mapping[str, tuple[float, float]],
+    guess: Mapping[str, float],
+    *,
+    at: At,
+    moving: Collection[str],
+    time: float,
+) -> tuple[FmuModel, EquilibriumSearch]:
+    """Return the FMU, with fixed variables recorded, and the search for its point, which begins where its initialisation ends.
+
+    at="start": the FMU stays there. Raises UnknownNameError, SteadyStateError for a free input that changes in steps.
+    """
+    model = fmu_of(given)
+    known = [*model.parameters, *model.inputs]
+    model = model.recording(n for n in fixed if n not in known and model.records(n))
+    everything = [*known, *model.states, *model.outputs]
+    for name in (*fixed, *guess, *bounds):
+        if name not in everything:
+            raise unknown_name("variable", name, everything, where=f"model '{model.name}'")
+    for name in free:
+        if name in model.inputs and name not in smooth_inputs(model):
+            raise SteadyStateError(f"'{name}' changes in steps only and cannot be sought", where="free")
+    s = FmuSystem(model)
+    begin = at_point(model, {n: v for n, v in fixed.items() if n in known}, None, s.outputs, (), time, check=False)
+    start = dict(zip(s.states, begin.x.tolist(), strict=True))
+    if at == "start":
+        fixed, moving = {**start, **{n: v for n, v in guess.items() if n in start}, **fixed}, s.states
+    return model, EquilibriumSearch.of(model, s, fixed, free, bounds, start, at=at, moving=moving, time=time)
 
 
 def linear_model(
@@ -267,10 +203,11 @@ def _gradient(
     low, high = model.parameters[name].min, model.parameters[name].max
 
     def at(value: float) -> list[Array]:
-        there = find_point(
-            model, {**held, name: value}, (), {}, guess if point.at == "steady" else {}, point.at, (), point.time
-        )
-        return list(_matrices(model, _at(model, there, outputs), inputs))
+        moved = {**held, name: value}
+        near = guess if point.at == "steady" else {}
+        _, search = fmu_search(model, moved, (), {}, near, at=point.at, moving=(), time=point.time)
+        states = solved(model.name, search, near).v
+        return list(_matrices(model, at_point(model, moved, states, outputs, (), point.time), inputs))
 
     def slope(h: float) -> list[Array]:
         here = held[name]

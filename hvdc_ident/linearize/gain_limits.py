@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 from hvdc_ident.linearize.characteristic import spectral_radius
 from hvdc_ident.linearize.stability import Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array
+from hvdc_ident.linearize.zeros import zeros
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,6 @@ def crossing_frequencies(a: Array, b: Array, c: Array, d: Array) -> Array:
 
     They are the zeros on the imaginary axis of L(s) - L(-s) and of 1 - L(s) L(-s).
     """
-    from hvdc_ident.linearize.transfer_function import zeros
-
     n = a.shape[0]
     if n == 0:
         return np.zeros(0)

@@ -18,9 +18,10 @@ from hvdc_ident.errors import LinearizationError, WaveformError, unknown_name
 from hvdc_ident.expression import TIME, parse, symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.frequency import FrequencyResponse, sensitivity
-from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point
+from hvdc_ident.linearize.linearisation import linearize
+from hvdc_ident.linearize.operating_point import find_operating_point
+from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import AnyModel, Model, Output, fresh, rewritten
 from hvdc_ident.parameters import Input

@@ -57,7 +57,6 @@ class Limit(Coded):
         return f"{self.signal}: {self.expression} {side} {self.level}, margin {self.margin:.6g}"
 
 
-
 def conditions(structure: ModelEquations) -> tuple[Condition, ...]:
     """Return the meaning of every switch of a structure, in the order of the switches; made before its code is compiled."""
     g = structure.graph

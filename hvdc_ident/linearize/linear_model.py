@@ -1,31 +1,33 @@
-"""The linear model: matrices with names, units, operating point and provenance, and its analysis as methods."""
+"""The linear model: matrices with names, units, operating point and provenance, and the algebra of these."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.linalg
 
 from hvdc_ident.display import Shown, Table, first_rows
-from hvdc_ident.errors import LinearizationError, unknown_name
+from hvdc_ident.errors import LinearizationError, ModelError, unknown_name
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.lazy import method
 from hvdc_ident.linearize.delays import DelayFreePart, eliminate
-from hvdc_ident.linearize.operating_point import OperatingPoint
+from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:
     import control
 
-    from hvdc_ident.linearize.frequency import FrequencyResponse
-    from hvdc_ident.linearize.loops import LoopMargins, Margins
-    from hvdc_ident.linearize.modal import Mode
-    from hvdc_ident.linearize.reduction import Reduction
-    from hvdc_ident.linearize.stability import Characteristic, Stability
-    from hvdc_ident.linearize.transfer_function import TransferFunction
+    from hvdc_ident.linearize import export, frequency, loops, modal, plot, reduction, transfer_function, zeros
+
+
+SCHEMA = 1
+KINDS = ("state", "input", "output")
+"""What has names and units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,133 +244,42 @@ class LinearModel(Shown):
             states=list(names), inputs=list(self.input_names), outputs=list(self.output_names),
         )  # fmt: skip
 
-    # --- analysis ---
-
     @cached_property
     def characteristic(self) -> Characteristic:
         """The exact characteristic equation of a model with delays; poles, modes and stability rest on one search for its roots."""
-        from hvdc_ident.linearize.stability import Characteristic as Equation
-
         assert self.delay_free is not None
-        return Equation.of(self.delay_free.without_zero_delays())
+        return Characteristic.of(self.delay_free.without_zero_delays())
 
-    def poles(self) -> Array:
-        """Return (states,) complex eigenvalues in rad/s; those of the pencil without the infinite ones for a descriptor.
+    # --- analysis: functions of other modules, bound when they are first asked for ---
 
-        With delays: the rightmost roots of the exact characteristic equation, at least one for each state and five for each delay.
-        """
-        from hvdc_ident.linearize.modal import poles
-
-        return poles(self)
-
-    def stability(self) -> Stability:
-        """Return the verdict on stability, delays exact, with the number of roots right of the imaginary axis."""
-        from hvdc_ident.linearize.modal import stability_of
-
-        return stability_of(self)
-
-    def zeros(self) -> Array:
-        """Complex invariant zeros of the whole system, rad/s."""
-        from hvdc_ident.linearize.transfer_function import zeros
-
-        return zeros(*self.standard())
-
-    def modes(self) -> tuple[Mode, ...]:
-        """Every mode: eigenvalue, frequency, damping, participation, shape, and its derivative by known parameters."""
-        from hvdc_ident.linearize.modal import modes
-
-        return modes(self)
-
-    def transfer_function(self, input: str | None = None, output: str | None = None) -> TransferFunction:
-        """Zeros, poles and gain from an input to an output; the names may be left out where there is only one."""
-        from hvdc_ident.linearize.transfer_function import transfer_function
-
-        return transfer_function(self, input or self._only("input"), output or self._only("output"))
-
-    def _only(self, kind: str) -> str:
-        names = self.input_names if kind == "input" else self.output_names
-        if len(names) != 1:
-            raise LinearizationError(
-                f"which {kind}?", where=f"linear model '{self.name}'", expected=f"one of {', '.join(names)}"
-            )
-        return names[0]
-
-    def response(self, omega: Array) -> Array:
-        """Return (frequencies, outputs, inputs) complex transfer matrix at omega in rad/s, delays exact."""
-        from hvdc_ident.linearize.frequency import transfer
-
-        return transfer(self, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
-
-    def bode(
-        self,
-        omega: Array | None = None,
-        *,
-        covariance: Array | None = None,
-        parameters: Sequence[str] = (),
-    ) -> FrequencyResponse:
-        """Return the frequency response at omega in rad/s (default: around the poles), with units; it draws itself.
-
-        covariance: (k, k) of parameters in their units, in the order of `parameters`, whose derivatives the model must
-        have (`linearize(..., sensitivities=...)`): the response then has the standard deviation that follows, as a band.
-        """
-        from hvdc_ident.linearize.frequency import bands, default_omega, frequency_response
-
-        if covariance is None:
-            return frequency_response(self, omega)
-        return bands(self, default_omega(self) if omega is None else omega, covariance, parameters)
-
-    def sigma(self, omega: Array | None = None) -> tuple[Array, Array]:
-        """Return (omega, singular values), (n,) and (n, k), largest first, of the transfer matrix."""
-        from hvdc_ident.linearize.frequency import sigma
-
-        return sigma(self, omega)
-
-    def margins(self, break_at: str | Sequence[str] | None = None) -> Margins | LoopMargins:
-        """Return gain, phase, delay, modulus and disk margins; of several loops together with their common disk margin.
-
-        break_at: the signal (or signals) of the model at which its closed loops are opened. Without it this linear model
-        is taken for an open loop L with negative unit feedback. Raises LinearizationError where it is neither.
-        """
-        from hvdc_ident.linearize.loops import loop, loop_margins, margins
-        from hvdc_ident.model import Model
-
-        if break_at is None:
-            return margins(self) if self.B.shape[1] == self.C.shape[0] == 1 else loop_margins(self)
-        if self.point is None or not isinstance(self.point.model, Model):
-            raise LinearizationError(
-                "a loop can be opened only in a model with equations",
-                where=f"linear model '{self.name}'",
-                hint="margins() without a signal takes this linear model for the open loop",
-            )
-        opened = loop(self.point.model, break_at, self.point)
-        return margins(opened) if isinstance(break_at, str) else loop_margins(opened)
-
-    def norms(self) -> dict[str, Any]:
-        """Return the H2, H-infinity and L-infinity norms, None with the reason where one does not exist."""
-        from hvdc_ident.linearize.reduction import norms
-
-        return norms(self)
-
-    def reduce(self, order: int | None = None, tolerance: float | None = None, *, match_dc: bool = False) -> Reduction:
-        """Return a balanced model of fewer states: so many, or as few as keep the error within the tolerance.
-
-        See `hvdc_ident.linearize.reduction.balanced`.
-        """
-        from hvdc_ident.linearize.reduction import balanced
-
-        return balanced(self, order, tolerance, match_dc=match_dc)
-
-    def save(self, path: str | Path) -> Path:
-        """Write the model in the format of the path's ending (.mat, .json, .csv, .m, .mo, .tex, .zpk) and return the path."""
-        from hvdc_ident.linearize.export import write
-
-        return write(self, path)
-
-    def plot(self, kind: str = "bode", ax: Any = None) -> Any:
-        """Return the axes of a drawing: "bode" (two: gain and phase, as is `ax`), "nyquist", "poles" or "participation"."""
-        from hvdc_ident.linearize.plot import draw
-
-        return draw(self, kind, ax)
+    if TYPE_CHECKING:
+        poles = modal.poles
+        stability = modal.stability_of
+        zeros = zeros.zeros_of
+        modes = modal.modes
+        transfer_function = transfer_function.transfer_function
+        response = frequency.response
+        bode = frequency.bode
+        sigma = frequency.sigma
+        margins = loops.margins_of
+        norms = reduction.norms
+        reduce = reduction.reduced
+        save = export.write
+        plot = plot.draw
+    else:
+        poles = method("hvdc_ident.linearize.modal.poles")
+        stability = method("hvdc_ident.linearize.modal.stability_of")
+        zeros = method("hvdc_ident.linearize.zeros.zeros_of")
+        modes = method("hvdc_ident.linearize.modal.modes")
+        transfer_function = method("hvdc_ident.linearize.transfer_function.transfer_function")
+        response = method("hvdc_ident.linearize.frequency.response")
+        bode = method("hvdc_ident.linearize.frequency.bode")
+        sigma = method("hvdc_ident.linearize.frequency.sigma")
+        margins = method("hvdc_ident.linearize.loops.margins_of")
+        norms = method("hvdc_ident.linearize.reduction.norms")
+        reduce = method("hvdc_ident.linearize.reduction.reduced")
+        save = method("hvdc_ident.linearize.export.write")
+        plot = method("hvdc_ident.linearize.plot.draw")
 
     def _screen(self) -> Iterator[str | Table]:
         def listed(names: tuple[str, ...]) -> str:
@@ -385,16 +296,65 @@ class LinearModel(Shown):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the model as plain lists, with names, units, operating point and provenance."""
-        from hvdc_ident.linearize.export.json_text import to_dict
-
-        return to_dict(self)
+        point = {} if self.point is None else {"operating_point": self.point.to_dict()}
+        return {
+            "schema": SCHEMA,
+            "kind": "linear-model",
+            "model": self.name,
+            "equation": "E dx/dt = A x + B u, y = C x + D u, deviations from x0, u0, y0; time in s",
+            **{k: getattr(self, k).tolist() for k in "ABCDE"},
+            **{f"{k}_{w}": list(getattr(self, f"{k}_{w}")) for w in ("names", "units") for k in KINDS},
+            **{k: list(getattr(self, k)) for k in ("x0", "u0", "y0")},
+            "provenance": dict(self.provenance),
+            **point,
+        }
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LinearModel:
         """Return the model that `to_dict` wrote, without its operating point. Raises ModelError for anything else."""
-        from hvdc_ident.linearize.export.json_text import from_dict
+        if not isinstance(data, Mapping) or data.get("schema") != SCHEMA or "A" not in data:
+            raise ModelError(
+                "this is no linear model",
+                where="linear model",
+                expected=f"a JSON object with schema {SCHEMA} and A, B, C, D",
+            )
+        try:
+            fields: dict[str, Any] = {k: data[k] for k in "ABCDE"}
+            fields |= {f"{k}_{w}": tuple(data[f"{k}_{w}"]) for k in KINDS for w in ("names", "units")}
+            fields |= {k: tuple(data[k]) for k in ("x0", "u0", "y0")}
+            return cls(**fields, name=data["model"], provenance=FrozenMap(data.get("provenance", {})))
+        except (KeyError, TypeError, ValueError) as e:
+            raise ModelError(
+                "the linear model is incomplete", where="linear model", got=f"{type(e).__name__}: {e}"
+            ) from None
 
-        return from_dict(dict(data))
+
+def approximate_poles(model: LinearModel) -> Array:
+    """Return (n,) complex eigenvalues of the state space, rad/s, in which a delay stands as its Pade approximant."""
+    if model.A.shape[0] == 0:
+        return np.zeros(0, dtype=complex)
+    if not model.is_descriptor:
+        return np.asarray(np.linalg.eigvals(model.A), dtype=complex)
+    alpha, beta = scipy.linalg.eigvals(model.A, model.E, homogeneous_eigvals=True)
+    return np.asarray(alpha[finite(alpha, beta)] / beta[finite(alpha, beta)], dtype=complex)
+
+
+def finite(alpha: Array, beta: Array) -> Array:
+    """Return a mask of the generalised eigenvalues alpha/beta that are finite."""
+    return np.asarray(np.abs(beta) > 1e-10 * np.maximum(np.abs(alpha), np.abs(beta)).clip(1e-300) * 1e-2)
+
+
+def gradient_of(model: LinearModel, parameter: str) -> Gradient:
+    """Return the derivatives of A, B, C, D by a parameter; raises where the model was linearised without it."""
+    if parameter not in model.gradients:
+        if model.point is not None and parameter in model.point.parameters:
+            raise LinearizationError(
+                f"the derivatives by '{parameter}' were not asked for",
+                where=f"linear model '{model.name}'",
+                hint=f"linearize(..., sensitivities=['{parameter}'])",
+            )
+        raise unknown_name("parameter", parameter, model.gradients, where=f"linear model '{model.name}'")
+    return model.gradients[parameter]
 
 
 def _eigenvalue(value: complex) -> str:

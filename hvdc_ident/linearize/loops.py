@@ -1,8 +1,8 @@
 """Loops opened at named signals, and their stability margins.
 
 Open-loop transfer, sensitivity and complementary sensitivity; plant and controller; gain, phase, delay, modulus and disk
-margin of each loop, and the disk margin of all together. python-control 0.10.2 without Slycot was measured and does not do:
-it finds a false gain margin of 3e-6 on the link, and has no disk margin of several loops.
+margin of each loop, and the disk margin of all together. python-control 0.10.2 finds a false gain margin of 3e-6 on the link, and
+Slycot's bound for the disk margin of several loops is up to 1e-3 above this one (`benchmarks/linear_library.py`).
 """
 
 from __future__ import annotations
@@ -18,12 +18,13 @@ from scipy.sparse.csgraph import connected_components
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, transfer
+from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, transfer, wide_omega
 from hvdc_ident.linearize.gain_limits import FLOOR, NONE, Closing, Crossing, crossing_frequencies, refined
-from hvdc_ident.linearize.jacobian import linearize
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.operating_point import OperatingPoint, find_operating_point, point_at
-from hvdc_ident.linearize.reduction import without_sliding_means
+from hvdc_ident.linearize.linearisation import linearize
+from hvdc_ident.linearize.operating_point import find_operating_point, point_at, signal_value
+from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.realisation import without_sliding_means
 from hvdc_ident.linearize.stability import Characteristic, Stability, sliding_means, stability
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import Model, Output, State, driven, fresh
@@ -162,7 +163,7 @@ def plant_and_controller(
     k = len(inputs)
     names = both.output_names
     returned_inputs, returned_outputs = names[:k], names[k:]
-    w = default_omega(both, 50)
+    w = wide_omega(both, 50)
     values = np.abs(transfer(both, 1j * w))
     size = np.maximum(values.max(axis=0), 1e-300)
     for part in ((slice(0, k), slice(0, k)), (slice(k, None), slice(k, None))):
@@ -179,25 +180,6 @@ def plant_and_controller(
     plant = back.channel(list(inputs), list(returned_outputs))
     controller = both.channel(list(outputs), list(returned_inputs))
     return plant, controller
-
-
-def signal_value(model: Model, point: OperatingPoint, name: str) -> float:
-    """Return the value of any name at an operating point."""
-    return signal_values(model, point, (name,))[name]
-
-
-def signal_values(model: Model, point: OperatingPoint, names: Sequence[str]) -> dict[str, float]:
-    """Return the values of any names at an operating point."""
-    from hvdc_ident.linearize.system import system
-
-    known = {**point.states, **point.unknowns, **point.extras, **point.inputs, **point.parameters}
-    asked = tuple(n for n in names if n not in known)
-    found = {n: float(known[n]) for n in names if n in known}
-    if asked:
-        s = system(model, asked)
-        shown = s.values(point.y, point.w, point.p, s.modes(point.y, point.w, point.p))[s.layout.n + s.layout.ne :]
-        found |= {n: float(v) for n, v in zip(s.outputs, shown, strict=False)}
-    return found
 
 
 # --- stability margins ---
@@ -391,6 +373,24 @@ def margins(loop: Loop | LinearModel, omega: Array | None = None) -> Margins:
     return _of_curve(values, _grid(model, closing, omega), closing)
 
 
+def margins_of(model: LinearModel, break_at: str | Sequence[str] | None = None) -> Margins | LoopMargins:
+    """Return gain, phase, delay, modulus and disk margins; of several loops together with their common disk margin.
+
+    break_at: the signal (or signals) of the model at which its closed loops are opened. Without it this linear model
+    is taken for an open loop L with negative unit feedback. Raises LinearizationError where it is neither.
+    """
+    if break_at is None:
+        return margins(model) if model.B.shape[1] == model.C.shape[0] == 1 else loop_margins(model)
+    if model.point is None or not isinstance(model.point.model, Model):
+        raise LinearizationError(
+            "a loop can be opened only in a model with equations",
+            where=f"linear model '{model.name}'",
+            hint="margins() without a signal takes this linear model for the open loop",
+        )
+    opened = loop(model.point.model, break_at, model.point)
+    return margins(opened) if isinstance(break_at, str) else loop_margins(opened)
+
+
 def open_equation(model: LinearModel) -> Characteristic:
     """Return the characteristic equation of open loops, to be closed; sliding means of models with delays left in it.
 
@@ -470,7 +470,7 @@ def _grid(model: LinearModel, closing: Closing, omega: Array | None) -> Array:
     """Return the frequencies at which curves are computed first: around open and closed poles, and beside crossings."""
     if omega is not None:
         return np.asarray(omega, dtype=float)
-    own = default_omega(model, 4000)
+    own = wide_omega(model, 4000)
     closed = np.abs(closing.open.closed(np.ones(closing.open.through.shape[0])).roots.values)
     closed = closed[closed > 1e-6 * own[0]]
     beyond = [np.geomspace(own[-1], 30.0 * v, 200) for v in (closed.max(initial=0.0),) if 30.0 * v > own[-1]]

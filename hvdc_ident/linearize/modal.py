@@ -8,61 +8,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.linearize import delayed_modes
 from hvdc_ident.linearize.delayed_locus import crossings, followed
+from hvdc_ident.linearize.derivatives import characteristic, state_matrix
 from hvdc_ident.linearize.equilibrium import EquilibriumSearch
-from hvdc_ident.linearize.jacobian import characteristic, state_matrix
-from hvdc_ident.linearize.operating_point import ZERO, steady
-from hvdc_ident.linearize.stability import Characteristic, Stability, stability
+from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles
+from hvdc_ident.linearize.mode import Mode
+from hvdc_ident.linearize.operating_point import steady
+from hvdc_ident.linearize.plot import locus
+from hvdc_ident.linearize.stability import ZERO, Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array, CompiledSystem
 from hvdc_ident.model import Model
 
-if TYPE_CHECKING:
-    from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-
-
 ON_AXIS = (1e-9, 1e-6)
 """1/s left and right of the imaginary axis within which an eigenvalue of A counts as on it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Mode(Coded):
-    """One eigenvalue in rad/s, with damping, participation, shape and kind.
-
-    frequency_hz: of the oscillation, 0 for a real one. damping: -Re/|lambda|, 0 for a zero eigenvalue.
-    participation: share of each state, they sum to 1. shape: the right eigenvector, its largest entry 1.
-    sensitivity: d(lambda)/dp by parameter. kind: "oscillation", "decay", "growth", "growing oscillation",
-    or what a zero eigenvalue is: "free integrator", "hidden integrator" (nothing reaches it), "saturated state", "angle
-    reference or unobserved integrator", "undriven integrator", "sliding mean (cancelled by its delay)".
-    """
-
-    eigenvalue: complex
-    frequency_hz: float
-    damping: float
-    participation: FrozenMap[float]
-    shape: FrozenMap[complex]
-    sensitivity: FrozenMap[complex]
-    kind: str
-
-    @property
-    def time_constant(self) -> float:
-        """1/|Re lambda| in s, infinite on the imaginary axis."""
-        return 1.0 / abs(self.eigenvalue.real) if self.eigenvalue.real else float("inf")
-
-    @property
-    def dominant(self) -> str:
-        """The state that takes part most."""
-        return max(self.participation, key=lambda n: self.participation[n])
-
 
 
 def poles(model: LinearModel) -> Array:
@@ -73,16 +41,6 @@ def poles(model: LinearModel) -> Array:
     if model.delay_free is not None:
         return model.characteristic.roots.values
     return approximate_poles(model)
-
-
-def approximate_poles(model: LinearModel) -> Array:
-    """Return (n,) complex eigenvalues of the state space, rad/s, in which a delay stands as its Pade approximant."""
-    if model.A.shape[0] == 0:
-        return np.zeros(0, dtype=complex)
-    if not model.is_descriptor:
-        return np.asarray(np.linalg.eigvals(model.A), dtype=complex)
-    alpha, beta = scipy.linalg.eigvals(model.A, model.E, homogeneous_eigvals=True)
-    return np.asarray(alpha[finite(alpha, beta)] / beta[finite(alpha, beta)], dtype=complex)
 
 
 def stability_of(model: LinearModel) -> Stability:
@@ -97,11 +55,6 @@ def stability_of(model: LinearModel) -> Stability:
         "stable" if first.real < -ON_AXIS[0] else "on the limit of stability" if first.real < ON_AXIS[1] else "unstable"
     )
     return Stability(verdict, int((values.real >= ON_AXIS[1]).sum()), first)
-
-
-def finite(alpha: Array, beta: Array) -> Array:
-    """Return a mask of the generalised eigenvalues alpha/beta that are finite."""
-    return np.asarray(np.abs(beta) > 1e-10 * np.maximum(np.abs(alpha), np.abs(beta)).clip(1e-300) * 1e-2)
 
 
 def eigen(a: Array) -> tuple[Array, Array, Array]:
@@ -126,9 +79,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     A model with delays has infinitely many; these are the rightmost ones, at least as many as it has states.
     """
     if model.delay_free is not None:
-        from hvdc_ident.linearize.delayed_modes import modes as delayed
-
-        return delayed(model)
+        return delayed_modes.modes(model)
     names = model.state_names
     if model.is_descriptor:
         a, b, c, d = model.standard()
@@ -206,19 +157,6 @@ def sensitivities(values: Array, right: Array, left: Array, da: Array) -> Array:
         sound = np.linalg.norm(left[cluster], axis=1).max() * np.linalg.norm(right[:, cluster], axis=0).max() < 1e6
         slope[cluster] = np.linalg.eigvals(block) if sound else np.trace(block) / cluster.size
     return np.asarray(slope)
-
-
-def gradient_of(model: LinearModel, parameter: str) -> Gradient:
-    """Return the derivatives of A, B, C, D by a parameter; raises where the model was linearised without it."""
-    if parameter not in model.gradients:
-        if model.point is not None and parameter in model.point.parameters:
-            raise LinearizationError(
-                f"the derivatives by '{parameter}' were not asked for",
-                where=f"linear model '{model.name}'",
-                hint=f"linearize(..., sensitivities=['{parameter}'])",
-            )
-        raise unknown_name("parameter", parameter, model.gradients, where=f"linear model '{model.name}'")
-    return model.gradients[parameter]
 
 
 # --- names ---
@@ -300,10 +238,7 @@ class RootLocus(Coded):
 
     def plot(self, ax: Any = None) -> Any:
         """Return the axes with the locus."""
-        from hvdc_ident.linearize.plot import locus
-
         return locus(self, ax=ax)
-
 
 
 def root_locus(
@@ -352,7 +287,7 @@ class _Along:
         self.model, self.parameter = model, parameter
         own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
         start = {parameter: own.value}
-        self._search = EquilibriumSearch.of(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
+        self._search = EquilibriumSearch.of_model(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
         names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
         self._place = names.index(parameter)
 
@@ -370,6 +305,7 @@ class _Along:
             root, _ = steady(self.model, search)
         except SteadyStateError as e:
             raise e.at(f"{self.parameter} = {value:g}") from None
+        assert isinstance(search.system, CompiledSystem)
         return search.system, search.vectors(root.v)
 
     def matrix(self, value: float) -> Array:

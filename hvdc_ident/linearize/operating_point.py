@@ -1,119 +1,22 @@
-"""Operating points: any state, unknown, input, output or parameter fixed, free or bounded; exact Jacobians; trim."""
+"""Search for operating points: any state, unknown, input, output or parameter fixed, free or bounded; exact Jacobians; trim."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Any, Literal
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from hvdc_ident.display import Shown, Table, first_rows
-from hvdc_ident.errors import LinearizationError, SteadyStateError, require_known, unknown_name
+from hvdc_ident.errors import SteadyStateError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.equilibrium import At, Equations, EquilibriumSearch, Root, homotopy, newton, weights
-from hvdc_ident.linearize.limits import Limit, limits
-from hvdc_ident.linearize.stability import Characteristic, stability
-from hvdc_ident.linearize.system import Array
+from hvdc_ident.linearize.derivatives import constants
+from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root, solved, weights
+from hvdc_ident.linearize.jacobian import linear_at
+from hvdc_ident.linearize.point import Branch, OperatingPoint
+from hvdc_ident.linearize.system import Array, system
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate import ACCURACY, Equilibria, equilibria, resting
+from hvdc_ident.simulate import equilibria, resting
 
 Bounds = Mapping[str, tuple[float, float]]
-Side = Literal["here", "below", "above"]
-Branch = Literal["own", "unconnected", "other", "trimmed"]
-ZERO = 1e-8
-"""An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class OperatingPoint(Shown):
-    """A point of a model: values by name, in the model's units.
-
-    extras: values of delays and sampled blocks. residual: the largest scaled residual of the equations that define it.
-    limits: every limiter in use with its margin. at: "steady", or "start" where states stand at their given start.
-    method: "newton" or "homotopy"; underdetermined points say "newton, least norm".
-    branch: "own", the steady state that a simulation starts from: connected with the one that the model has at its own
-    values; "unconnected", found by a new search where following that one ended at a jump; "other", another one, to which
-    a given guess led; "trimmed" where outputs or states are fixed, something is free, or states stand at their start.
-    """
-
-    model: AnyModel
-    states: FrozenMap[float]
-    unknowns: FrozenMap[float]
-    extras: FrozenMap[float]
-    inputs: FrozenMap[float]
-    outputs: FrozenMap[float]
-    parameters: FrozenMap[float]
-    residual: float
-    limits: tuple[Limit, ...]
-    iterations: int
-    method: str
-    at: At = "steady"
-    time: float = 0.0
-    search: EquilibriumSearch | None = field(default=None, repr=False)
-    branch: Branch = "own"
-
-    def _screen(self) -> Iterator[str | Table]:
-        yield f"Operating point of {self.model.name} ({self.at}, {self.method}), residual {self.residual:.2g}"
-        parts = (("state", self.states), ("input", self.inputs), ("output", self.outputs))
-        rows = tuple((n, kind, v) for kind, values in parts for n, v in values.items())
-        yield from first_rows(("name", "kind", "value"), rows)
-        yield "\n".join([x.text for x in self.active_limits] or ["no limit is active"])
-        yield "\n".join(self.notes)
-
-    @property
-    def active_limits(self) -> tuple[Limit, ...]:
-        """The limiters that hold their signal here."""
-        return tuple(x for x in self.limits if x.active)
-
-    @cached_property
-    def stable(self) -> bool | None:
-        """True where no eigenvalue of the linear model lies right of the imaginary axis, delays exact.
-
-        None for an FMU, on a kink, and where a gain around a delay leaves it undecided.
-        """
-        return None if self.search is None else _stable(self, self.y, self.w)
-
-    @cached_property
-    def notes(self) -> tuple[str, ...]:
-        """Remarks on the point: that it is unstable, not the model's own one, or far off; with the other one's place."""
-        return _notes(self)
-
-    @property
-    def y(self) -> Array:
-        """(states + unknowns,) as the machine code takes them."""
-        return np.array([*self.states.values(), *self.unknowns.values()], dtype=float)
-
-    @property
-    def w(self) -> Array:
-        """(1 + inputs + delays + sampled,) as the machine code takes them, time first."""
-        return np.array([self.time, *self.inputs.values(), *self.extras.values()], dtype=float)
-
-    @property
-    def p(self) -> Array:
-        """(parameters,) as the machine code takes them."""
-        return np.array([*self.parameters.values()], dtype=float)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the point as plain numbers; active limits with what is limited, by what, and the margin."""
-        return {
-            "states": dict(self.states),
-            "unknowns": dict(self.unknowns),
-            "inputs": dict(self.inputs),
-            "outputs": dict(self.outputs),
-            "parameters": dict(self.parameters),
-            "residual": self.residual,
-            "active_limits": [x.to_dict() for x in self.active_limits],
-            "margins": [x.to_dict() for x in self.limits if not x.active and x.kind != "branch"],
-            "at": self.at,
-            "method": self.method,
-            "iterations": self.iterations,
-            "branch": self.branch,
-            "stable": self.stable,
-            "notes": list(self.notes),
-        }
 
 
 def find_operating_point(
@@ -157,12 +60,13 @@ def find_operating_point(
             free = freed_inputs(model, base, outputs, fixed)
             guess = {**base.states, **base.unknowns, **base.extras, **(guess or {})}
         fixed = {**fixed, **(outputs or {})}
-    if not isinstance(model, Model):
-        from hvdc_ident.linearize.fmu_linear import find_point
+    if isinstance(model, Model):
+        search = EquilibriumSearch.of_model(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
+        return solve(model, search, guess or {})
+    from hvdc_ident.linearize.fmu_linear import fmu_search
 
-        return find_point(model, fixed or {}, free, bounds or {}, guess or {}, at, moving, time)
-    search = EquilibriumSearch.of(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
-    return solve(model, search, guess or {})
+    recorded, search = fmu_search(model, fixed or {}, free, bounds or {}, guess or {}, at=at, moving=moving, time=time)
+    return point_of(recorded, search, solved(recorded.name, search, guess or {}), "trimmed")
 
 
 def solve(model: Model, search: EquilibriumSearch, guess: Mapping[str, float] | None = None) -> OperatingPoint:
@@ -170,7 +74,7 @@ def solve(model: Model, search: EquilibriumSearch, guess: Mapping[str, float] | 
     if search.is_plain and not guess:
         return point_of(model, search, *steady(model, search))
     own = _own(model, search)
-    root = _constrained(model, search, guess or {}, own)
+    root = solved(model.name, search, guess or {}, own)
     if not search.is_plain:
         return point_of(model, search, root, "trimmed")
     same = own is not None and np.allclose(
@@ -210,48 +114,11 @@ def _own(model: Model, search: EquilibriumSearch) -> Array | None:
         return None
 
 
-def _constrained(model: Model, search: EquilibriumSearch, guess: Mapping[str, float], own: Array | None) -> Root:
-    """Return the root that the guess leads to, else one near the model's own steady state, else near its guesses."""
-    best: Root | None = None
-    starts = search.guesses(guess)
-    near = (
-        None if own is None else search.guesses({**dict(zip(search.variables, own.tolist(), strict=False)), **guess})[0]
-    )
-    tries: list[tuple[Callable[[Equations, Array, Array, Array], Root], Array | None]]
-    tries = [(newton, v) for v in ([*starts[:1], near, *starts[1:]] if guess else [near, *starts])]
-    tries += [(homotopy, v) for v in (near, *starts[:1])]
-    with np.errstate(all="ignore"):
-        for solve, v in tries:
-            if v is None:
-                continue
-            root = solve(search.equations, v, search.low, search.high)
-            if root.found:
-                return root
-            best = root if best is None or root.shares.max() < best.shares.max() else best
-    assert best is not None
-    raise _not_found(model, search, best)
-
-
-def _not_found(model: Model, search: EquilibriumSearch, root: Root) -> SteadyStateError:
-    worst = int(np.argmax(root.shares))
-    names = search.variables
-    on_bound = [n for n, v, a, b in zip(names, root.v, search.low, search.high, strict=True) if v in (a, b)]
-    bound = f"; on its bound: {', '.join(on_bound)}" if on_bound else ""
-    hint = "check the fixed values and limits, give a guess near the solution, or free another input"
-    return SteadyStateError(
-        "no operating point was found",
-        where=f"model '{model.name}'",
-        expected=f"every equation met to {ACCURACY:g} of its terms",
-        got=f"{search.rows[worst]} left with {root.residual[worst]:.3g} (scaled {root.shares[worst]:.2g}){bound}",
-        hint=hint if search.at == "start" else hint + "; states that need not rest can be named in `moving`",
-    )
-
-
-def point_of(model: Model, search: EquilibriumSearch, root: Root, branch: Branch = "own") -> OperatingPoint:
+def point_of(model: AnyModel, search: EquilibriumSearch, root: Root, branch: Branch = "own") -> OperatingPoint:
     """Return the point of a solved search."""
     y, w, p = search.vectors(root.v)
     s, size = search.system, search.system.layout
-    values = s.values(y, w, p, s.modes(y, w, p))
+    values, _ = s.evaluate(y, w, p)
     shown = values[size.n + size.ne : size.main]
     wanted = {n: float(v) for n, v in zip(s.outputs, shown, strict=True) if n in model.outputs}
     n_extra = 1 + size.nu
@@ -265,7 +132,7 @@ def point_of(model: Model, search: EquilibriumSearch, root: Root, branch: Branch
         FrozenMap(wanted),
         _named(s.parameters, p),
         float(root.shares.max(initial=0.0)),
-        limits(s.structure, s.conditions, s.switches(y, w, p)),
+        s.limits(y, w, p),
         root.iterations,
         method,
         search.at,
@@ -340,98 +207,34 @@ def _step_to(
         )
 
 
-def _notes(point: OperatingPoint) -> tuple[str, ...]:
-    """Return sentences on a point that is unstable, not the model's own steady state, or far outside its states' own range.
-
-    Each names the other steady state where one is found: the model's own one, or those that the model runs to from here.
-    """
-    model = point.model
-    if point.search is None or point.at != "steady" or not isinstance(model, Model):
-        return ()
-    model = resting(model)
-    at = equilibria(model)
-    v = np.array([*point.y, *point.extras.values()])
-    found = []
-    if point.branch == "unconnected":
-        found.append(
-            "Followed from the model's own values, its steady state ends at a jump before these: this one is from a new search."
-        )
-    if point.branch == "other":
-        own = at.start(model, point.p, point.w[1 : 1 + len(point.inputs)], point.time).v
-        found.append(f"This is not the model's own steady state, which stands at {at.text(own)}.")
-    far = at.far(v)
-    if far:
-        shown = ", ".join(f"'{n}' at {point.states[n]:.4g} (guess {model.states[n].guess:g})" for n in far)
-        found.append(f"Far outside the states' own range: {shown}.")
-    if point.stable is False:
-        found.append(f"Unstable: {_fastest(point)}. {_elsewhere(at, point, v)}")
-    return tuple(found)
+def signal_value(model: Model, point: OperatingPoint, name: str) -> float:
+    """Return the value of any name at an operating point."""
+    return signal_values(model, point, (name,))[name]
 
 
-def _equation(point: OperatingPoint, y: Array, w: Array) -> Characteristic | None:
-    from hvdc_ident.linearize.jacobian import characteristic
-
-    assert point.search is not None and isinstance(point.model, Model)
-    try:
-        return characteristic(point.model, point.search.system, y, w, point.p)
-    except LinearizationError:
-        return None
-
-
-def _stable(point: OperatingPoint, y: Array, w: Array) -> bool | None:
-    """Return whether no root lies right of the imaginary axis; None where there is no linear model, or it cannot be told."""
-    equation = _equation(point, y, w)
-    if equation is None:
-        return None
-    if equation.channels:
-        unstable = stability(equation).unstable
-        return None if unstable is None else unstable == 0
-    values = np.linalg.eigvals(equation.matrix) if equation.nx else np.zeros(1)
-    return bool(values.real.max() <= ZERO * max(1.0, float(np.abs(values).max())))
+def signal_values(model: Model, point: OperatingPoint, names: Sequence[str]) -> dict[str, float]:
+    """Return the values of any names at an operating point."""
+    known = {**point.states, **point.unknowns, **point.extras, **point.inputs, **point.parameters}
+    asked = tuple(n for n in names if n not in known)
+    found = {n: float(known[n]) for n in names if n in known}
+    if asked:
+        s = system(model, asked)
+        shown = s.values(point.y, point.w, point.p, s.modes(point.y, point.w, point.p))[s.layout.n + s.layout.ne :]
+        found |= {n: float(v) for n, v in zip(s.outputs, shown, strict=False)}
+    return found
 
 
-def _fastest(point: OperatingPoint) -> str:
-    equation = _equation(point, point.y, point.w)
-    assert equation is not None
-    worst = equation.roots.values[:1]
-    if not worst.size or worst[0].real <= 0:
-        return "roots of its characteristic equation grow"
-    turning = f" +- {abs(worst[0].imag):.3g}j" if worst[0].imag else ""
-    return f"the eigenvalue {worst[0].real:.3g}{turning} 1/s grows"
-
-
-def _direction(equation: Characteristic) -> Array:
-    """Return (states,) the shape of the rightmost mode, a delay's share in it left out."""
-    root = equation.roots.values[:1]
-    if not root.size:
-        return np.ones(equation.nx)
-    return np.asarray(np.linalg.svd(equation.whole.pencil(root)[0])[2][-1].conj()[: equation.nx].real)
-
-
-def _elsewhere(at: Equilibria, point: OperatingPoint, v: Array) -> str:
-    """Return a sentence on the nearest stable steady state that the model runs to from here, or that its guesses lead to."""
-    equation = _equation(point, point.y, point.w)
-    assert equation is not None
-    nx = len(point.states)
-    direction = _direction(equation)
-    size = np.maximum(np.abs(point.y[:nx]), 1e-2)
-    direction = 1e-2 * direction / max(float(np.abs(direction / size).max()), 1e-300)
-    u = point.w[1 : 1 + len(point.inputs)]
-    others = at.neighbours(point.p, u, point.time, v, direction)
-    with suppress(SteadyStateError):  # then the guesses offer none
-        others.append(at.search(point.p, u, point.time).v)
-    stable = [
-        x for x in others if not np.allclose(x, v, rtol=1e-6, atol=1e-6) and _stable(point, *_split(at, point, x))
-    ]
-    stable.sort(key=lambda x: float(np.abs((x[:nx] - v[:nx]) / size).max()))  # of a machine's turns the nearest
-    if not stable:
-        return "No stable steady state was found nearby."
-    return f"A stable one stands at {at.text(stable[0])}; a `guess` there in the model's states leads to it."
-
-
-def _split(at: Equilibria, point: OperatingPoint, x: Array) -> tuple[Array, Array]:
-    n = at.n
-    return x[:n].copy(), np.concatenate([point.w[: 1 + len(point.inputs)], x[n:]])
+def with_constants_as_inputs(model: AnyModel, at: OperatingPoint) -> tuple[AnyModel, OperatingPoint]:
+    """Return the model and its point with states that never move as inputs: a reference that the start is found with is no mode."""
+    if not isinstance(model, Model):
+        return model, at
+    fixed = constants(model)
+    if not fixed:
+        return model, at
+    held = model.with_values({**at.parameters, **at.inputs}).driven(fixed)
+    values = {n: at.states[n] for n in fixed}
+    guess = {n: v for n, v in (at.states | at.unknowns).items() if n not in fixed}
+    return held.with_values(values), find_operating_point(held.with_values(values), guess=guess)
 
 
 # --- trim: inputs that are set so that outputs have given values ---
@@ -514,9 +317,7 @@ def _independent(model: AnyModel, outputs: list[str], gains: Array) -> None:
 
 def _dc_gains(model: AnyModel, point: OperatingPoint, outputs: Collection[str]) -> Array:
     """Return (outputs, all inputs) gains at rest; 0 for an input that drives an integrator: there is no rest with another value."""
-    from hvdc_ident.linearize.jacobian import linearize
-
-    a, b, c, d = linearize(model, point, outputs=list(outputs)).standard()
+    a, b, c, d = linear_at(*with_constants_as_inputs(model, point), outputs=list(outputs)).standard()
     if not a.shape[0]:
         return d
     x = np.linalg.lstsq(a, -b, rcond=1e-13)[0]

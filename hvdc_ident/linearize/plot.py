@@ -14,12 +14,12 @@ import numpy as np
 from hvdc_ident.colours import SERIES
 from hvdc_ident.display import axes_of
 from hvdc_ident.errors import unknown_name
-from hvdc_ident.linearize.frequency import FrequencyResponse
-from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.modal import Mode
 
 if TYPE_CHECKING:
+    from hvdc_ident.linearize.frequency import FrequencyResponse
+    from hvdc_ident.linearize.linear_model import LinearModel
     from hvdc_ident.linearize.modal import RootLocus
+    from hvdc_ident.linearize.mode import Mode
 
 LINES = ("-", "--", "-.", ":")
 MARK = "#777777"
@@ -56,7 +56,7 @@ def bode(responses: Sequence[FrequencyResponse], labels: Sequence[str] = (), ax:
                 if r.source in ("recording", "simulation"):
                     style = {"color": style["color"], "linestyle": "none", "marker": ".", "markersize": 4}
                 gain.semilogx(f, db, label=f"{name}{input} to {output}", **style)
-                phase.semilogx(f, np.degrees(np.unwrap(np.angle(r.values[keep, i, j]))), **style)
+                phase.semilogx(f, r.phase_deg[keep, i, j], **style)
                 if r.std is not None:
                     size, spread = r.magnitude[keep, i, j], 2.0 * r.std[keep, i, j]
                     low = 20 * np.log10(np.maximum(size - spread, 1e-3 * size))
@@ -193,8 +193,11 @@ def locus(found: RootLocus, left: float | None = None, ax: Any = None) -> Any:
 KINDS = ("bode", "nyquist", "poles", "participation")
 
 
-def draw(model: LinearModel, kind: str, ax: Any = None) -> Any:
-    """Return the axes of a drawing of a linear model: "bode", "nyquist", "poles" or "participation". Raises UnknownNameError."""
+def draw(model: LinearModel, kind: str = "bode", ax: Any = None) -> Any:
+    """Return the axes of a drawing: "bode" (two: gain and phase, as is `ax`), "nyquist", "poles" or "participation".
+
+    Raises UnknownNameError for another kind.
+    """
     if kind == "bode":
         return bode([model.bode()], ax=ax)
     if kind == "nyquist":

@@ -23,6 +23,8 @@ from hvdc_ident.linearize.system import Array
 EIGENVALUES = "eigenvalues of A"
 COUNTED = "roots of the exact characteristic equation, counted by the argument principle"
 MULTIPLIERS = "multipliers over the period of the sampled blocks (modes: without aliases)"
+ZERO = 1e-8
+"""An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""
 TOLERANCES = (1e-12, 1e-10, 1e-8)
 """Distances from the imaginary axis, relative to the radius that bounds the roots, within which one counts as on it."""
 PER_DELAY = 5
@@ -350,7 +352,6 @@ class Stability(Coded):
             return "infinitely many roots right of the imaginary axis"
         number = f"{self.unstable:.0f} root{'' if self.unstable == 1 else 's'} right of the imaginary axis"
         return f"at least {number}" if self.reason else number
-
 
 
 def stability(equation: Characteristic) -> Stability:

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.expression import FUNCTIONS
-from hvdc_ident.linearize.limits import Condition, conditions
+from hvdc_ident.linearize.limits import Condition, Limit, conditions, limits
 from hvdc_ident.model import Model
-from hvdc_ident.simulate import Code, Function, Graph, ModelEquations, by_structure, check_times
+from hvdc_ident.simulate import ACCURACY, Code, Function, Graph, ModelEquations, by_structure, check_times
 
 Array = NDArray[Any]
 
@@ -124,6 +124,9 @@ class Layout:
 class CompiledSystem:
     """Compiled values and derivatives of one model structure for one list of outputs; reusable for any values."""
 
+    accuracy = ACCURACY
+    """Largest scaled residual that counts as a solution of its equations."""
+
     def __init__(self, model: Model, outputs: Sequence[str]) -> None:
         self.structure = s = ModelEquations(model, (), outputs)
         g, m = s.graph, model
@@ -204,6 +207,18 @@ class CompiledSystem:
         """Return (rows, columns) derivatives over [x, z, inputs, delays, sampled]."""
         size = self.layout
         return self._run("jac", size.rows * size.columns, y, w, p, m).reshape(size.rows, size.columns)
+
+    def evaluate(self, y: Array, w: Array, p: Array, parameters: Sequence[int] = ()) -> tuple[Array, Array]:
+        """Return values (rows,) and Jacobian (rows, columns + parameters) by some parameters too, switches as at the point."""
+        m = self.modes(y, w, p)
+        jac = self.jacobian(y, w, p, m)
+        if len(parameters):
+            jac = np.concatenate([jac, self.by_parameters(y, w, p, m)[:, list(parameters)]], axis=1)
+        return self.values(y, w, p, m), jac
+
+    def limits(self, y: Array, w: Array, p: Array) -> tuple[Limit, ...]:
+        """Return every limiter that matters at the point, with its margin."""
+        return limits(self.structure, self.conditions, self.switches(y, w, p))
 
     def by_parameters(self, y: Array, w: Array, p: Array, m: Array) -> Array:
         """Return (rows, parameters) partial derivatives over the parameters."""

@@ -101,7 +101,7 @@ def write(
     an ending that is not known, where the model is not of the kind that the ending needs, and where values are asked for that do
     not stand.
     """
-    from hvdc_ident.linearize.export import formats
+    from hvdc_ident.linearize.export import FORMATS
     from hvdc_ident.linearize.export import write as write_linear
 
     path = Path(path)
@@ -114,8 +114,8 @@ def write(
             expected="a file *.fmu",
             hint=f"--to {path.with_suffix('.fmu')}, or leave them out",
         )
-    if ending not in formats() and not (nonlinear and ending in _WRITERS):
-        known = sorted({*formats(), *(_WRITERS if nonlinear else ())})
+    if ending not in FORMATS and not (nonlinear and ending in _WRITERS):
+        known = sorted({*FORMATS, *(_WRITERS if nonlinear else ())})
         raise StudyError(
             "no export has this ending",
             where=str(path),

@@ -184,7 +184,7 @@ def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[list[di
     """The impedance of each port, and a file of each."""
 
     from hvdc_ident.linearize import port_impedance
-    from hvdc_ident.linearize.export.csv_response import text
+    from hvdc_ident.linearize.export import csv_of_response
 
     point = linear.point
     assert point is not None and isinstance(point.model, Model)
@@ -201,5 +201,5 @@ def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[list[di
                 "least_real_part": {"value": float(passive[k]), "omega": float(omega[k])},
             }
         )
-        files[f"impedance.{table.name}.csv"] = text(z)
+        files[f"impedance.{table.name}.csv"] = csv_of_response(z)
     return found, files

@@ -462,7 +462,7 @@ class LinearizeTable(TomlTable):
     plant: PlantTable | None = optional("The signals between plant and controller, for the coprime factor margin.",
         'plant = {inputs = "Irorder1", outputs = "Vdc1_m"}')
     reduce: ReduceTable | None = optional("A model of lower order by balanced truncation.", "reduce = {order = 2}")
-    compare: Name | None = optional("Another model, shipped or a path, to which gap and nu-gap are computed.", 'compare = "vsc-hvdc-avm"')
+    compare: Name | None = optional("Another model, shipped or a path, to which the nu-gap is computed.", 'compare = "vsc-hvdc-avm"')
     scale: Sizes = optional("By input or output: the size that counts as 1 in norms, gaps and the reduction.",
         "scale = {Vdcref1 = 0.02}", "the signal's", default={}, of="input or output of [linearize]")
     formula: Names | None = optional("Parameters that stay symbols in the transfer functions.", 'formula = ["KPVDC", "KIVDC"]',

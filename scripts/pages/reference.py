@@ -34,7 +34,7 @@ KINDS = {
     "Operating points": "find_operating_point OperatingPoint linear.point_at linear.continuation",
     "Linear models": "linearize LinearModel bode linear.one_sided linear.symbolic_transfer linear.root_locus linear.balanced",
     "Loops and margins": "linear.loop linear.margins linear.loop_margins linear.plant_and_controller linear.ncf_margin",
-    "Distances and norms": "linear.compare linear.gap linear.nu_gap linear.h2_norm linear.hinf_norm linear.linf_norm",
+    "Distances and norms": "linear.compare linear.nu_gap linear.h2_norm linear.hinf_norm linear.linf_norm",
     "Frequency responses": "linear.Port linear.port_impedance linear.port_admittance linear.MeasuredResponse linear.read_response "
     "linear.response_at_tones linear.response_from_record linear.simulated_response",
     "Export": "export __version__",
@@ -237,8 +237,8 @@ def _members(kind: type) -> Iterator[str]:
     """Yield a table of the public methods and properties of a class, with the first line of each."""
     rows = []
     for name in sorted(dir(kind)):
-        member = inspect.getattr_static(kind, name)
         doc = inspect.getdoc(getattr(kind, name, None)) or ""
+        member = inspect.getattr_static(kind, name)  # a method that is bound when it is asked for is there by now
         if name.startswith("_") or (
             not isinstance(member, property | classmethod | staticmethod) and not callable(member)
         ):

@@ -48,12 +48,17 @@ def test_points_that_are_sought_and_points_that_are_not(fmu):
     model = fmu(spring())
     sought = find_operating_point(model, {"y": 0.7}, free=["u"])
     assert sought.inputs["u"] == pytest.approx(0.7, abs=1e-9) and sought.residual < 1e-9
+    assert sought.stable is True and sought.notes == ()
+    pushed = find_operating_point(model, {"u": 0.1, "k": -8.0})  # lambda^2 + lambda/4 - 4 = 0
+    assert pushed.stable is False and pushed.notes == ("Unstable: the eigenvalue 1.88 1/s grows.",)
+    with pytest.raises(SteadyStateError, match=r"on its bound: u"):
+        find_operating_point(model, {"y": 0.7}, free=["u"], bounds={"u": (0.0, 0.5)})
     held = point_at(model, {"x": 0.2, "v": 1.0}, {"u": 0.1})
     assert held.outputs["twice"] == pytest.approx(2.25) and held.states["x"] == 0.2
     start = find_operating_point(model, {"u": 0.4}, at="start")
     assert start.states == {"x": 0.4, "v": 0.0}
     assert [p.states["x"] for p in continuation(model, "u", [0.0, 0.5, 1.0])] == pytest.approx([0, 0.5, 1.0], abs=1e-9)
-    with pytest.raises(SteadyStateError, match=r"no operating point.*d\(v\)/dt left with -9.81"):
+    with pytest.raises(SteadyStateError, match=r"no operating point.*d\(v\)/dt = 0 left with -9.81"):
         find_operating_point(fmu(BALL, 2, "model-exchange"))
     with pytest.raises(InputError, match="no variable 'uu'"):
         find_operating_point(model, {"uu": 1.0})

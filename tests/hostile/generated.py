@@ -33,7 +33,6 @@ LONGEST = 120  # s of processor time a command may take
 COMMANDS = (
     "check", "simulate", "linearize", "sweep", "identify", "fit", "diagnose", "run", "report", "letter",
     "export .toml", "export .mo", "export .ssv", "export .fmu", "export .mat", "export .json", "export .csv", "export .m",
-    "export .tex",
 )  # fmt: skip
 EFFECTS = (
     "lag", "delay", "second-order", "limit", "saturation", "rate-limit", "deadband", "backlash", "quantisation",

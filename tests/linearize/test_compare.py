@@ -7,8 +7,7 @@ from helpers import linear, stable
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize import balanced, h2_norm, hinf_norm, linearize, nu_gap
-from hvdc_ident.linearize.distance import difference
-from hvdc_ident.linearize.reduction import minimal
+from hvdc_ident.linearize.reduction import difference, minimal
 from hvdc_ident.models import load_model
 
 

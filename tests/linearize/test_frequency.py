@@ -1,6 +1,7 @@
 """Frequency responses, zeros, loops and margins, against python-control and closed forms."""
 
 import control
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from helpers import linear, stable
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError, UnknownNameError, WaveformError
 from hvdc_ident.linearize import (
+    FrequencyResponse,
     Port,
     find_operating_point,
     frequency_response,
@@ -24,11 +26,13 @@ from hvdc_ident.linearize import (
 )
 from hvdc_ident.linearize.delays import pade, response
 from hvdc_ident.linearize.frequency import bands, sensitivity, sigma
-from hvdc_ident.linearize.transfer_function import zeros
+from hvdc_ident.linearize.zeros import zeros
+from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
 
 DELAY = [{"effect": "delay", "at": "Ir1", "parameters": {"T": 0.002}}]
 W = np.logspace(-1, 3, 15)
+LAG = Model(name="lag", inputs={"u": 0.0}, states={"x": "u - x"}, outputs={"y": "x"})
 
 
 @pytest.fixture(scope="module")
@@ -314,7 +318,76 @@ def test_the_voltage_loop_as_a_formula(link):
         symbolic_transfer(apply_effects(link, DELAY), "Vdcref1", "Vdc1", ["KPVDC"])
 
 
+# --- phases and frequencies to show ---
+
+
 def test_default_frequencies_cover_the_poles(model):
     found = frequency_response(model)
-    assert found.omega[0] < 30 / 10 and found.omega[-1] > 4.1e5
+    assert found.omega[0] == pytest.approx(3.0) and found.omega[-1] > 4.1e5
     assert found.to_xarray().dims == ("omega", "output", "input")
+
+
+def test_default_frequencies_end_where_a_channel_shows_nothing_more(model):
+    """The dc line's mode at 6.5 kHz is a thousandth of what the voltage control shows, and most of the line's current."""
+    voltage = model.channel("Vdcref1", "Vdc1").bode().frequency_hz
+    assert 0.4 < voltage[0] < 1.0 and 60.0 < voltage[-1] < 100.0
+    assert model.channel("Vdcref1", "Idc").bode().frequency_hz[-1] > 6e4
+
+
+def test_default_frequencies_of_models_without_poles_or_damping():
+    static = linear(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[2.0]]).bode()
+    np.testing.assert_array_equal(static.magnitude, 2.0)
+    undamped = linear([[0, 1], [-4, 0]], [[0], [1]], [[1, 0]]).bode()
+    assert undamped.omega[0] == pytest.approx(0.2) and np.isfinite(undamped.values).all()
+
+
+@pytest.mark.parametrize("time", [1e-4, 2e-3, 0.5])
+@pytest.mark.parametrize("points", [2, 7, 300])
+def test_the_phase_of_a_lag_and_a_delay_on_coarse_grids(time, points):
+    """-atan(w) - w T: up to 100 000 turns, of which a step passes hundreds."""
+    late = linearize(apply_effects(LAG, [{"effect": "delay", "at": ["y"], "parameters": {"T": time}}]), inputs="u", outputs="y")
+    w = 2 * np.pi * np.geomspace(0.1, 2e5, points)
+    found = late.bode(w)
+    want = -np.degrees(np.arctan(w) + w * time)
+    np.testing.assert_allclose(found.phase_deg[:, 0, 0], want, rtol=1e-9, atol=1e-6)
+    again = FrequencyResponse.from_dict(found.to_dict())
+    np.testing.assert_array_equal(again.phase_deg, found.phase_deg)
+    shuffled = late.bode(w[::-1])
+    np.testing.assert_allclose(shuffled.phase_deg[::-1, 0, 0], want, rtol=1e-9, atol=1e-6)
+    drawn = found.plot()[1].lines[0].get_ydata()
+    np.testing.assert_allclose(drawn, want, rtol=1e-9, atol=1e-6)
+    plt.close("all")
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10_000))
+def test_phases_on_coarse_grids_are_those_of_fine_ones(seed):
+    """Three resonances and two pairs of zeros, damped by 0.1 to 30 %, seen at 6 frequencies over five decades."""
+    rng = np.random.default_rng(seed)
+
+    def pairs(count):
+        size, damping = 10 ** rng.uniform(-1, 3, count), 10 ** rng.uniform(-3, -0.5, count)
+        upper = size * (-damping + 1j * np.sqrt(1 - damping**2))
+        return np.concatenate([upper, upper.conj()])
+
+    g = control.ss(control.zpk(pairs(2), pairs(3), 1.0))
+    model = linear(g.A, g.B, g.C, g.D)
+    w = np.geomspace(1e-2, 1e4, 6)
+    zeros_and_poles = np.abs(np.concatenate([model.poles(), model.zeros()]))
+    beside = (zeros_and_poles * (1.0 + np.concatenate([[0.0], x := np.geomspace(1e-6, 1.0, 200), -0.5 * x]))[:, None]).ravel()
+    fine = np.unique(np.concatenate([w, np.geomspace(1e-2, 1e4, 4000), beside[(beside > 1e-2) & (beside < 1e4)]]))
+    want = np.degrees(np.unwrap(np.angle(model.response(fine)[:, 0, 0])))[np.searchsorted(fine, w)]
+    np.testing.assert_allclose(model.bode(w).phase_deg[:, 0, 0], want, atol=1e-3)
+
+
+def test_dc_gains_beside_integrators():
+    """1/(s + 1) beside an integrator of another input, and an integrator that is washed out; 1/s and 2/(s + 1)."""
+    beside = linear([[-1, 0], [0, 0]], np.eye(2), np.eye(2))
+    assert beside.transfer_function("u0", "y0").dc_gain == pytest.approx(1.0)
+    assert beside.transfer_function("u1", "y1").dc_gain == np.inf
+    assert beside.transfer_function("u0", "y1").dc_gain == 0.0
+    washed = linear([[0, 0], [1, -1]], [[1], [0]], [[1, -1]]).transfer_function()
+    assert washed.dc_gain == pytest.approx(1.0)
+    assert linear([[-1]], [[2]], [[1]]).transfer_function().dc_gain == pytest.approx(2.0)
+    late = linearize(apply_effects(LAG, [{"effect": "delay", "at": ["y"], "parameters": {"T": 0.2}}]))
+    assert late.transfer_function().dc_gain == pytest.approx(1.0)

@@ -9,7 +9,8 @@ from hvdc_ident.errors import LinearizationError, SteadyStateError, UnknownNameE
 from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import find_operating_point, linearize, root_locus
-from hvdc_ident.linearize.modal import gradient_of, match
+from hvdc_ident.linearize.linear_model import gradient_of
+from hvdc_ident.linearize.modal import match
 from hvdc_ident.model import Model, Output, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter

@@ -7,7 +7,7 @@ from hvdc_ident.errors import LinearizationError, UnknownNameError
 from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import Port, find_operating_point, port_admittance, port_impedance
-from hvdc_ident.linearize.loops import signal_value
+from hvdc_ident.linearize.operating_point import signal_value
 from hvdc_ident.model import Model, Output, Signal, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter

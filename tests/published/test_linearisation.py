@@ -13,7 +13,6 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import (
     LinearModel,
     find_operating_point,
-    gap,
     h2_norm,
     hinf_norm,
     linearize,
@@ -206,25 +205,6 @@ def test_nu_gap():
     assert found.winding == 0
     assert found.value == pytest.approx(0.0020, abs=5e-5)
     assert found.value == pytest.approx(2000 / (1 + 1e6), rel=1e-9)
-
-
-def test_gap():
-    """MathWorks, gapmetric: 1/(s - 0.001) against 1/(s + 0.001), gap 0.0021, found there to a tolerance of 0.001."""
-    found = gap(companion([1.0], [1.0, -0.001]), companion([1.0], [1.0, 0.001]))
-    assert found == pytest.approx(0.0021, abs=0.001)
-    # The gap is never below the nu-gap, and in this example the two are equal.
-    assert found == pytest.approx(2000 / (1 + 1e6), abs=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("a", "b"), [([1.0, 1.0], [1.0, 2.0]), ([1.0, -0.5], [1.0, 0.5]), ([1.0, 0.4, 1.0], [1.0, 0.2, 1.2])]
-)
-def test_the_gap_is_a_distance_above_the_nu_gap(a, b):
-    first, second = companion([1.0], a), companion([1.0], b)
-    assert gap(first, first) < 1e-4
-    there, back = gap(first, second, 1e-3), gap(second, first, 1e-3)
-    assert there == pytest.approx(back, abs=1e-3)
-    assert there >= nu_gap(first, second).value - 2e-3
 
 
 def test_norms():

@@ -70,7 +70,7 @@ def test_at_start_uses_the_given_start(study, tmp_path):
     assert point["states"] == {"delta": 0.1, "w": 1.0} and point["at"] == "start"
 
 
-@pytest.mark.parametrize("ending", ["mat", "json", "m", "mo", "csv", "tex", "zpk", "toml"])
+@pytest.mark.parametrize("ending", ["mat", "json", "m", "mo", "csv", "toml"])
 def test_export_by_ending(study, tmp_path, ending):
     path = tmp_path / f"out.{ending}"
     result = run("export", study, "--to", path)
@@ -189,13 +189,15 @@ def test_every_key_of_linearize_is_answered(servo, tmp_path):
 
 
 def test_the_reduced_model_is_exported_in_the_units_of_the_whole(servo, tmp_path):
-    from hvdc_ident.linearize.export import read
+    from hvdc_ident.linearize import LinearModel
 
     servo.write_text(servo.read_text() + "scale = {y = 2.0}\nreduce = {order = 2, match_dc = true}\n")
     for name, more in (("whole.json", ()), ("small.json", ("--reduced",))):
         result = run("export", servo, "--to", tmp_path / name, *more)
         assert result.exit_code == 0, result.output
-    whole, small = read(tmp_path / "whole.json"), read(tmp_path / "small.json")
+    whole, small = (
+        LinearModel.from_dict(json.loads((tmp_path / name).read_text())) for name in ("whole.json", "small.json")
+    )
     assert small.A.shape == (2, 2)
     np.testing.assert_allclose(small.response([0.0]), whole.response([0.0]), rtol=1e-9)
     servo.write_text(servo.read_text().replace("reduce = {order = 2, match_dc = true}\n", ""))

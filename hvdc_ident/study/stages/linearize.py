@@ -144,7 +144,7 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
         return [*found, f"At the fitted values there is {fitted['message']}."]
     why = data["fitted_note"]
     found += [f"There is no linear model at fitted values: {why}. `hvdc-ident fit STUDY` fits it."] if why else []
-    return [*found, "Next: `hvdc-ident export STUDY --to FILE.mat` (.json, .csv, .m, .tex) writes A, B, C and D."]
+    return [*found, "Next: `hvdc-ident export STUDY --to FILE.mat` (.json, .csv, .m) writes A, B, C and D."]
 
 
 def verdict(data: Mapping[str, Any]) -> str:

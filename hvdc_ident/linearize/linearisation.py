@@ -1,0 +1,90 @@
+"""Linearisation of a model at an operating point: A, B, C, D with exact derivatives, below and above a limit, and a check."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hvdc_ident.linearize.derivatives import Side
+from hvdc_ident.linearize.jacobian import linear_at
+from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.operating_point import find_operating_point, with_constants_as_inputs
+from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.system import system
+from hvdc_ident.model import AnyModel, Model
+
+
+def linearize(
+    model: AnyModel,
+    point: OperatingPoint | None = None,
+    *,
+    inputs: Sequence[str] | str | None = None,
+    outputs: Sequence[str] | str | None = None,
+    pade_order: int = 5,
+    sensitivities: Sequence[str] = (),
+    side: Side = "refuse",
+    descriptor: bool = False,
+) -> LinearModel:
+    """Return the linear model between inputs and outputs (of outputs or named signals; default all) at an operating point.
+
+    point: default, the steady state found from the model's values. pade_order: of every delay in the state space (the
+    frequency response takes the delays exactly). sensitivities: parameters whose exact total derivatives of A, B, C, D
+    come along, the shift of the operating point included. side: what to do where the point lies on a kink: "refuse",
+    or the Jacobian "below" or "above" the limit. descriptor: keep the algebraic unknowns as states, with E.
+
+    Raises UnknownNameError, and LinearizationError on a kink, for an ill-posed loop, or Jacobian entries not finite.
+
+    >>> from hvdc_ident import linearize, load_model
+    >>> linear = linearize(load_model("vsc-hvdc-link"), inputs="Vdcref1", outputs="Irorder1")
+    >>> linear.A.shape, linear.D.shape
+    ((6, 6), (1, 1))
+    >>> [round(mode.frequency_hz, 2) for mode in linear.modes() if mode.frequency_hz > 0.1]
+    [4.87, 4.87]
+    """
+    at = find_operating_point(model) if point is None else point
+    model, at = with_constants_as_inputs(model, at)
+    inputs = [inputs] if isinstance(inputs, str) else inputs
+    outputs = [outputs] if isinstance(outputs, str) else outputs
+    return linear_at(model, at, inputs, outputs, pade_order, sensitivities, side, descriptor)
+
+
+def one_sided(
+    model: Model,
+    point: OperatingPoint,
+    *,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    pade_order: int = 5,
+    sensitivities: Sequence[str] = (),
+    descriptor: bool = False,
+) -> tuple[LinearModel, LinearModel]:
+    """Return the linear models below and above the limit on which a point lies; equal where it lies on none."""
+
+    def at(side: Side) -> LinearModel:
+        return linearize(
+            model,
+            point,
+            inputs=inputs,
+            outputs=outputs,
+            pade_order=pade_order,
+            sensitivities=sensitivities,
+            side=side,
+            descriptor=descriptor,
+        )
+
+    return at("below"), at("above")
+
+
+def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:
+    """Return the largest difference between the Jacobian and one by complex steps, relative to each row's largest entry."""
+    if not isinstance(model, Model):
+        from hvdc_ident.linearize.fmu_linear import error_of
+
+        return error_of(model, point, outputs)
+    s = system(model, outputs)
+    y, w, p = point.y, point.w, point.p
+    exact = s.jacobian(y, w, p, s.modes(y, w, p))[: s.layout.main]
+    other = s.complex_step(y, w, p)
+    scale = np.maximum(np.abs(exact).max(axis=1, initial=0.0), 1e-300)
+    return float((np.abs(exact - other) / scale[:, None]).max(initial=0.0))
