@@ -24,7 +24,7 @@ from hvdc_ident.discrepancy.forms import expression
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.implied import TIED, apart, implied, nearest, off_given
 from hvdc_ident.discrepancy.movable import in_proportion
-from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
+from hvdc_ident.discrepancy.options import CERTAIN, TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.result import Hypothesis, Rival
 from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.discrepancy.search import SearchOutcome
@@ -206,8 +206,6 @@ def _equal(found: Round, group: Sequence[Rival], tries: Callable[[str], bool]) -
     return equal
 
 
-CERTAIN = 0.95
-"""Probability of an effect class from which it is named."""
 MAX_HYPOTHESES = 20
 """Hypotheses in the result at most, the likeliest."""
 

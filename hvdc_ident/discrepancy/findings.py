@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, credible
+from hvdc_ident.discrepancy.classes import EffectClass, credible
 from hvdc_ident.discrepancy.explain import advice, sentence
 from hvdc_ident.discrepancy.forms import with_values
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.implied import apart
-from hvdc_ident.discrepancy.options import LISTED
+from hvdc_ident.discrepancy.options import CERTAIN, LISTED
 from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival, ValueAt
 from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.effects import effects, split_sources

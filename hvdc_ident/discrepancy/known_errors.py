@@ -13,10 +13,9 @@ import numpy as np
 from scipy import stats
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.classes import CERTAIN
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.moves import STATED_ERROR, derivative
-from hvdc_ident.discrepancy.options import LISTED, REFUTED, SearchContext
+from hvdc_ident.discrepancy.options import CERTAIN, LISTED, REFUTED, SearchContext
 from hvdc_ident.text import figures, listed, percentage
 
 LEVEL_ERROR = 0.005

@@ -17,6 +17,8 @@ TOLERANCE = 0.01
 """Share of the squared gap, a tenth of its amplitude, that nobody asks about: no model leaves noise alone of real records."""
 REFUTED = 0.1
 """Share of the squared gap that, left over and no noise, refutes the form of an effect: the form misses a third of the amplitude."""
+CERTAIN = 0.95
+"""Probability of an effect class from which it is named, and within which an error lies that is known to so much."""
 SHORTLIST = 6
 """The best by a cheap measure (a score, a regression) that are tried in full: formulas, filters, places, earlier rivals."""
 FIELD = 40

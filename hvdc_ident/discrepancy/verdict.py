@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import FEWEST_QUIET, Array, event_time, quiet_rows
-from hvdc_ident.discrepancy.classes import CERTAIN, EffectClass, classes, formula_rivals, likely, rivals
+from hvdc_ident.discrepancy.classes import EffectClass, classes, formula_rivals, likely, rivals
 from hvdc_ident.discrepancy.evidence import largest_rmse, louder_than_noise, material_gap
 from hvdc_ident.discrepancy.explain import moved_parameters
 from hvdc_ident.discrepancy.findings import finding, values_by_place
@@ -19,7 +19,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit, signal
 from hvdc_ident.discrepancy.implied import implied
 from hvdc_ident.discrepancy.known_errors import known_errors
 from hvdc_ident.discrepancy.nominal import Nominal
-from hvdc_ident.discrepancy.options import LISTED, REFUTED, TOLERANCE, SearchContext
+from hvdc_ident.discrepancy.options import CERTAIN, LISTED, REFUTED, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
 from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict
