@@ -19,7 +19,17 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats._columns import check_size, checked, chosen, guarded, instants, joined, package, time_name
+from hvdc_ident.formats._columns import (
+    check_size,
+    checked,
+    chosen,
+    damaged,
+    guarded,
+    instants,
+    joined,
+    package,
+    time_name,
+)
 from hvdc_ident.formats.dymola_mat import recognises as is_result_file
 from hvdc_ident.formats.dymola_mat import starts_as_version_4
 
@@ -92,6 +102,8 @@ def _until_version_7(path: Path) -> dict[str, Any]:
             found[value["s0"][0].decode("latin-1")] = _Object()  # scipy calls it 'None'
         elif not name.startswith("__"):
             found[name] = value
+    if "dataInfo" in found:
+        raise damaged(path, "a result file of Dymola without its class", expected="a matrix 'Aclass' at its start")
     return found
 
 
