@@ -37,21 +37,21 @@ enum {
 
 #define SIZES(INT)                                                                                                             \
     INT(nx) INT(nz) INT(nu) INT(nd) INT(nq) INT(ns) INT(no) INT(np) /* states, unknowns, inputs, delays, samples, switches, ... */ \
-    INT(width)      /* of a row over the parameters: np, rounded up for loops by four */                                        \
-    INT(n)          /* unknowns of the step: states and algebraic unknowns */                                                   \
-    INT(size)       /* the flat vector: the n unknowns, then their rows over the parameters */                                  \
-    INT(stride)     /* the same, rounded up for loops by four */                                                                \
-    INT(nw)         /* elements of w before its rows */                                                                         \
-    INT(hessians)   /* second derivatives */                                                                                    \
-    INT(factors)    /* factors of the generated elimination; 0: dense pivoting alone */                                         \
-    INT(timed)      /* whether an equation uses time itself */                                                                  \
-    INT(rosenbrock) /* the method */                                                                                            \
+    INT(width)      /* of a row over the parameters: np, rounded up for loops by four */                                       \
+    INT(n)          /* unknowns of the step: states and algebraic unknowns */                                                  \
+    INT(size)       /* the flat vector: the n unknowns, then their rows over the parameters */                                 \
+    INT(stride)     /* the same, rounded up for loops by four */                                                               \
+    INT(nw)         /* elements of w before its rows */                                                                        \
+    INT(hessians)   /* second derivatives */                                                                                   \
+    INT(factors)    /* factors of the generated elimination; 0: dense pivoting alone */                                        \
+    INT(timed)      /* whether an equation uses time itself */                                                                 \
+    INT(rosenbrock) /* the method */                                                                                           \
     INT(sliding) INT(twin) /* the switch on whose surface the run slides, and its twin there; NONE */
 
 #define FUNCTIONS(CODE)                                                                                                        \
-    CODE(do_f) CODE(do_fs) CODE(do_jac) CODE(do_hess) CODE(do_ft) CODE(do_sw) CODE(do_sws) CODE(do_swd) CODE(do_modes)          \
-    CODE(do_out) CODE(do_outs) CODE(do_rows) CODE(do_src) CODE(do_srcs) CODE(do_srcd) CODE(do_rest) CODE(do_rest_jac)           \
-    CODE(do_rest_p) CODE(do_const) CODE(do_lu) CODE(do_solve) CODE(do_surface)                                                  \
+    CODE(do_f) CODE(do_fs) CODE(do_jac) CODE(do_hess) CODE(do_ft) CODE(do_sw) CODE(do_sws) CODE(do_swd) CODE(do_modes)         \
+    CODE(do_out) CODE(do_outs) CODE(do_rows) CODE(do_src) CODE(do_srcs) CODE(do_srcd) CODE(do_rest) CODE(do_rest_jac)          \
+    CODE(do_rest_p) CODE(do_const) CODE(do_lu) CODE(do_solve) CODE(do_surface)                                                 \
     CODE(do_rhs) CODE(do_observe) CODE(do_sources) /* with rows over the parameters where there are any */
 
 #define SECOND_DERIVATIVES(INDEX) INDEX(hess_row) INDEX(hess_column)
@@ -59,10 +59,10 @@ enum {
 /* --- what the caller states of a run --- */
 
 #define GIVEN(VECTOR, INDEX, INT)                                                                                              \
-    VECTOR(p) VECTOR(constants) VECTOR(scale)  /* parameters; timing constants with their rows; size of each parameter */       \
-    VECTOR(t_out) VECTOR(out)                  /* instants of the outputs, and the outputs with their rows */                   \
+    VECTOR(p) VECTOR(constants) VECTOR(scale)  /* parameters; timing constants with their rows; size of each parameter */      \
+    VECTOR(t_out) VECTOR(out)                  /* instants of the outputs, and the outputs with their rows */                  \
     VECTOR(breaks) INDEX(pointer) VECTOR(times) VECTOR(values) /* of the inputs: stops, first points of each, points */        \
-    INT(n_breaks) INT(n_out) INT(max_steps)                                                                                     \
+    INT(n_breaks) INT(n_out) INT(max_steps)                                                                                    \
     INT(slides)                                /* whether the run may slide along the surface of a switch */
 
 #define GIVEN_INSTANTS(REAL) REAL(start) REAL(end) REAL(rtol) REAL(atol)
@@ -70,48 +70,48 @@ enum {
 /* --- the vectors of a run, in its workspace --- */
 
 #define VECTORS(VECTOR)                                                                                                        \
-    VECTOR(y) VECTOR(yn) VECTOR(u)                 /* flat: at the step's start, at its end, at a stage */                      \
-    VECTOR(k) VECTOR(e) VECTOR(dense)              /* stages, error, the four rows of the step's quartic */                     \
+    VECTOR(y) VECTOR(yn) VECTOR(u)                 /* flat: at the step's start, at its end, at a stage */                     \
+    VECTOR(k) VECTOR(e) VECTOR(dense)              /* stages, error, the four rows of the step's quartic */                    \
     VECTOR(add) VECTOR(mass) VECTOR(ft)            /* what a stage adds to the right-hand side, 1 where it has a derivative, f_t */ \
-    VECTOR(f_before) VECTOR(f_after)               /* right-hand sides at both sides of a switch or jump */                     \
-    VECTOR(yd) VECTOR(w) VECTOR(wd) VECTOR(m) /* arguments of the generated functions */                              \
-    VECTOR(jac) VECTOR(matrix) VECTOR(small) VECTOR(hessian) VECTOR(factor) VECTOR(shift) /* linear algebra */                  \
-    VECTOR(floors) VECTOR(totals)                  /* error weights and sums of each parameter */                               \
-    VECTOR(z_before) VECTOR(z_from) VECTOR(z_step) VECTOR(side) /* unknowns before a solve, a step of it, the modes there */    \
-    VECTOR(sv) VECTOR(top) VECTOR(slack) VECTOR(sws) /* switches: values, largest so far, tolerance, rows */                    \
-    VECTOR(src) VECTOR(src_rate) VECTOR(src_left)  /* sources of delays and samples; the delays' before the segment */          \
-    VECTOR(lag) VECTOR(lag_p) VECTOR(before)       /* delays, their rows, the delayed signals before the start */               \
-    VECTOR(nodes) VECTOR(history) VECTOR(echo)     /* history of delayed signals; instants at which jumps come back */          \
-    VECTOR(tick) VECTOR(publish) VECTOR(ticks) VECTOR(pending) VECTOR(pending_p) VECTOR(publish_p) /* samples */                \
-    VECTOR(jump_p)                                 /* derivative of the present jump's instant by the parameters */             \
-    VECTOR(surface)                                /* of a slide */                                                             \
+    VECTOR(f_before) VECTOR(f_after)               /* right-hand sides at both sides of a switch or jump */                    \
+    VECTOR(yd) VECTOR(w) VECTOR(wd) VECTOR(m) /* arguments of the generated functions */                                       \
+    VECTOR(jac) VECTOR(matrix) VECTOR(small) VECTOR(hessian) VECTOR(factor) VECTOR(shift) /* linear algebra */                 \
+    VECTOR(floors) VECTOR(totals)                  /* error weights and sums of each parameter */                              \
+    VECTOR(z_before) VECTOR(z_from) VECTOR(z_step) VECTOR(side) /* unknowns before a solve, a step of it, the modes there */   \
+    VECTOR(sv) VECTOR(top) VECTOR(slack) VECTOR(sws) /* switches: values, largest so far, tolerance, rows */                   \
+    VECTOR(src) VECTOR(src_rate) VECTOR(src_left)  /* sources of delays and samples; the delays' before the segment */         \
+    VECTOR(lag) VECTOR(lag_p) VECTOR(before)       /* delays, their rows, the delayed signals before the start */              \
+    VECTOR(nodes) VECTOR(history) VECTOR(echo)     /* history of delayed signals; instants at which jumps come back */         \
+    VECTOR(tick) VECTOR(publish) VECTOR(ticks) VECTOR(pending) VECTOR(pending_p) VECTOR(publish_p) /* samples */               \
+    VECTOR(jump_p)                                 /* derivative of the present jump's instant by the parameters */            \
+    VECTOR(surface)                                /* of a slide */                                                            \
     VECTOR(instants) VECTOR(block)                 /* four instants and their flat vectors */
 
 #define INDICES(INDEX)                                                                                                         \
-    INDEX(pivots) INDEX(small_pivots) /* row exchanges of the factors */                                                        \
-    INDEX(at)                         /* each input's present piece */                              \
+    INDEX(pivots) INDEX(small_pivots) /* row exchanges of the factors */                                                       \
+    INDEX(at)                         /* each input's present piece */                                                         \
     INDEX(heads)                      /* heads of this record for the slide on each switch, then without one */
 
 #define COUNTS(INT)                                                                                                            \
-    INT(accepted) INT(rejected) INT(events) INT(evaluations) INT(segments) INT(forced_steps) /* what a run reports */           \
-    INT(steps) INT(i_out) INT(i_break) INT(echoes) INT(kept)                            \
-    INT(history_room) INT(echo_room)  /* rows for which there is memory */                                                      \
+    INT(accepted) INT(rejected) INT(events) INT(evaluations) INT(segments) INT(forced_steps) /* what a run reports */          \
+    INT(steps) INT(i_out) INT(i_break) INT(echoes) INT(kept)                                                                   \
+    INT(history_room) INT(echo_room)  /* rows for which there is memory */                                                     \
     INT(stiff) INT(chatter) INT(last_switch) INT(aim)
 
 #define FLAGS(INT)                                                                                                             \
-    INT(still)     /* no input has a slope in this segment */                                                                   \
-    INT(quiet)     /* nothing comes from outside in this segment but time */                                                    \
-    INT(forced)    /* the right-hand side may change with time alone */                                                         \
-    INT(first)     /* the first segment */                                                                                      \
-    INT(fresh)     /* the first stage holds the derivative at (t, y) */                                                         \
-    INT(again)     /* the step before was rejected: what was computed at (t, y) stands */                                       \
-    INT(last)      /* this step ends at the segment's end */                                                                    \
+    INT(still)     /* no input has a slope in this segment */                                                                  \
+    INT(quiet)     /* nothing comes from outside in this segment but time */                                                   \
+    INT(forced)    /* the right-hand side may change with time alone */                                                        \
+    INT(first)     /* the first segment */                                                                                     \
+    INT(fresh)     /* the first stage holds the derivative at (t, y) */                                                        \
+    INT(again)     /* the step before was rejected: what was computed at (t, y) stands */                                      \
+    INT(last)      /* this step ends at the segment's end */                                                                   \
     INT(echo_now) INT(disturbed) INT(published) /* what happened at the present break */
 
 #define INSTANTS(REAL)                                                                                                         \
-    REAL(t) REAL(tb)     /* tb: the present segment's end */                                              \
-    REAL(h) REAL(hs) REAL(step_end)            /* the step wanted, the step taken, its end */                                   \
-    REAL(order) REAL(shortest) REAL(last_event) REAL(error) REAL(stiffness)                               \
+    REAL(t) REAL(tb)     /* tb: the present segment's end */                                                                   \
+    REAL(h) REAL(hs) REAL(step_end)            /* the step wanted, the step taken, its end */                                  \
+    REAL(order) REAL(shortest) REAL(last_event) REAL(error) REAL(stiffness)                                                    \
     REAL(surface_top)                          /* largest value of the sliding switch so far */
 
 #define AS_INTEGER(name) integer name;
