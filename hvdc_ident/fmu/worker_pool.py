@@ -31,6 +31,8 @@ from hvdc_ident.parallel import Child, Ending, Watch, available_cores
 from hvdc_ident.parallel.progress import RESIDENT, SPACE, begin
 
 MIB = 2**20
+NEEDS = ("hvdc_ident.fmu.worker", "fmpy.fmi2", "fmpy.fmi3", "scipy.integrate")
+"""What a worker imports before it loads an FMU."""
 EXHAUSTED = 0.5
 """Share of its memory from which a process may have run out of it: one that grows by doubling is refused from half on."""
 
@@ -129,17 +131,22 @@ class _FmuWorker:
 
 @dataclass(eq=False)
 class _Processes:
-    """The processes of a pool and its folder. They end with the pool."""
+    """The processes of a pool and its folder. They end with the pool.
+
+    spare: started processes whose worker has ended: the next one begins there with everything imported.
+    """
 
     owner: int
     folder: Folder
     workers: dict[int, _FmuWorker] = field(default_factory=dict)
+    spare: list[Child] = field(default_factory=list)
 
     def close(self) -> None:
         """End all processes; remove the folder where no other process uses it."""
-        for worker in self.workers.values():
-            worker.process.close()
+        for child in (*(w.process for w in self.workers.values()), *self.spare):
+            child.close()
         self.workers.clear()
+        self.spare.clear()
         if self.owner == os.getpid():
             self.folder.release()
         else:
@@ -391,7 +398,12 @@ class WorkerPool:
         worker: _FmuWorker | None = None
         setup = Setup(self.description, processes.folder, self.limits.deadline, self.limits.memory)
         try:
-            child = Child(serve, setup, self.learned, keeps=[processes.folder.lock], finish=processes.folder.release)
+            if processes.spare:
+                child = processes.spare.pop()
+                child.again(serve, setup, self.learned)
+            else:
+                folder = processes.folder
+                child = Child(serve, setup, self.learned, keeps=[folder.lock], needs=NEEDS, finish=folder.release)
             worker = processes.workers[number] = _FmuWorker(child, self.limits.memory)
             answer, _ = self._heard(worker, "loading")
             if "failed" in answer:
@@ -416,7 +428,10 @@ class WorkerPool:
         if at is None:  # ended before
             return None
         del processes.workers[at]
-        return worker.process.end(trace=trace)
+        ending = worker.process.rest(trace=trace)
+        if ending is not None:
+            processes.spare.append(worker.process)
+        return ending
 
     def _close(self) -> None:
         if self._processes is not None:
