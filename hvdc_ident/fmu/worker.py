@@ -169,8 +169,6 @@ class RequestHandler:
 def serve(connection: Connection, progress: memoryview[float], setup: Setup, learned: Mapping[str, Any]) -> None:
     """Answer requests until the connection closes or the FMU ends the process. learned: by earlier workers."""
     folder = str(setup.folder.binaries)
-    if setup.description.interface == "model-exchange":
-        import scipy.integrate  # noqa: F401 - loaded later it would count as the FMU's memory
     limit_memory(progress, setup.memory)
 
     def load(learned: dict[str, Any]) -> Instance:

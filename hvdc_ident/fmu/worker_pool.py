@@ -31,6 +31,8 @@ from hvdc_ident.parallel import Child, Ending, Watch, available_cores
 from hvdc_ident.parallel.progress import RESIDENT, SPACE, begin
 
 MIB = 2**20
+NEEDS = ("hvdc_ident.fmu.worker", "fmpy.fmi2", "fmpy.fmi3", "scipy.integrate")
+"""What a worker imports before it loads an FMU."""
 EXHAUSTED = 0.5
 """Share of its memory from which a process may have run out of it: one that grows by doubling is refused from half on."""
 
@@ -129,17 +131,22 @@ class _FmuWorker:
 
 @dataclass(eq=False)
 class _Processes:
-    """The processes of a pool and its folder. They end with the pool."""
+    """The processes of a pool and its folder. They end with the pool.
+
+    spare: started processes whose worker has ended: the next one begins there with everything imported.
+    """
 
     owner: int
     folder: Folder
     workers: dict[int, _FmuWorker] = field(default_factory=dict)
+    spare: list[Child] = field(default_factory=list)
 
     def close(self) -> None:
         """End all processes; remove the folder where no other process uses it."""
-        for worker in self.workers.values():
-            worker.process.close()
+        for child in (*(w.process for w in self.workers.values()), *self.spare):
+            child.close()
         self.workers.clear()
+        self.spare.clear()
         if self.owner == os.getpid():
             self.folder.release()
         else:
@@ -151,7 +158,7 @@ class WorkerPool:
     """The workers of one FMU. A pickled pool has none; it starts its own where it is unpickled.
 
     learned: what was found out about the FMU in its first runs, for later workers: "restart", how it is brought back to
-    its start (see `hvdc_ident.fmu.instance`), and "restart at a point"; "derivatives", by parameter whether a run confirmed the FMU's own.
+    its start (see `hvdc_ident.fmu.instance`), and "restart at a point".
     cache: runs that callers keep, see `hvdc_ident.fmu.terminal_effects`. memory: bytes of the first worker after its last
     answer. sensitivity_error: largest relative error of a derivative by differences. started: processes so far. runs:
     whole runs of the FMU so far, those for derivatives among them.
@@ -218,17 +225,13 @@ class WorkerPool:
     # --- shares of a request ---
 
     def _shares(self, heading: Mapping[str, Any]) -> list[list[str]]:
-        """Return the parameters of each worker where derivatives come from differences of whole runs; empty for one worker.
+        """Return the parameters of each worker where derivatives are asked for; empty for one worker.
 
         Columns of one worker and of several are the same to the last digit: the noise of runs and the difference steps
         that a worker finds are sent to all of them.
         """
         names: list[str] = heading.get("parameters", [])
         if heading["do"] != "simulate" or len(names) < 2 or "restart" not in self.learned:
-            return []
-        d, confirmed = self.description, self.learned.get("derivatives", {})
-        directions = heading.get("directions", {})
-        if d.directional and d.states and any(n not in directions and confirmed.get(n, True) for n in names):
             return []
         count = min(self.limits.workers or idle_cores(self._busy), len(names))
         return [names[i::count] for i in range(count)]
@@ -391,7 +394,12 @@ class WorkerPool:
         worker: _FmuWorker | None = None
         setup = Setup(self.description, processes.folder, self.limits.deadline, self.limits.memory)
         try:
-            child = Child(serve, setup, self.learned, keeps=[processes.folder.lock], finish=processes.folder.release)
+            if processes.spare:
+                child = processes.spare.pop()
+                child.again(serve, setup, self.learned)
+            else:
+                folder = processes.folder
+                child = Child(serve, setup, self.learned, keeps=[folder.lock], needs=NEEDS, finish=folder.release)
             worker = processes.workers[number] = _FmuWorker(child, self.limits.memory)
             answer, _ = self._heard(worker, "loading")
             if "failed" in answer:
@@ -416,7 +424,10 @@ class WorkerPool:
         if at is None:  # ended before
             return None
         del processes.workers[at]
-        return worker.process.end(trace=trace)
+        ending = worker.process.rest(trace=trace)
+        if ending is not None:
+            processes.spare.append(worker.process)
+        return ending
 
     def _close(self) -> None:
         if self._processes is not None:

@@ -18,6 +18,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import send_handle
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +70,9 @@ class Child:
     """A process that runs work(connection, progress, *arguments) and ends with this one. What it prints is kept.
 
     connection: to the work, of picklable objects. progress: memory that the work shares, see `hvdc_ident.parallel.progress`.
-    keeps: descriptors that it inherits under their numbers. finish: called, once this process has ended without closing
-    the child, by what guards it. Raises OSError where the system starts no process.
+    keeps: descriptors that it inherits under their numbers. needs: modules that what guards it loads, so that a work begun
+    again is spared that. finish: called, once this process has ended without closing the child, by what guards it. Raises
+    OSError where the system starts no process.
     """
 
     def __init__(
@@ -78,32 +80,46 @@ class Child:
         work: Callable[..., None],
         *arguments: object,
         keeps: Sequence[int] = (),
+        needs: Sequence[str] = (),
         finish: Callable[[], object] | None = None,
     ) -> None:
         self._owner = os.getpid()
         self._printed = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the child
-        here, there = socket.socketpair()
         control, far = socket.socketpair()
         root = str(Path(__file__).resolve().parents[2])
         path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
-        with there, far, progress_file() as noted:
+        with far, progress_file() as noted:
             self.progress = progress_in(noted.fileno())
-            begin(self.progress)
-            given = (there.fileno(), noted.fileno())
+            at = noted.fileno()
             self.guard = subprocess.Popen(
                 [sys.executable, "-P", "-c", f"from {inside.__name__} import main; main()", str(far.fileno())],
                 stdin=subprocess.DEVNULL,
                 stdout=self._printed,
                 stderr=self._printed,
-                pass_fds=(far.fileno(), *given, *keeps),
+                pass_fds=(far.fileno(), at, *keeps),
                 env={**os.environ, **one_thread(), "PYTHONPATH": path},
                 start_new_session=True,  # what a terminal sends to all its processes is for this one
             )
-        self.connection, self._control = Connection(here.detach()), Connection(control.detach())
+        self._control = Connection(control.detach())
         with contextlib.suppress(OSError):  # it has ended already: noticed when it is heard
-            self._control.send((os.getpid(), *given))
+            self._control.send((os.getpid(), at, tuple(needs)))
             self._control.send_bytes(pickle.dumps(finish))
+        self._begin(work, arguments)
+
+    def _begin(self, work: Callable[..., None], arguments: Sequence[object]) -> None:
+        here, there = socket.socketpair()
+        self.connection = Connection(here.detach())
+        begin(self.progress)
+        self.progress[PROCESS] = 0
+        with there, contextlib.suppress(OSError):  # what guards it has ended already: noticed when it is heard
+            send_handle(self._control, there.fileno(), self.guard.pid)
             self._control.send_bytes(pickle.dumps((work, arguments)))
+
+    def again(self, work: Callable[..., None], *arguments: object) -> None:
+        """Begin work in a new process, after `rest`; what the one before printed is forgotten."""
+        self._printed.seek(0)  # the processes that print share the place
+        self._printed.truncate()
+        self._begin(work, arguments)
 
     @property
     def pid(self) -> int:
@@ -123,14 +139,21 @@ class Child:
 
         trace: whether it tells its frames before; that takes a fifth of a second.
         """
-        ending = None
+        ending = self.rest(trace=trace)
+        self.close()
+        return ending
+
+    def rest(self, *, trace: bool = False) -> Ending | None:
+        """End it as `end` does, but keep what guards it, so that work can begin `again`; None where that is gone."""
         with contextlib.suppress(OSError, EOFError):
             self._control.send(trace)
         with contextlib.suppress(OSError, EOFError):
             if self._control.poll(PATIENCE):
                 ending = Ending(*self._control.recv())
+                self.connection.close()
+                return ending
         self.close()
-        return ending
+        return None
 
     def close(self) -> None:
         """End it without asking how; in a process that was forked from its owner, only let go of it."""

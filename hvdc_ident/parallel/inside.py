@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import faulthandler
+import importlib
 import math
 import os
 import pickle
@@ -24,6 +25,7 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
+from multiprocessing.reduction import recv_handle
 from typing import Any, NoReturn
 
 from hvdc_ident.parallel.progress import NOW, PROCESS, RESIDENT, SPACE, progress_in
@@ -37,23 +39,28 @@ PR_SET_PDEATHSIG = 1  # Linux: the signal that a process gets when its parent en
 
 
 def main() -> None:
-    """Start the child that the owner asks for, and guard it until it or its owner ends."""
+    """Start the child that the owner asks for, guard it until it or its owner ends, and start another where one is asked for."""
     try:
         control = Connection(int(sys.argv[1]))
-        owner, talk, noted = control.recv()  # pickled by the owner, which is trusted
-        finish, work = control.recv_bytes(), control.recv_bytes()
-        dumps, dumping = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        dumps.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
-        dumping.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the least: a few lines, then it waits to be read
-        guard, progress = os.getpid(), progress_in(noted)
-        pid = os.fork()
-        if pid == 0:
-            control.close()
+        owner, noted, needs = control.recv()  # pickled by the owner, which is trusted
+        finish, progress = control.recv_bytes(), progress_in(noted)
+        for module in needs:
+            importlib.import_module(module)
+        owners_end: list[int] = []
+        with contextlib.suppress(OSError, AttributeError):
+            owners_end = [os.pidfd_open(owner)]
+        asks = [control]
+        while os.getppid() == owner:
+            if control not in wait([*asks, *owners_end], None if owners_end else PATIENCE):
+                continue
+            try:
+                talk, work = recv_handle(control), control.recv_bytes()
+            except (EOFError, OSError):
+                asks = []  # an owner that lives on ends this process
+                continue
+            pid, dumps = _forked(control, talk, progress, work)
+            _Guard(control, owner, owners_end, pid, dumps, progress).guard()
             dumps.close()
-            _work(guard, Connection(talk), progress, dumping, work)
-        dumping.close()
-        os.close(talk)
-        _Guard(control, owner, pid, dumps, progress).guard()
         if left := pickle.loads(finish):
             left()
     except (EOFError, OSError):
@@ -61,26 +68,51 @@ def main() -> None:
     os._exit(0)
 
 
+def _forked(control: Connection, talk: int, progress: memoryview[float], work: bytes) -> tuple[int, socket.socket]:
+    """Return the new process that does the work, and what takes its frames."""
+    dumps, dumping = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    dumps.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+    dumping.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1)  # the least: a few lines, then it waits to be read
+    guard = os.getpid()
+    pid = os.fork()
+    if pid == 0:
+        control.close()
+        dumps.close()
+        _work(guard, Connection(talk), progress, dumping, work)
+    dumping.close()
+    os.close(talk)
+    return pid, dumps
+
+
 class _Guard:
-    """What guards a child. control: to the owner. dumps: takes the child's frames, and ends with it."""
+    """What guards a child. control: to the owner. dumps: takes the child's frames, and ends with it.
+
+    owners_end: what the system makes ready when the owner ends; empty where it does not tell.
+    """
 
     def __init__(
-        self, control: Connection, owner: int, pid: int, dumps: socket.socket, progress: memoryview[float]
+        self,
+        control: Connection,
+        owner: int,
+        owners_end: list[int],
+        pid: int,
+        dumps: socket.socket,
+        progress: memoryview[float],
     ) -> None:
-        self.control, self.owner, self.pid, self.dumps, self.progress = control, owner, pid, dumps, progress
+        self.control, self.owner, self.owners_end = control, owner, owners_end
+        self.pid, self.dumps, self.progress = pid, dumps, progress
         self.space = self.resident = 0  # most bytes of address space and of memory that it was seen with
         self.dumped: dict[int, list[bytes]] = {}  # by process
-        self.owners_end: list[int] = []
-        with contextlib.suppress(OSError, AttributeError):
-            self.owners_end = [os.pidfd_open(owner)]
 
     def guard(self) -> None:
-        """Return once the child and its owner have ended."""
+        """Return once the child has ended and its owner knows how, or is gone."""
+        asked = False
         while os.getppid() == self.owner:
             ready = wait([self.control, self.dumps, *self.owners_end], None if self.owners_end else PATIENCE)
             if self.dumps in ready and not self._read():
                 break
             if self.control in ready:
+                asked = True
                 with contextlib.suppress(EOFError, OSError):
                     if self.control.recv():
                         self._ask_where_it_is()
@@ -94,9 +126,10 @@ class _Guard:
         resident = max(self.resident, usage.ru_maxrss * 1024)
         with contextlib.suppress(OSError, EOFError):
             self.control.send((os.waitstatus_to_exitcode(status), resident, self.space, self._traces()))
-            self.control.recv()  # never: it ends when the owner closes it
-        while os.getppid() == self.owner:  # an owner that lives on ends this process
-            wait(self.owners_end, None if self.owners_end else PATIENCE)
+            while not asked and os.getppid() == self.owner:  # the owner asks for its end when it notices
+                asked = self.control in wait([self.control, *self.owners_end], None if self.owners_end else PATIENCE)
+                if asked:
+                    self.control.recv()
 
     def _processes(self) -> list[int]:
         """The child and, where its work is in a process of its own, that."""

@@ -16,7 +16,10 @@ SPRING_CODE = (
     HEAD
     + """
 #define NR 16
-#define INITIALIZE(r) (r[0] = r[8])
+#ifndef RELEASED
+#define RELEASED 0.0
+#endif
+#define INITIALIZE(r) (r[0] = r[8] + RELEASED)
 static void start(double *r) { r[4] = 2; r[5] = 0.5; r[6] = 8; r[7] = 0.25; }
 static void equations(double *r, double t) {
     r[2] = r[1];
@@ -38,9 +41,6 @@ static int spring_along(void *c, const unsigned *un, unsigned long nu, const uns
     s[9] = 2 * d[1] + d[7];
 #ifdef SHIFTS
     for (unsigned long i = 0; i < nk; i++) if (kn[i] == 4) r[4] *= 1 + SHIFTS;
-#endif
-#ifdef LATER
-    for (unsigned long i = 0; i < nk; i++) if (kn[i] == 4 && fabs(r[0]) > 0.5) s[3] *= LATER;
 #endif
     for (unsigned long i = 0; i < nu; i++) out[i] = s[un[i]] * WRONG;
     return 0;
@@ -70,6 +70,10 @@ def spring(
     """The spring, with directional derivatives of its own, wrong ones, or none. more: what else goes wrong with them."""
     defines = (f"NOMINAL={nominal}", *(["OWN_DERIVATIVES", f"WRONG={wrong}", *more] if own else []))
     return CModel(name, SPRING_CODE, SPRING_VARIABLES, 2, 0, directional=own, defines=defines)
+
+
+# The spring without derivatives of its own, let go at 1 beside its place of rest.
+RELEASED = CModel("released", SPRING_CODE, SPRING_VARIABLES, 2, 0, defines=("RELEASED=1.0",))
 
 
 # Falls from h, bounces with the factor e.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -12,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from hvdc_ident.parallel import ChildEndedError, call
+from hvdc_ident.parallel import Child, ChildEndedError, call, inside
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="this system hands no descriptors on")
 
@@ -59,6 +60,25 @@ def test_what_it_printed_last_is_told() -> None:
     with pytest.raises(ChildEndedError) as ended:
         call(exec, "import os; print('bad superblock', flush=True); os._exit(3)", seconds=60.0)
     assert ended.value.printed == "bad superblock"
+
+
+def test_work_begins_again_in_a_new_process_of_the_same_guard() -> None:
+    """After an end that was asked for and after a crash; nothing of the one before reaches the next."""
+    child = Child(inside.answer, os.getpid, (), needs=("sqlite3",))
+    first, _ = child.connection.recv()
+    assert first == child.pid and child.rest() is not None
+    child.again(inside.answer, exec, ("import os; print('bad', flush=True); os.abort()",))
+    with pytest.raises((EOFError, OSError)):
+        child.connection.recv()
+    assert "bad" in child.printed
+    ended = child.rest()
+    assert ended is not None and ended.code == -signal.SIGABRT
+    child.again(inside.answer, eval, ("__import__('os').getppid(), 'sqlite3' in __import__('sys').modules",))
+    (guard, loaded), _ = child.connection.recv()
+    assert guard == child.guard.pid and loaded and "bad" not in child.printed
+    ended = child.end()
+    assert ended is not None and "abort" not in ended.traces
+    assert child.guard.returncode is not None
 
 
 def test_nothing_of_it_stays() -> None:
