@@ -7,6 +7,7 @@ first order, each error a normal variable about 0, so chi2 with the best of them
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.moves import STATED_ERROR, derivative
 from hvdc_ident.discrepancy.options import CERTAIN, LISTED, REFUTED, SearchContext
-from hvdc_ident.text import figures, listed, percentage
+from hvdc_ident.text import listed, percentage, quantity
 
 LEVEL_ERROR = 0.005
 """Share of an output's range by which its recorded level may be off: the accuracy class 0.5 of IEC 61869 and 60688."""
@@ -28,13 +29,13 @@ COVERED = 2.0
 class KnownErrors:
     """The likeliest errors of a model and its records.
 
-    errors: by stated value its relative error, by output that of its level in the output's unit, the most unlikely first; levels:
-    the outputs among them. chi2: of the residuals with these errors, and of the errors themselves. p: the chance of errors so
-    large.
+    errors: by stated value its relative error, by output that of its level in the output's unit, the most unlikely first;
+    levels: the outputs among them, with their units. chi2: of the residuals with these errors, and of the errors themselves. p: the
+    chance of errors so large.
     """
 
     errors: dict[str, float]
-    levels: frozenset[str]
+    levels: Mapping[str, str]
     chi2: float
     p: float
 
@@ -45,7 +46,7 @@ class KnownErrors:
 
     def __str__(self) -> str:
         each = [
-            f"the level of {n} by {figures(e, 2)}" if n in self.levels else f"{n} by {percentage(e, 1)}"
+            f"the level of {n} by {quantity(e, self.levels[n], 2)}" if n in self.levels else f"{n} by {percentage(e, 1)}"
             for n, e in list(self.errors.items())[:LISTED]
         ]
         return listed(each)
@@ -75,7 +76,9 @@ def known_errors(search: SearchContext, here: Refit) -> KnownErrors | None:
     order = np.argsort(-np.abs(best), kind="stable")
     names = list(sizes)
     errors = {names[k]: float(best[k] * sizes[names[k]]) for k in order}
-    return KnownErrors(errors, frozenset(outputs), here.chi2 + float(asked @ best), chance)
+    known = here.model.outputs
+    units = {o: known[o].unit if o in known else "" for o in outputs}
+    return KnownErrors(errors, units, here.chi2 + float(asked @ best), chance)
 
 
 def _range(here: Refit, output: str) -> float:
