@@ -41,7 +41,7 @@ def build_core() -> None:
     if command is None:
         raise RuntimeError("the core in C needs a compiler: install one (cc), or pip install ziglang")
     for build, flags in BUILDS.items():
-        target = CORE / f"core-{build}.so"
+        target = CORE / f"core-{build}.so.1"
         subprocess.run([*command, *FLAGS, *flags, str(CORE / "all.c"), "-o", str(target), "-lm"], check=True)
 
 

@@ -21,7 +21,7 @@ from hvdc_ident.simulate.core import BUILDS
 
 ROOT = Path(__file__).resolve().parents[1]
 KEPT_OUT = shutil.ignore_patterns("__pycache__", ".*", "*-results", "build", "dist", "*.egg-info")
-BUILD = "import sys; import build_backend as b; print(getattr(b, sys.argv[1])(sys.argv[2]))"
+BUILD = "import sys; sys.path.insert(0, ''); import build_backend as b; print(getattr(b, sys.argv[1])(sys.argv[2]))"
 DATA = re.compile(r"\.(toml|j2|html|css|js|c|h)$|(py\.typed|LICENSE)$")
 
 
@@ -54,7 +54,7 @@ def test_the_wheel_holds_the_package_with_its_data_and_nothing_else(built: dict[
     with zipfile.ZipFile(built["wheel"]) as archive:
         held = {n for n in archive.namelist() if ".dist-info/" not in n}
     wanted = _package_files()
-    core = {f"hvdc_ident/simulate/core/core-{build}.so" for build in BUILDS}
+    core = {f"hvdc_ident/simulate/core/core-{build}.so.1" for build in BUILDS}
     assert held == wanted | core
     endings = {p.rpartition(".")[2] for p in held}
     assert endings >= {"py", "typed", "toml", "j2", "css", "js", "c", "h"}

@@ -33,6 +33,7 @@ from hvdc_ident.parallel.child import Ending
 BATCH = 0.02  # s of work that is sent and reported at a time: a kill of the parent loses no more of each worker's
 AHEAD = 2  # batches of quick items that each worker has, so that it works while the last one's outcomes are stored
 MOST = 1000  # items of a batch
+LOOK = 1.0  # s between two looks at workers that report nothing
 DEATHS = 2  # of workers at the same item before it is given up
 
 Batch = list[tuple[int, Any]]
@@ -49,6 +50,9 @@ class Workers(Protocol):
 
     def why(self, error: BaseException) -> tuple[str, bool]:
         """Return why a future has no value, and whether that is the worker's end: another one may have it."""
+
+    def end_lost(self) -> None:
+        """End the futures of workers that have ended without a word."""
 
 
 def outcomes_of(workers: Workers, function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Outcome]:
@@ -75,7 +79,7 @@ def outcomes_of(workers: Workers, function: Callable[[Any], Any], items: Iterabl
                 running[workers.submit(work_on, name, sent, batch)] = batch
             if not running:
                 return
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+            for future in _first_done(workers, running):
                 batch = running.pop(future)
                 error = CancelledError() if future.cancelled() else future.exception()
                 if error is None and future.result() is None:
@@ -102,9 +106,18 @@ def outcomes_of(workers: Workers, function: Callable[[Any], Any], items: Iterabl
             future.cancel()
 
 
+def _first_done(workers: Workers, running: Iterable[Future[Any]]) -> set[Future[Any]]:
+    """Return those futures that are done, once any is."""
+    futures = tuple(running)
+    while not (done := wait(futures, LOOK, FIRST_COMPLETED).done):
+        workers.end_lost()
+    return done
+
+
 def _loads(workers: Workers, name: str, content: bytes) -> bool:
     """Return True where a worker can load the function. Raises ComputationError."""
-    error = workers.submit(work_on, name, content, []).exception()
+    (future,) = _first_done(workers, [workers.submit(work_on, name, content, [])])
+    error = future.exception()
     if error is not None:
         raise _cannot_begin(workers.why(error)[0])
     return True
@@ -195,6 +208,11 @@ class OpenPool:
             return "its worker ended", True
         return f"no result after {self._timeout:g} s" if isinstance(error, TimeoutError) else one_line(error), False
 
+    def end_lost(self) -> None:
+        """End the futures of workers that have ended without a word."""
+        for worker in self._workers:
+            worker.end_lost()
+
     def close(self) -> None:
         """End the workers."""
         for worker in self._workers:
@@ -207,13 +225,15 @@ class _Worker:
     """A process that is started when it is first needed, and anew when it has ended.
 
     It is a pebble pool of its own: in one of several processes (5.2) the task of a process that ends just after it took it may
-    never be reported, while others are at work; alone, its end breaks the pool, which is.
+    never be reported, while others are at work; alone, its end breaks the pool, which is. What is given to a pool that is about to
+    break may still be lost.
     """
 
     def __init__(self, context: Any) -> None:
         self._context = context
         self._pool: Any = None
         self._given: list[Future[Any]] = []
+        self._silent = False  # at the last look it had ended, and owed an answer
 
     def load(self) -> int:
         """Return how many futures it has not done."""
@@ -227,9 +247,22 @@ class _Worker:
         if self._pool is None or not self._pool.active:
             self.stop()
             self.join()
+            self._end_given()
             self._pool = pebble.ProcessPool(1, initializer=_end_with_parent, context=self._context)
         self._given.append(self._pool.submit(function, timeout, *arguments))
         return self._given[-1]
+
+    def end_lost(self) -> None:
+        """End the futures that the pool has not ended itself since the last look, where it has broken."""
+        silent = self._pool is not None and not self._pool.active and self.load() > 0
+        if silent and self._silent:
+            self._end_given()
+        self._silent = silent
+
+    def _end_given(self) -> None:
+        for future in self._given:
+            if not future.done():
+                future.set_exception(BrokenProcessPool("its worker ended"))
 
     def stop(self) -> None:
         """Let it end."""

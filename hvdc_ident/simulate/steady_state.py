@@ -393,8 +393,9 @@ class Equilibria:
     def _judged(self, v: Array, p: Array, u: Array, time: float) -> tuple[Array, Array, Array]:
         """(residual, Jacobian, scaled residuals) of the rest equations at v."""
         r, jac, weights = self._equations(p, u, time).judged(self._region.size, v)
-        rounding = np.abs(jac) @ np.abs(v)
-        shares = np.where(np.abs(r) <= 16.0 * EPSILON * rounding, 0.0, np.abs(r) / weights)
+        with np.errstate(all="ignore"):  # where something is no number, its share is none either
+            rounding = np.abs(jac) @ np.abs(v)
+            shares = np.where(np.abs(r) <= 16.0 * EPSILON * rounding, 0.0, np.abs(r) / weights)
         return r, jac, shares
 
     # --- where a search begins ---

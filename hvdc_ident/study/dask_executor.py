@@ -46,6 +46,9 @@ class DaskExecutor:
             return "its worker died", True
         return ("the cluster gave it up", True) if isinstance(error, CancelledError) else (one_line(error), False)
 
+    def end_lost(self) -> None:
+        """Do nothing: the scheduler hears of workers that end."""
+
 
 @contextmanager
 def dask_executor(address: str) -> Iterator[DaskExecutor]:

@@ -13,7 +13,7 @@ WITH_EXAMPLES = (
     "hvdc_ident.formats",
     "hvdc_ident.data.signals",
     "hvdc_ident.linearize.distance",
-    "hvdc_ident.linearize.jacobian",
+    "hvdc_ident.linearize.linearisation",
     "hvdc_ident.linearize.loops",
     "hvdc_ident.linearize.operating_point",
     "hvdc_ident.models",

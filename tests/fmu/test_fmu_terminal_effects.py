@@ -65,7 +65,9 @@ def test_runs_and_derivatives_agree_with_the_twin(fmu, uses, names):
     assert [n for n in model.parameters if n not in TWIN.parameters] == names[:1] + [
         n for n in twin.parameters if n not in TWIN.parameters
     ][1:]
-    found = simulate(model, RUN, {"d": 0.6}, ["k", *names])
+    # A play lets go where its signal turns, and lags it by so little before that only tight tolerances see when.
+    rtol = 1e-10 if any(u["effect"] == "backlash" for u in uses) else None
+    found = simulate(model, RUN, {"d": 0.6}, ["k", *names], rtol=rtol)
     wanted = simulate(twin, RUN, {"d": 0.6}, ["k", *names], rtol=1e-10)
     for output in ("y", "twice"):
         scale = np.ptp(wanted[output])

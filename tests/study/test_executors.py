@@ -105,6 +105,32 @@ def test_a_script_without_a_guard_around_its_main_part_is_told_so(tmp_path):
     assert found.returncode == 1 and "if __name__ == '__main__'" in found.stderr.splitlines()[-1]
 
 
+def test_what_a_broken_pool_was_given_and_never_reported_is_lost_and_done_again(monkeypatch):
+    """As where it breaks while it is given something: the future is neither done nor anybody's."""
+    from concurrent.futures import Future
+
+    import pebble
+
+    class Broken:
+        active = False
+
+        def __init__(self, *arguments, **settings):
+            pass
+
+        def submit(self, *arguments):
+            monkeypatch.undo()
+            return Future()
+
+        def stop(self):
+            pass
+
+        def join(self):
+            pass
+
+    monkeypatch.setattr(pebble, "ProcessPool", Broken)
+    assert list(LocalPool(1).map(abs, [-1, -2, -3])) == [1, 2, 3]
+
+
 def test_items_that_end_their_worker_at_once_are_all_told_of(tmp_path):
     """Also where this process is too busy to hear that a worker took an item before it is gone."""
     stop = threading.Event()

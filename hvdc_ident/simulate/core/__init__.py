@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 FOLDER = Path(__file__).parent
 BUILDS = {"avx2": ("avx2", "fma"), "baseline": ()}
 """The builds of the library, best first, with the features of the processor that each needs."""
-LIBRARY = "core-{build}.so"
+LIBRARY = "core-{build}.so.1"
 STATUSES = (
     "converged", "step-limit", "not-finite", "chatter", "inconsistent", "stiff", "sliding", "two-slides", "out-of-memory",
 )  # fmt: skip
