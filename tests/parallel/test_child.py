@@ -64,16 +64,16 @@ def test_what_it_printed_last_is_told() -> None:
 
 def test_work_begins_again_in_a_new_process_of_the_same_guard() -> None:
     """After an end that was asked for and after a crash; nothing of the one before reaches the next."""
-    child = Child(inside.answer, os.getpid, (), needs=("sqlite3",))
+    child = Child(inside.answer, os.getpid, (), None, needs=("sqlite3",))
     first, _ = child.connection.recv()
     assert first == child.pid and child.rest() is not None
-    child.again(inside.answer, exec, ("import os; print('bad', flush=True); os.abort()",))
+    child.again(inside.answer, exec, ("import os; print('bad', flush=True); os.abort()",), None)
     with pytest.raises((EOFError, OSError)):
         child.connection.recv()
     assert "bad" in child.printed
     ended = child.rest()
     assert ended is not None and ended.code == -signal.SIGABRT
-    child.again(inside.answer, eval, ("__import__('os').getppid(), 'sqlite3' in __import__('sys').modules",))
+    child.again(inside.answer, eval, ("__import__('os').getppid(), 'sqlite3' in __import__('sys').modules",), None)
     (guard, loaded), _ = child.connection.recv()
     assert guard == child.guard.pid and loaded and "bad" not in child.printed
     ended = child.end()
