@@ -1,6 +1,6 @@
-"""Derivatives of an FMU: the Jacobian at a point, and differences of whole runs. In worker processes only.
+"""Derivatives of an FMU: directional derivatives and the Jacobian at a point, and differences of whole runs.
 
-At a point, directional derivatives are used where the FMU offers them and they agree with differences.
+Directional derivatives are used where the FMU offers them and they agree with differences. In worker processes only.
 
 A run has noise (its integrator's, and that of rows which an event passes): fourth differences over short steps of all
 parameters at once show it. A pair of runs around a parameter then gives its derivative, and the curvature from which the
@@ -59,6 +59,40 @@ class DirectionalDerivative:
         for i, k in self._identities:
             result[i] = seed[k]
         return result
+
+    def matrix(self) -> Array:
+        """(unknowns, knowns): every unit direction."""
+        return np.column_stack([self.along(row) for row in np.eye(self._m)]) if self._m else np.zeros((self._count, 0))
+
+
+class SensitivityEquations:
+    """S' = A S + df/dp and dy/dp of a run, by parameters or by constants added to inputs, from directional derivatives."""
+
+    def __init__(
+        self, instance: Instance, parameters: Sequence[str], sizes: Sequence[float], outputs: Sequence[str]
+    ) -> None:
+        d = instance.description
+        states = [v.reference for v in d.states.values()]
+        recorded = [d.variable(n).reference for n in outputs]
+        varied = {**d.inputs, **d.parameters}
+        self.sizes = tuple(sizes)
+        self.count = len(parameters)
+        self._a = DirectionalDerivative(instance, d.derivatives, states)
+        knowns = [[*states, varied[n].reference] for n in parameters]
+        self._derivatives = [DirectionalDerivative(instance, d.derivatives, k) for k in knowns]
+        self._outputs = [DirectionalDerivative(instance, recorded, k) for k in knowns]
+
+    def state_matrix(self) -> Array:
+        """(nx, nx) A."""
+        return self._a.matrix()
+
+    def derivatives(self, j: int, s: Array) -> Array:
+        """(nx,) dS/dt of the column of parameter j."""
+        return self._derivatives[j].along(np.append(s, 1.0))
+
+    def outputs(self, j: int, s: Array) -> Array:
+        """(outputs,) dy/dp of parameter j."""
+        return self._outputs[j].along(np.append(s, 1.0))
 
 
 class PointEvaluation:

@@ -1,4 +1,7 @@
-"""A run of a model-exchange FMU: scipy's LSODA between events, which are located on its interpolant. In worker processes only."""
+"""A run of a model-exchange FMU: scipy's LSODA between events, which are located on its interpolant. In worker processes only.
+
+Sensitivities S = dx/dp are integrated as additional states, S' = A S + df/dp, each column one directional derivative.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.fmu.derivatives import SensitivityEquations
 from hvdc_ident.fmu.fmi import DISCARD, FmiError, VariableGroup
 from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
 from hvdc_ident.fmu.piecewise_linear import Interpolant, PackedInputs
@@ -20,6 +24,11 @@ MAX_EVENTS = 100_000  # at states, of a run
 MAX_CHATTER = 50  # events within CHATTER_SPAN of each other
 CHATTER_SPAN = 1e-9  # share of the span
 MAX_RETRIES = 8  # shorter steps tried where the FMU discards a point
+JUMP_TOLERANCE = 1e-6  # change of a derivative at an event, against its size, that sensitivities cannot pass
+
+
+class SensitivitiesLost(Exception):
+    """An event at which a derivative or a state jumps: the columns S are not right after it."""
 
 
 @dataclass
@@ -34,14 +43,20 @@ class Counts:
 
 @dataclass
 class ModelExchangeRun:
-    """One run. names: of the recorded variables. outputs: (n, names), filled row by row."""
+    """One run. names: of the recorded variables. equations: of the sensitivities, or None. start: (nx, np) dx0/dp.
+
+    max_steps: after which the run is given up. outputs (n, names) and gradients (n, names, np) are filled row by row.
+    """
 
     instance: Instance
     signals: PackedInputs
     time: Array
     names: tuple[str, ...]
     tolerance: float
+    equations: SensitivityEquations | None = None
+    start: Array | None = None
     counts: Counts = field(default_factory=Counts)
+    max_steps: int = MAX_STEPS
 
     def __post_init__(self) -> None:
         self.library = self.instance.library
@@ -54,7 +69,9 @@ class ModelExchangeRun:
         ]
         self.continuous_inputs = VariableGroup(self.library, [variables[k] for k in self.continuous])
         self.recorded = self.instance.variables(self.names)
+        self.columns = self.equations.count if self.equations else 0
         self.outputs = np.empty((self.time.size, len(self.names)))
+        self.gradients = np.zeros((self.time.size, len(self.names), self.columns))
         self.applied: list[float] | None = None  # present values of the continuous inputs
         self.flat = False  # whether they keep them until the segment's end
         self.row = 0
@@ -67,7 +84,7 @@ class ModelExchangeRun:
         self.rounding = 0.0  # difference up to which instants are one
 
     def go(self, values: Mapping[str, float]) -> None:
-        """Fill every row. Raises RunFailed or FmiError; RunEnded with the rows up to the end."""
+        """Fill every row. Raises RunFailed, FmiError or SensitivitiesLost; RunEnded with the rows up to the end."""
         try:
             self._go(values)
         except RunEnded as e:
@@ -82,20 +99,21 @@ class ModelExchangeRun:
         self.instance.begin(values, self._inputs_at(t, before_jump=True), t, self.end, self.tolerance)
         x = self.library.get_states()
         self.atol = 1e-2 * self.tolerance * self.instance.nominals()
+        y = np.concatenate([x, *(self.start.T if self.start is not None and self.columns else [])])
         stops = sorted({*(s for s in self.signals.breaks.tolist() if t <= s <= self.end), self.end})
         self.rounding = self._rounding(t)
-        t, x = self._stop_at(t, x, stops)
+        t, y = self._stop_at(t, y, stops)
         while t < self.end:
             stop = next(s for s in stops if s > t)
             due = self.instance.next_time
             self.rounding = self._rounding(stop)
             if due is not None and due <= t + self.rounding:
-                t, x = self._stop_at(t, x, stops)
+                t, y = self._stop_at(t, y, stops)
                 continue
             self.segment_end = stop if due is None or abs(due - stop) <= self.rounding else min(due, stop)
-            t, x = self._segment(t, x, self.segment_end)
+            t, y = self._segment(t, y, self.segment_end)
             if t >= self.segment_end:
-                t, x = self._stop_at(t, x, stops)
+                t, y = self._stop_at(t, y, stops)
 
     def _rounding(self, t: float) -> float:
         """Return the difference up to which instants are one: no integrator can step from one to the other.
@@ -111,22 +129,22 @@ class ModelExchangeRun:
 
     # --- between stops ---
 
-    def _segment(self, t: float, x: Array, end: float) -> tuple[float, Array]:
+    def _segment(self, t: float, y: Array, end: float) -> tuple[float, Array]:
         """Integrate to `end` or to an event before it, which is processed; return the instant and the states."""
         self.counts.segments += 1
         self.positive = self.library.get_indicators() > 0.0
         self.flat = False
-        self._set_point(t, x)
+        self._set_point(t, y[: self.nx])
         self.flat = all(self.inputs[k].is_flat(t, end) for k in self.continuous)
         with warnings.catch_warnings(record=True) as caught:  # of the integrator, quoted where it gives up
             warnings.simplefilter("always")
             try:
-                return self._steps(t, x, end, caught)
+                return self._steps(t, y, end, caught)
             finally:
                 self.flat = False
 
-    def _steps(self, t: float, x: Array, end: float, caught: list[warnings.WarningMessage]) -> tuple[float, Array]:
-        solver = self._solver(t, x, end)
+    def _steps(self, t: float, y: Array, end: float, caught: list[warnings.WarningMessage]) -> tuple[float, Array]:
+        solver = self._solver(t, y, end)
         rows, completed = self.time.tolist(), self.instance.description.completed_step
         retries = 0
         while solver.status == "running":
@@ -137,44 +155,47 @@ class ModelExchangeRun:
                 if e.status != DISCARD or retries == MAX_RETRIES:
                     raise
                 retries += 1
-                solver = self._solver(before, x, end, (end - before) * 10.0**-retries)
+                solver = self._solver(before, y, end, (end - before) * 10.0**-retries)
                 continue
-            x = solver.y.copy() if self.nx else x
-            if not np.isfinite(x.sum()):
+            y = solver.y.copy() if self.nx else y
+            if not np.isfinite(y.sum()):
                 raise RunFailed("a state is not finite", float(solver.t), "check parameter values and limits")
             event = self._crossing(solver, before)
             t = float(solver.t) if event is None else event
             if self.row < len(rows) and rows[self.row] <= t:
                 self._record_until(solver.dense_output(), min(t, end - self.rounding))
             if event is not None and self.nx:
-                x = np.asarray(solver.dense_output()(event), dtype=float)
+                y = np.asarray(solver.dense_output()(event), dtype=float)
             if completed or event is not None or t >= end:
-                self._set_point(t, x, before_jump=t >= end)
+                self._set_point(t, y[: self.nx], before_jump=t >= end)
             wanted, over = self.library.completed_integrator_step() if completed else (False, False)
             if over:
                 raise RunEnded(t)
             if event is not None:
                 self._count_state_event(t)
-                return t, self._event_at(t, x, None)
+                return t, self._event_at(t, y, None)
             if wanted:
-                after = self._step_event(t, x, t - before)
+                after = self._step_event(t, y, t - before)
                 if after is not None:
                     return t, after
-        return end, x
+        return end, y
 
-    def _solver(self, t: float, x: Array, end: float, most: float = np.inf) -> Any:
+    def _solver(self, t: float, y: Array, end: float, most: float = np.inf) -> Any:
         from scipy.integrate import LSODA
 
+        atol = np.concatenate([self.atol, *(self.atol / s for s in (self.equations.sizes if self.equations else []))])
         dummy = self.nx == 0
         if dummy:
             most = min(most, (end - t) / 50)
+        jac = self._jacobian if self.equations is not None and not dummy else None
         return LSODA(
             (lambda _t, _y: np.zeros(1)) if dummy else self._derivatives,
             t,
-            np.zeros(1) if dummy else x,
+            np.zeros(1) if dummy else y,
             end,
             rtol=self.tolerance,
-            atol=1.0 if dummy else self.atol,
+            atol=1.0 if dummy else atol,
+            jac=jac,
             max_step=most,
         )
 
@@ -186,9 +207,9 @@ class ModelExchangeRun:
             raise RunFailed(
                 f"the integrator gave up: {' '.join(text.split())[:200]}", float(solver.t), "check parameter values"
             )
-        if self.counts.accepted - self.before > MAX_STEPS:
+        if self.counts.accepted - self.before > self.max_steps:
             raise RunFailed(
-                f"more than {MAX_STEPS} steps", float(solver.t), "look for a very fast part of the model"
+                f"more than {self.max_steps} steps", float(solver.t), "look for a very fast part of the model"
             )
 
     def _set_point(self, t: float, x: Array, *, before_jump: bool = False) -> None:
@@ -201,10 +222,26 @@ class ModelExchangeRun:
                 self.continuous_inputs.set(u)
                 self.applied = u
 
-    def _derivatives(self, t: float, x: Array) -> Array:
+    def _derivatives(self, t: float, y: Array) -> Array:
         self.counts.evaluations += 1
-        self._set_point(t, x)
-        return self.library.get_derivatives().copy()
+        self._set_point(t, y[: self.nx])
+        derivatives = self.library.get_derivatives()
+        if not self.columns:
+            return derivatives.copy()
+        result = np.empty(y.size)
+        result[: self.nx] = derivatives
+        assert self.equations is not None
+        for j in range(self.columns):
+            part = slice((j + 1) * self.nx, (j + 2) * self.nx)
+            result[part] = self.equations.derivatives(j, y[part])
+        return result
+
+    def _jacobian(self, t: float, y: Array) -> Array:
+        """Return the matrix of the stiff method's iteration: A on the diagonal, without the coupling of S to x."""
+        assert self.equations is not None
+        self._set_point(t, y[: self.nx])
+        a = self.equations.state_matrix()
+        return np.asarray(np.kron(np.eye(1 + self.columns), a), dtype=float) if self.columns else a
 
     # --- events ---
 
@@ -269,28 +306,29 @@ class ModelExchangeRun:
         self.close = [s for s in self.close if t - s <= CHATTER_SPAN * span] + [t]
         return len(self.close) > MAX_CHATTER
 
-    def _step_event(self, t: float, x: Array, step: float) -> Array | None:
+    def _step_event(self, t: float, y: Array, step: float) -> Array | None:
         """Process the event that the FMU wants after a completed step of this length; return the states after it.
 
         Some FMUs want one after every step. Where it changes neither the states nor the next time event, and no
         derivative by so much that another such step would differ by its tolerance, it returns None: the integrator goes on.
         """
         due, old = self.instance.next_time, self.library.get_derivatives().copy()
-        after = self._event_at(t, x, None)
+        after = self._event_at(t, y, None)
         self.positive = self.library.get_indicators() > 0.0
+        x = y[: self.nx]
         moved = step * np.abs(self.library.get_derivatives() - old) > self.atol + self.tolerance * np.abs(x)
         if np.array_equal(after[: self.nx], x) and due == self.instance.next_time and not moved.any():
             return None
         self._count_state_event(t)
         return after
 
-    def _event_at(self, t: float, x: Array, u: Array | None) -> Array:
+    def _event_at(self, t: float, y: Array, u: Array | None) -> Array:
         """Return the states after event mode at t; inputs u are set in it where they jump.
 
         Some FMUs decide in event mode by what they computed last, in which a search for the event may have left them on
         its other side: so derivatives and indicators are computed here first.
         """
-        self.library.get_derivatives()
+        old = self.library.get_derivatives().copy()
         self.library.get_indicators()
         self.library.enter_event_mode()
         if u is not None:
@@ -298,17 +336,27 @@ class ModelExchangeRun:
             self.applied = None
         changed = self.instance.update_discrete_states(t)
         self.library.enter_continuous_time_mode()
-        return self.library.get_states() if changed else x
+        x = self.library.get_states() if changed else y[: self.nx]
+        if self.columns:
+            jumped = bool(np.abs(x - y[: self.nx]).max(initial=0.0) > 0.0)
+            if u is None:
+                size = np.abs(old).max(initial=0.0) + np.abs(self.library.derivatives.values).max(initial=0.0)
+                jumped |= bool(
+                    np.abs(self.library.get_derivatives() - old).max(initial=0.0) > JUMP_TOLERANCE * max(size, 1e-300)
+                )
+            if jumped:
+                raise SensitivitiesLost(f"a state or a derivative jumps at {t:.6g} s")
+        return np.concatenate([x, y[self.nx :]]) if changed else y
 
-    def _stop_at(self, t: float, x: Array, stops: Sequence[float]) -> tuple[float, Array]:
+    def _stop_at(self, t: float, y: Array, stops: Sequence[float]) -> tuple[float, Array]:
         """Process a stop and those that differ from it by rounding; return the instant of the last and the states after it.
 
         Rows before its jump are recorded, then time events and inputs act, then rows after it.
         """
-        self._set_point(t, x, before_jump=True)
+        self._set_point(t, y[: self.nx], before_jump=True)
         near = t + self.rounding
         while self.row + 1 < self.time.size and self.time[self.row] == self.time[self.row + 1] <= near:
-            self._record()
+            self._record(y)
         before, breaks = self._inputs_at(t, before_jump=True), stops[bisect_left(stops, t) : bisect_right(stops, near)]
         t = max([t, *breaks])
         while (due := self.instance.next_time) is not None and due <= near:
@@ -316,15 +364,15 @@ class ModelExchangeRun:
             if self._count_event(t):
                 raise RunFailed("the FMU asks for time events without end", t, "export it again, or as co-simulation")
             self.library.set_time(t)
-            x = self._event_at(t, x, None)
+            y = self._event_at(t, y, None)
         u = self._inputs_at(t, before_jump=False)
         if breaks and (u != before).any():
-            x = self._event_at(t, x, u)
+            y = self._event_at(t, y, u)
         self.segment_end = self.end + 1.0 if t < self.end else t
-        self._set_point(t, x)
+        self._set_point(t, y[: self.nx])
         while self.row < self.time.size and self.time[self.row] <= t:
-            self._record()
-        return t, x
+            self._record(y)
+        return t, y
 
     # --- rows ---
 
@@ -332,11 +380,14 @@ class ModelExchangeRun:
         """Record the rows of a step that lie before t; those at a stop, but for rounding, are recorded there."""
         while self.row < self.time.size and self.time[self.row] < t:
             s = float(self.time[self.row])
-            x = np.asarray(dense(s), dtype=float) if self.nx else np.zeros(0)
-            self._set_point(s, x)
-            self._record()
+            y = np.asarray(dense(s), dtype=float) if self.nx else np.zeros(0)
+            self._set_point(s, y[: self.nx])
+            self._record(y)
 
-    def _record(self) -> None:
+    def _record(self, y: Array) -> None:
         """Record the next row, at whose instant the FMU is."""
         self.outputs[self.row] = self.recorded.get()
+        if self.equations is not None:
+            for j in range(self.columns):
+                self.gradients[self.row, :, j] = self.equations.outputs(j, y[(j + 1) * self.nx : (j + 2) * self.nx])
         self.row += 1

@@ -1,9 +1,9 @@
-"""An experiment as a worker runs it, with derivatives by differences of runs. In worker processes only."""
+"""An experiment as a worker runs it, with derivatives by the best method for each parameter. In worker processes only."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, astuple, replace
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any
@@ -14,13 +14,18 @@ from hvdc_ident.data import Array
 from hvdc_ident.fmu import co_simulation, model_exchange
 from hvdc_ident.fmu.derivatives import (
     SHORT_STEP,
+    SUFFICIENT,
+    SensitivityEquations,
     difference,
+    difference_pair,
     first_difference,
     noise_of,
+    rms,
 )
 from hvdc_ident.fmu.description import Message
-from hvdc_ident.fmu.fmi import FmiError
+from hvdc_ident.fmu.fmi import FmiError, VariableGroup
 from hvdc_ident.fmu.instance import (
+    NOISE_FACTOR,
     Instance,
     RunEnded,
     RunFailed,
@@ -36,7 +41,11 @@ if TYPE_CHECKING:
 
 STEPS_KEPT = 1000  # of differences, and noise levels, that a worker remembers
 LOST_IN_NOISE = 0.5  # relative error from which a derivative is not distinguished from noise
+START_STEP = 1e-3  # of differences of the initial state by a parameter, in its sizes
 PERTURBATION = 0.1  # step of an input that shows whether a run is repeated, in sizes of the input
+CONFIRMING_STEP = 1e-3  # of the differences that confirm directional derivatives, in sizes of the parameter
+CONFIRMING_DOUBT = 0.1  # relative uncertainty of a difference of runs above which it confirms nothing
+EXCESS_STEPS = 20  # times the steps of a plain run that one with sensitivities may take before it is given up
 REUSE_NOTES = {
     "instance": "a reset does not bring the FMU back to its start: each run has a new instance",
     "process": "neither a reset nor a new instance brings the FMU back to its start: each run has a new process",
@@ -44,7 +53,7 @@ REUSE_NOTES = {
 
 
 class SensitivityRun:
-    """One experiment: a run, and its derivatives by parameters.
+    """One experiment: a run, and derivatives by the best method for each parameter.
 
     Parameters include inputs, whose derivatives are by constants added to them, and directions of all inputs: constants
     0, of size 1, that move them along a line of points.
@@ -90,16 +99,24 @@ class SensitivityRun:
             self._find_calls()
         gradients = np.zeros((self.time.size, len(self.names), len(self.parameters)))
         errors = np.zeros(len(self.parameters))
-        outputs = self._run()
-        for j, name in enumerate(self.parameters):
+        directional = self._confirmed_parameters()
+        integrated = self._integrated(directional, gradients) if directional else None
+        by_differences = [n for n in self.parameters if integrated is None or n not in directional]
+        outputs = self._run() if integrated is None else integrated
+        for name in by_differences:
             if name in self.wanted:
+                j = self.parameters.index(name)
                 gradients[:, :, j], errors[j] = self._by_differences(name, outputs)
         lost = [j for j, e in enumerate(errors.tolist()) if e > LOST_IN_NOISE]
         gradients[:, :, lost], errors[lost] = 0.0, 0.0  # a column of noise would pass for a direction
         if lost:
             self.notes["not seen above the noise of the runs"] = ", ".join(self.parameters[j] for j in lost)
         if self.parameters:
-            self.notes["sensitivities"] = f"differences of runs: {', '.join(self.parameters)}"
+            methods: dict[str, list[str]] = {}
+            for name in self.parameters:
+                method = "differences of runs" if name in by_differences else "directional derivatives"
+                methods.setdefault(method, []).append(name)
+            self.notes["sensitivities"] = "; ".join(f"{m}: {', '.join(names)}" for m, names in methods.items())
         if co_simulated:
             self._find_held(outputs)
             self.notes |= co_simulation.notes(self.learned)
@@ -232,12 +249,18 @@ class SensitivityRun:
         signals: PackedInputs,
         names: tuple[str, ...],
         counts: model_exchange.Counts,
+        refinement: float = 1.0,
     ) -> Array:
-        """(n, names) of a run; NaN after an end that the FMU asked for, where such a run is accepted."""
+        """(n, names) of a run; NaN after an end that the FMU asked for, where such a run is accepted.
+
+        refinement: factor on the integrator's tolerance.
+        """
         self.handler.runs += 1
         try:
             if instance.library.exchange:
-                run = model_exchange.ModelExchangeRun(instance, signals, self.time, names, self.tolerance, counts)
+                run = model_exchange.ModelExchangeRun(
+                    instance, signals, self.time, names, refinement * self.tolerance, counts=counts
+                )
                 run.go(values)
                 return run.outputs
             counts.segments += 1
@@ -253,6 +276,98 @@ class SensitivityRun:
         if not self.partial or rows is None or not rows.size:
             raise ended
         return np.vstack([rows, np.full((count - rows.shape[0], rows.shape[1]), np.nan)])
+
+    # --- derivatives from sensitivity equations ---
+
+    def _confirmed_parameters(self) -> list[str]:
+        """Return the parameters and inputs whose directional derivatives a whole run has confirmed."""
+        d = self.description
+        if not self.parameters or self.handler.isolated or not (d.directional and d.states):
+            return []
+        variables = {**d.parameters, **{n: v for n, v in d.inputs.items() if v.continuous}}
+        plain = [n for n in self.parameters if n in variables and n not in self.directions]
+        real = [n for n in plain if variables[n].kind in ("Real", "Float64")]
+        confirmed: dict[str, bool] = self.learned.setdefault("derivatives", {})
+        new = [n for n in real if n not in confirmed]
+        if new:
+            confirmed |= self._confirmed(new)
+        return [n for n in real if confirmed.get(n)]
+
+    def _confirmed(self, names: list[str]) -> dict[str, bool]:
+        """Return which directional derivatives hold over this whole run.
+
+        The FMI standard takes states and inputs as knowns of a directional derivative. By parameters some FMUs give
+        other figures, and some move the parameter: so the run with sensitivities has to be the run without, the
+        parameters have to have their values after it, and each column has to be the difference of runs.
+        """
+        instance = self.handler.instance
+        plain = model_exchange.Counts()
+        outputs = self._rows(instance, self.values, self.signals, self.names, plain)
+        finer = self._rows(instance, self.values, self.signals, self.names, model_exchange.Counts(), 0.5)
+        noise = rms(outputs - finer)
+        parameters = VariableGroup(instance.library, tuple(self.description.parameters.values()))
+        before = parameters.get().copy()
+        try:
+            run = self._sensitivity_run(names, model_exchange.Counts(), EXCESS_STEPS * plain.accepted + 1000)
+            moved = not np.array_equal(before, parameters.get(), equal_nan=True)
+        except (RunFailed, FmiError, model_exchange.SensitivitiesLost):
+            moved = True
+        instance.renew(names)
+        size = np.abs(outputs).max(axis=0, initial=0.0)
+        if moved or (rms(run.outputs - outputs) > NOISE_FACTOR * (noise + self.tolerance * size)).any():
+            return {n: len(names) > 1 and self._confirmed([n])[n] for n in names}
+        return {n: self._agrees(n, run.gradients[:, :, j], outputs, noise) for j, n in enumerate(names)}
+
+    def _agrees(self, name: str, column: Array, outputs: Array, noise: Array) -> bool:
+        """Return whether a column is the difference of two runs, as far as their curvature and noise show."""
+        h = CONFIRMING_STEP * self.sizes[name]
+        found, curvature = difference_pair(self._run_by(name), self._value_of(name), h, *self.bounds[name], outputs)
+        strength = rms(found)
+        doubt = rms(curvature) * h + 2.0 * noise / h
+        conclusive = (doubt <= CONFIRMING_DOUBT * strength) | (strength <= 2.0 * noise / h)
+        return bool((conclusive & (rms(column - found) <= doubt + SUFFICIENT * strength)).all())
+
+    def _sensitivity_run(
+        self, names: Sequence[str], counts: model_exchange.Counts, max_steps: int = model_exchange.MAX_STEPS
+    ) -> model_exchange.ModelExchangeRun:
+        """Return the run with sensitivities. Raises SensitivitiesLost where an event makes them wrong."""
+        instance = self.handler.instance
+        start = np.column_stack([self._start_derivative(n) for n in names])
+        equations = SensitivityEquations(instance, names, [self.sizes[n] for n in names], self.names)
+        run = model_exchange.ModelExchangeRun(
+            instance, self.signals, self.time, self.names, self.tolerance, equations, start, counts, max_steps
+        )
+        run.go(self.values)
+        return run
+
+    def _integrated(self, names: Sequence[str], gradients: Array) -> Array | None:
+        """(n, outputs) with the gradients filled in; None where an event makes the columns wrong."""
+        try:
+            run = self._sensitivity_run(names, self.counts)
+        except model_exchange.SensitivitiesLost as e:
+            self.notes["events"] = f"{e}: derivatives come from differences of runs"
+            return None
+        gradients[:, :, [self.parameters.index(n) for n in names]] = run.gradients
+        if not (np.isfinite(run.outputs).all() and np.isfinite(run.gradients).all()):
+            raise RunFailed("an output or its sensitivity is not finite", hint="check parameter values and limits")
+        return run.outputs
+
+    def _start_derivative(self, name: str) -> Array:
+        """(nx,) dx0/dp, from initialisations at two steps, extrapolated."""
+        t = float(self.time[0])
+        instance = self.handler.instance
+
+        def start(value: float) -> Array:
+            values, signals = self._moved({name: value})
+            instance.begin(values, signals.at(self.time[:1], "left")[0], t, None, self.tolerance)
+            return instance.library.get_states()[:, None]
+
+        value, h = self._value_of(name), START_STEP * self.sizes[name]
+        middle = start(value)
+        coarse, fine = (
+            difference_pair(start, value, step, *self.bounds[name], middle)[0][:, 0] for step in (h, 0.5 * h)
+        )
+        return np.asarray((4.0 * fine - coarse) / 3.0)
 
     # --- derivatives from differences of runs ---
 

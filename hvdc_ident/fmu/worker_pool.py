@@ -158,7 +158,7 @@ class WorkerPool:
     """The workers of one FMU. A pickled pool has none; it starts its own where it is unpickled.
 
     learned: what was found out about the FMU in its first runs, for later workers: "restart", how it is brought back to
-    its start (see `hvdc_ident.fmu.instance`), and "restart at a point".
+    its start (see `hvdc_ident.fmu.instance`), and "restart at a point"; "derivatives", by parameter whether a run confirmed the FMU's own.
     cache: runs that callers keep, see `hvdc_ident.fmu.terminal_effects`. memory: bytes of the first worker after its last
     answer. sensitivity_error: largest relative error of a derivative by differences. started: processes so far. runs:
     whole runs of the FMU so far, those for derivatives among them.
@@ -225,13 +225,17 @@ class WorkerPool:
     # --- shares of a request ---
 
     def _shares(self, heading: Mapping[str, Any]) -> list[list[str]]:
-        """Return the parameters of each worker where derivatives are asked for; empty for one worker.
+        """Return the parameters of each worker where derivatives come from differences of whole runs; empty for one worker.
 
         Columns of one worker and of several are the same to the last digit: the noise of runs and the difference steps
         that a worker finds are sent to all of them.
         """
         names: list[str] = heading.get("parameters", [])
         if heading["do"] != "simulate" or len(names) < 2 or "restart" not in self.learned:
+            return []
+        d, confirmed = self.description, self.learned.get("derivatives", {})
+        directions = heading.get("directions", {})
+        if d.directional and d.states and any(n not in directions and confirmed.get(n, True) for n in names):
             return []
         count = min(self.limits.workers or idle_cores(self._busy), len(names))
         return [names[i::count] for i in range(count)]

@@ -42,6 +42,9 @@ static int spring_along(void *c, const unsigned *un, unsigned long nu, const uns
 #ifdef SHIFTS
     for (unsigned long i = 0; i < nk; i++) if (kn[i] == 4) r[4] *= 1 + SHIFTS;
 #endif
+#ifdef LATER
+    for (unsigned long i = 0; i < nk; i++) if (kn[i] == 4 && fabs(r[0]) > 0.5) s[3] *= LATER;
+#endif
     for (unsigned long i = 0; i < nu; i++) out[i] = s[un[i]] * WRONG;
     return 0;
 }

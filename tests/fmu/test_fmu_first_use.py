@@ -122,6 +122,20 @@ def test_an_experiment_of_one_instant_has_no_end(tmp_path):
     found.pool.close()
 
 
+@pytest.mark.parametrize("fault", ["SHIFTS=1e-3", "SHIFTS=10", "LATER=1.2"])
+def test_derivatives_by_a_parameter_are_those_of_runs_where_the_fmu_gets_them_wrong(fmu, fault):
+    """The mass moves with each question for its derivative, or its derivative is wrong once the spring has moved."""
+    name = "spring" + "".join(c for c in fault if c.isalnum())
+    found = fmu(spring(name, more=(fault,)), 2, "model-exchange")
+    run = simulate(found, STEP, {}, ["m", "k"])
+    assert run.notes["sensitivities"] == "differences of runs: m; directional derivatives: k"
+    assert np.abs(run["y"] - response(STEP.time)).max() < 2e-7
+    h = 1e-5
+    wanted = (response(STEP.time, m=2.0 + h) - response(STEP.time, m=2.0 - h)) / (2 * h)
+    assert np.abs(run.gradient("y")[:, 0] - wanted).max() < 1e-4
+    assert np.array_equal(simulate(found, STEP)["y"], simulate(found, STEP)["y"])
+
+
 def test_an_iteration_of_a_fit_takes_one_run_and_one_a_parameter(fmu):
     """A trial, then a gradient at the same values: the trial is not run again."""
     model = fmu(spring("counted", own=False), 2, "co-simulation")
@@ -154,7 +168,7 @@ def test_an_fmu_that_can_be_made_once_is_checked_and_run_by_resets(tmp_path, ver
     assert told["brought back to its start by"] == "reset" and told["two short runs"].startswith("equal")
     assert told["derivatives at the start"].startswith("directional ones agree with differences, for all 7")
     run = simulate(found, STEP, {}, ["m", "k"])
-    assert run.notes["sensitivities"] == "differences of runs: m, k"
+    assert run.notes["sensitivities"] == "directional derivatives: m, k"
     h = 1e-5
     wanted = (response(STEP.time, m=2.0 + h) - response(STEP.time, m=2.0 - h)) / (2 * h)
     assert np.abs(run.gradient("y")[:, 0] - wanted).max() < 1e-4
@@ -172,7 +186,9 @@ def test_a_reset_that_keeps_a_parameter_which_the_fmu_moved_itself_restores_its_
     assert found.pool.learned["restart"] == "reset"
     point = at_point(found, {"u": 0.5, "k": 6.0}, np.array([0.4, 0.0]), ["twice"], ["k", "m"])
     assert point.jacobian[:, 3:] == pytest.approx(np.array([[0.0, 0.0], [0.05, -0.15], [0.0, 0.0]]), abs=1e-6)
-    assert np.abs(simulate(found, STEP)["y"] - response(STEP.time)).max() < 2e-7
+    run = simulate(found, STEP, {}, ["m", "k"])
+    assert run.notes["sensitivities"] == "differences of runs: m; directional derivatives: k"
+    assert np.abs(run["y"] - response(STEP.time)).max() < 2e-7
     found.pool.close()
 
 

@@ -169,12 +169,15 @@ def test_an_offset_of_an_input_and_its_derivative(fmu):
         assert np.abs(found.gradient("y") - wanted.gradient("y")).max() < 1e-4
 
 
-def test_the_derivative_by_an_input_passes_through_the_effect_at_it(fmu):
+@pytest.mark.parametrize("own", [True, False])
+def test_the_derivative_by_an_input_passes_through_the_effect_at_it(fmu, own):
     """Once: as a direction of the signals that enter, not as a constant added to them too."""
     lag = [{"effect": "lag", "at": "u", "parameters": {"T": 0.1}}]
     wanted = simulate(apply_effects(TWIN, lag), RUN, {}, ["u"]).gradient("y")
     for interface in ("model-exchange", "co-simulation"):
-        found = simulate(apply_effects(fmu(spring(), 2, interface), lag), RUN, {}, ["u"]).gradient("y")
+        plain = fmu(spring("spring" if own else "plain_spring", own), 2, interface)
+        simulate(plain, RUN, {}, ["u"])  # confirms directional derivatives by the input itself
+        found = simulate(apply_effects(plain, lag), RUN, {}, ["u"]).gradient("y")
         assert np.abs(found - wanted).max() < 5e-3 * np.abs(wanted).max()
 
 
