@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 from setuptools import build_meta
-from setuptools.build_meta import get_requires_for_build_sdist, prepare_metadata_for_build_wheel  # noqa: F401
 
 CORE = Path(__file__).parent / "hvdc_ident" / "simulate" / "core"
 FLAGS = (
@@ -66,6 +65,8 @@ def build_editable(wheel_directory: str, config_settings: Any = None, metadata_d
 
 
 build_sdist = build_meta.build_sdist
+get_requires_for_build_sdist = build_meta.get_requires_for_build_sdist
+prepare_metadata_for_build_wheel = build_meta.prepare_metadata_for_build_wheel
 
 if __name__ == "__main__":
     build_core()

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from hvdc_ident.expression import FUNCTIONS
+from hvdc_ident.simulate.core import NUMBERS
 from hvdc_ident.simulate.graph import Graph
 
 # Names of the generated functions, in the order in which the integrators take their addresses.
@@ -20,7 +21,7 @@ NAMES = (
     "rest", "rest_jac", "rest_p", "const", "lu", "solve", "surface",
 )  # fmt: skip
 ARGUMENTS = ("y", "yd", "w", "wd", "p", "m", "out")
-LANES = 4  # instants that a function over several of them takes at once
+LANES = int(NUMBERS["LANES"])  # instants that a function over several of them takes at once
 BLOCK = 300  # instructions of a block of a long function
 LONG = 4000  # instructions; a shorter function is one block
 

@@ -26,7 +26,7 @@ Method = Literal["auto", "nonstiff", "explicit", "rosenbrock"]
 a run that proves stiff, whatever was run before."""
 Integers = NDArray[np.int64]
 COUNTED = [PLACE[n] for n in ("accepted", "rejected", "events", "evaluations", "segments", "forced_steps")]
-"""What a run reports."""
+"""Places in the record of the counts that a run reports."""
 
 
 @dataclass(frozen=True)
@@ -194,25 +194,20 @@ class Engine:
         """
         s = self.structure.sizes
         begin, end = float(time[0] if first is None else first), float(time[-1])
-        p = np.ascontiguousarray(p, dtype=float)
-        u, addresses, _ = _tables(tuple(inputs), begin, end)
+        p = np.array(p, dtype=float)  # one that may be written, for it has an address then
+        u, (n_breaks, *tables), _kept = _tables(tuple(inputs), begin, end)
         y, w = self.start(p, u, begin, search=tolerance.search, model=model)
         constants = self.constants(p)
         out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
-        n_breaks, *tables = addresses
-        t_out, scales = (
-            np.array(time, dtype=float),
-            np.ones(max(s.np, 1)) if scale is None else np.array(scale, dtype=float),
-        )
-        p = np.array(p)
+        t_out = np.array(time, dtype=float)
+        scales = np.ones(max(s.np, 1)) if scale is None else np.array(scale, dtype=float)
         own = [address(a) for a in (p, constants, scales, t_out, out)]
         given = [*own, *tables, n_breaks, time.size, tolerance.max_steps, tolerance.slides]
         instants = [begin, end, tolerance.rtol, tolerance.atol]
         explicit = self._is_explicit(method, p, y, w, end - begin)
         while True:
-            record, _heads, work = self._record(
-                not explicit
-            )  # the heads live as long as the record that points to them
+            # The heads, as the tables above, live as long as the record that has their addresses.
+            record, _heads, work = self._record(not explicit)
             record[GIVEN] = given
             reals = record.view(float)
             reals[GIVEN_INSTANTS] = instants
@@ -262,7 +257,7 @@ class Engine:
         record = np.zeros(len(RUN_FIELDS), dtype=np.int64)
         record[: len(HEAD_FIELDS)] = heads.max(axis=0)  # room for the largest
         doubles = room(record)
-        record[PLACE["heads"]] = heads.ctypes.data
+        record[PLACE["heads"]] = address(heads)
         return record, heads, doubles
 
     def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:

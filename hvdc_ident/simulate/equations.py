@@ -20,13 +20,12 @@ from hvdc_ident.errors import require_known, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.model import Model, dependency_order, reached
 from hvdc_ident.simulate.codegen import Elimination, Function, Row, eliminate, function_text, solve_text
+from hvdc_ident.simulate.core import NUMBERS
 from hvdc_ident.simulate.graph import Graph
 from hvdc_ident.simulate.object_code import Code
 from hvdc_ident.simulate.sliding_equations import sliding
 
-ACCURACY = 1e-10  # largest scaled residual that counts as a steady state
-SHORTEST = 2.0**-16  # of a path of values: a step that has to be shorter means that the path ends
-TINY = 1e-3  # the least that an unknown counts for, where it tells by what an equation's residual is measured
+ACCURACY, SHORTEST, TINY = (NUMBERS[n] for n in ("ACCURACY", "SHORTEST", "TINY"))
 
 
 def padded(count: int) -> int:

@@ -72,15 +72,18 @@ def minimum_norm(equations: SteadyEquations, size: Array, v: Array) -> None:
 
     size: the most that each unknown counts for.
     """
+    there = equations.judged(size, v)
     for _ in range(50):
-        r, jac, weights = equations.judged(size, v)
+        r, jac, weights = there
         if not (np.isfinite(r).all() and np.isfinite(jac).all()):
             return
         step = np.linalg.lstsq(jac / weights[:, None], -r / weights, rcond=1e-12)[0]
         before, damping = float(np.linalg.norm(r / weights)), 1.0
         while damping > 1e-4:
             trial = v + damping * step
-            after = float(np.linalg.norm(equations.judged(size, trial)[0] / weights))
+            there = equations.judged(size, trial)
+            with np.errstate(all="ignore"):  # a trial may be beyond what numbers hold: it is none then
+                after = float(np.linalg.norm(there[0] / weights))
             if after < before or before < 1e-14:
                 break
             damping /= 2

@@ -1,7 +1,7 @@
 """The integrators and the steady-state solvers in C: their records, and their functions by ctypes.
 
-The library is built when the package is installed, for any processor and for those with AVX2. The layout of a run's record is
-read from `core.h`, where it stands once.
+The library is built when the package is installed, for any processor and for those with AVX2. The layout of a run's record, the
+statuses and shared numbers are read from `core.h`, where they stand once.
 """
 
 from __future__ import annotations
@@ -26,26 +26,33 @@ FOLDER = Path(__file__).parent
 BUILDS = {"avx2": ("avx2", "fma"), "baseline": ()}
 """The builds of the library, best first, with the features of the processor that each needs."""
 LIBRARY = "core-{build}.so.1"
-STATUSES = (
-    "converged", "step-limit", "not-finite", "chatter", "inconsistent", "stiff", "sliding", "two-slides", "out-of-memory",
-)  # fmt: skip
-"""How a run ends, in the order of `enum status`."""
 Record = NDArray[np.int64]
+
+
+_HEADER = re.sub(r"/\*.*?\*/", "", (FOLDER / "core.h").read_text(), flags=re.DOTALL)
+STATUSES = tuple(
+    re.sub("[^A-Z_,]", "", re.findall(r"enum status \{(.*?)\}", _HEADER)[0]).lower().replace("_", "-").split(",")
+)
+"""Statuses with which a run ends, by their number."""
+NUMBERS = {
+    name: float.fromhex(value) if value.startswith("0x") else float(value)
+    for name, value in re.findall(r"#define (\w+) (0x\S+|[0-9]\S*)", _HEADER)
+}
+"""Numbers that the core and its caller share, by name."""
 
 
 def _fields(*lists: str) -> tuple[str, ...]:
     """Return the names that the header's lists of fields hold, in their order."""
-    header = re.sub(r"/\*.*?\*/", "", (FOLDER / "core.h").read_text(), flags=re.DOTALL)
     found: list[str] = []
     for name in lists:
-        body = re.search(rf"#define {name}\(.*?\)((?:.*\\\n)*.*)", header)
+        body = re.search(rf"#define {name}\(.*?\)((?:.*\\\n)*.*)", _HEADER)
         assert body is not None
         found += re.findall(r"\b[A-Z]+\((\w+)\)", body[1])
     return tuple(found)
 
 
 HEAD_FIELDS = _fields("SIZES", "FUNCTIONS", "SECOND_DERIVATIVES")
-"""What one set of equations brings; first in a run's record."""
+"""Fields that one set of equations brings; first in a run's record."""
 _STATED, _STATED_INSTANTS = _fields("GIVEN"), _fields("GIVEN_INSTANTS")
 RUN_FIELDS = (
     *HEAD_FIELDS, *_STATED, *_STATED_INSTANTS, *_fields("VECTORS", "INDICES", "COUNTS", "FLAGS", "INSTANTS"),

@@ -26,9 +26,15 @@ enum status { CONVERGED, STEP_LIMIT, NOT_FINITE, CHATTER, INCONSISTENT, STIFF, S
 enum {
     NONE = -1,   /* no switch */
     AGAIN = -2,  /* the step is to be taken once more */
-    NODES = 5,   /* a delayed signal is kept as a quartic in each step, through five equidistant values */
-    LANES = 4    /* instants that a generated function over several of them takes at once; elements of a loop over a vector */
+    NODES = 5    /* a delayed signal is kept as a quartic in each step, through five equidistant values */
 };
+
+/* --- numbers that the caller reads from here too --- */
+
+#define LANES 4         /* instants that a generated function over several of them takes at once; elements of a loop over a vector */
+#define ACCURACY 1e-10  /* largest scaled residual that counts as a steady state */
+#define SHORTEST 0x1p-16 /* of a path of values: a step that has to be shorter means that the path ends */
+#define TINY 1e-3       /* the least that an unknown counts for, where it tells by what an equation's residual is measured */
 
 /* A loop whose turns do not depend on each other: over elements of vectors that do not overlap, or are the same (-fopenmp-simd). */
 #define EACH(i, count) _Pragma("omp simd") for (integer i = 0; i < (count); i++)

@@ -12,9 +12,6 @@ typedef struct steady {
     double *y, *w, *wd, *p, *m;
 } steady;
 
-static const double ACCURACY = 1e-10;       /* largest scaled residual that counts as a steady state */
-static const double SHORTEST = 1.0 / 65536; /* of a path of values: a step that has to be shorter means that the path ends */
-static const double TINY = 1e-3;            /* the least that an unknown counts for, where it tells by what a residual is measured */
 static const double NEAR_LIMIT = 0.1; /* radians, or of a value above 1: the longest step across a limit; a sine is its tangent there */
 static const double SAME = 1e-6;      /* of a value: places nearer than this are one steady state, reached by different arithmetic */
 
