@@ -68,11 +68,11 @@ def _quantity(record: Trajectory, names: tuple[str, str, str]) -> Literal["volta
     if len(units) > 1:
         return None
     (unit,) = units
-    for kind, quantity, letters in (("V", "voltage", "uve"), ("A", "current", "i")):
+    for kind, letters in (("V", "uve"), ("A", "i")):
         if (unit and conversion(unit, kind) is not None) or (
             conversion(unit, "pu") is not None and names[0][0].lower() in letters
         ):
-            return "voltage" if quantity == "voltage" else "current"
+            return "voltage" if kind == "V" else "current"
     return None
 
 

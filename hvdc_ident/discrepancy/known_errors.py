@@ -46,53 +46,52 @@ class KnownErrors:
 
     def __str__(self) -> str:
         each = [
-            f"the level of {n} by {quantity(e, self.levels[n], 2)}" if n in self.levels else f"{n} by {percentage(e, 1)}"
+            f"the level of {n} by {quantity(e, self.levels[n], 2)}"
+            if n in self.levels
+            else f"{n} by {percentage(e, 1)}"
             for n, e in list(self.errors.items())[:LISTED]
         ]
         return listed(each)
 
 
-def known_errors(search: SearchContext, here: Refit) -> KnownErrors | None:
-    """Return the errors of a model's stated values and of its records' levels that suit the residual best; None where there are none.
+def known_errors(search: SearchContext, here: Refit) -> KnownErrors:
+    """Return the errors of a model's stated values and of its records' levels that suit the residual best.
 
     here: the model, with free parameters that go with the errors.
     """
     nominal = here.nominal()
     residual = nominal.residual
     stated = [f for f in search.stated if f.name not in here.problem.names]
-    deviations = [STATED_ERROR / COVERED * abs(f.given) for f in stated]
-    columns = [derivative(here, f, residual) * d for f, d in zip(stated, deviations, strict=True)]
-    outputs = here.problem.outputs
-    columns += [_of_level(here, o, residual) for o in outputs]
-    if not columns:
-        return None
+    value, level = STATED_ERROR / COVERED, LEVEL_ERROR / COVERED  # standard deviations, of a value and of a range
+    levels = {o: level * _range(here, o) for o in here.problem.outputs}
+    columns = [derivative(here, f, residual) * value * abs(f.given) for f in stated]
+    columns += [_of_level(here, o, d, residual) for o, d in levels.items()]
     answers = nominal.projected(np.column_stack(columns))
     asked = answers.T @ nominal.projected(residual[:, None])[:, 0]
     best = -np.linalg.solve(np.eye(answers.shape[1]) + answers.T @ answers, asked)  # in standard deviations
     chance = float(stats.chi2.sf(best @ best, best.size))
-    relative = dict.fromkeys((f.name for f in stated), STATED_ERROR / COVERED)
     # The records are moved towards the model, so they are off the other way.
-    sizes = relative | {o: -LEVEL_ERROR / COVERED * _range(here, o) for o in outputs}
-    order = np.argsort(-np.abs(best), kind="stable")
+    sizes = {f.name: value for f in stated} | {o: -d for o, d in levels.items()}
     names = list(sizes)
+    order = np.argsort(-np.abs(best), kind="stable")
     errors = {names[k]: float(best[k] * sizes[names[k]]) for k in order}
     known = here.model.outputs
-    units = {o: known[o].unit if o in known else "" for o in outputs}
+    units = {o: known[o].unit if o in known else "" for o in levels}
     return KnownErrors(errors, units, here.chi2 + float(asked @ best), chance)
 
 
 def _range(here: Refit, output: str) -> float:
     """Return the range of an output over the fitted records, in its unit."""
-    records = [e.measured[output] for e in here.problem.fitted_experiments if e.measured and output in e.outputs]
-    return float(np.nanmax(np.concatenate(records)) - np.nanmin(np.concatenate(records)))
+    measured = [e.measured for e in here.problem.fitted_experiments if output in e.outputs]
+    records = np.concatenate([m[output] for m in measured if m is not None])
+    return float(np.nanmax(records) - np.nanmin(records))
 
 
-def _of_level(here: Refit, output: str, residual: Array) -> Array:
-    """Return (N,) the change of the whitened residual with records of an output that are higher by one standard deviation of its level.
+def _of_level(here: Refit, output: str, level: float, residual: Array) -> Array:
+    """Return (N,) the change of the whitened residual with records of an output that are higher by so much, in its unit.
 
     residual: (N,) with the records as they are.
     """
-    level = LEVEL_ERROR / COVERED * _range(here, output)
     records = []
     for e in here.problem.experiments:
         if e.measured is None or output not in e.outputs:

@@ -374,7 +374,7 @@ def doubt_of_known_errors(search: SearchContext, outcome: SearchOutcome) -> Doub
     for found in outcome.kept:
         assert found.winner is not None
         errors = known_errors(search, found.before)
-        if errors is not None and errors.in_place_of(found.before, found.winner.refit):
+        if errors.in_place_of(found.before, found.winner.refit):
             label = found.candidates[found.winner.pick.candidate].label
             why = f"stated values and recorded levels that are off by no more than they may be explain as much as {label} ({errors})"
             return Doubt(why, f"Stated values known better, or fitted, and larger inputs, in which {label} answers.")

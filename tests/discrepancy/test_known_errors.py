@@ -22,16 +22,14 @@ QUIETER = 20.0
 RANGE = 3.2
 """Of the torque in the fitted records, about."""
 SMALL, LARGE = 0.002 * RANGE, 0.02 * RANGE
-"""What a recorder of class 0.5 may add to the torque, and what it may not."""
+"""Levels that a recorder of class 0.5 may add to the torque, and may not."""
 
 
 def of_a_card(card: Model, data: tuple[Experiment, ...]) -> KnownErrors:
     """The errors of a drive, refitted."""
     search = SearchContext("all", None, FrozenMap(), DiagnosisOptions(), seed=0, stated=stated(card, FREE))
     start, _ = nominal(ModelSimulator(card), data, FREE, {}, None, starts=1, seed=0, executor=None)
-    found = known_errors(search, judged(Refit(card, (), start.problem, start.noise, start.theta)))
-    assert found is not None
-    return found
+    return known_errors(search, judged(Refit(card, (), start.problem, start.noise, start.theta)))
 
 
 def test_the_likeliest_errors_are_those_that_the_card_has() -> None:
