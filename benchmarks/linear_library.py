@@ -74,7 +74,7 @@ def questions(seed: int) -> list[tuple[str, Array, Callable[[LinearModel], Array
 
 
 def error(compute: Callable[[Any], Array], of: Any, want: Array) -> float:
-    """How far an answer is off; infinite where the library raises an error, which counts as a wrong one."""
+    """Return how far an answer is off; infinite where the library raises an error, which counts as a wrong one."""
     try:
         found = compute(of)
     except (ArithmeticError, ValueError, control.exception.ControlArgument) as refused:

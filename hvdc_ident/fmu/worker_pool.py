@@ -32,7 +32,7 @@ from hvdc_ident.parallel.progress import RESIDENT, SPACE, begin
 
 MIB = 2**20
 NEEDS = ("hvdc_ident.fmu.worker", "fmpy.fmi2", "fmpy.fmi3", "scipy.integrate")
-"""What a worker imports before it loads an FMU."""
+"""Modules that a worker imports before it loads an FMU."""
 EXHAUSTED = 0.5
 """Share of its memory from which a process may have run out of it: one that grows by doubling is refused from half on."""
 

@@ -51,7 +51,7 @@ def time_name(names: Sequence[str]) -> str | None:
 
 
 def guarded(read: Callable[[Path], Trajectory], path: Path) -> Trajectory:
-    """What a reader of this folder returns, read in a process of its own: damaged files end the libraries for HDF5 and MATLAB,
+    """Return what a reader of this folder does, read in a process of its own: damaged files end the libraries for HDF5 and MATLAB,
     or hold them up, or let them take all memory.
 
     Raises WaveformError: its own, or where the file cannot be read, or its process ends or hangs.

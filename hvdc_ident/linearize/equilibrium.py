@@ -145,7 +145,7 @@ At = Literal["steady", "start"]
 
 
 class System(Protocol):
-    """What a search for a point asks of a model, be it a graph or an FMU: names, and values and derivatives at a point.
+    """Protocol of a model whose points are searched for, be it a graph or an FMU: names, and values and derivatives at a point.
 
     accuracy: largest scaled residual that counts as a solution. with_rest, with_start: places of the states that have one.
     """

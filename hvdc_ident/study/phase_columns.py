@@ -1,4 +1,4 @@
-"""What a new study makes of the phases in a recording: lines of `phases` in its experiment."""
+"""Phases in a recording as a new study writes them: lines of `phases` in its experiment."""
 
 from __future__ import annotations
 
@@ -65,5 +65,5 @@ def phases_text(line: schema.PhasesTable) -> str:
 
 
 def _likeness(voltage: PhaseSet, current: PhaseSet) -> float:
-    """How much two names have in common, beside the letter of the quantity."""
+    """Return how much two names have in common, beside the letter of the quantity."""
     return SequenceMatcher(None, voltage.names[0].lower(), current.names[0].lower()).ratio()

@@ -47,7 +47,7 @@ class Context(Coded):
 
 @dataclass(frozen=True)
 class DiagnosisContext(Coded):
-    """What the JSON of a diagnosis has beside it. units: of the outputs. judgement: of the model with each set of values."""
+    """Fields of the JSON of a diagnosis beside its own. units: of the outputs. judgement: of the model with each set of values."""
 
     units: Mapping[str, str] = field(default_factory=dict)
     judgement: Judgements = field(default_factory=Judgements)
