@@ -18,7 +18,8 @@ from setuptools import build_meta
 
 CORE = Path(__file__).parent / "hvdc_ident" / "simulate" / "core"
 FLAGS = (
-    "-std=c99", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math", "-fopenmp-simd",
+    "-std=c99", "-O3", "-ffp-contract=fast", "-fno-math-errno", "-fno-trapping-math",
+    "-fopenmp-simd", '-DINDEPENDENT=_Pragma("omp simd")',
     "-fPIC", "-shared", "-Wall", "-Wextra",
 )  # fmt: skip
 BUILDS = {"baseline": (), "avx2": ("-mavx2", "-mfma")}

@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 from hvdc_ident.lazy import offered
 
 if TYPE_CHECKING:
+    from hvdc_ident.simulate.c_code import c_array, c_function, c_number, c_solve, c_string
     from hvdc_ident.simulate.codegen import NAMES, Elimination, Function
+    from hvdc_ident.simulate.core import core_sources
     from hvdc_ident.simulate.engine import Engine, Method, Tolerance, check_times, engine_of
     from hvdc_ident.simulate.equations import ACCURACY, ModelEquations, by_structure, torn
     from hvdc_ident.simulate.experiment_run import ModelSimulator, chains_of, simulate, with_recording
@@ -17,6 +19,8 @@ else:
     __getattr__ = offered(
         __name__,
         {
+            "c_code": "c_array c_function c_number c_solve c_string",
+            "core": "core_sources",
             "codegen": "NAMES Elimination Function",
             "engine": "Engine Method Tolerance check_times engine_of",
             "equations": "ACCURACY ModelEquations by_structure torn",
@@ -44,8 +48,14 @@ __all__ = [
     "Statistics",
     "Tolerance",
     "by_structure",
+    "c_array",
+    "c_function",
+    "c_number",
+    "c_solve",
+    "c_string",
     "chains_of",
     "check_times",
+    "core_sources",
     "engine_of",
     "equilibria",
     "evaluate",

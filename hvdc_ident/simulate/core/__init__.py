@@ -66,6 +66,11 @@ GIVEN_INSTANTS = slice(GIVEN.stop, GIVEN.stop + len(_STATED_INSTANTS))
 """Then, as doubles, start, end and the tolerances, relative and absolute."""
 
 
+def core_sources() -> dict[str, str]:
+    """Return the core's files, {name: text}, for a program that includes `core.c`, which includes the others."""
+    return {p.name: p.read_text("utf-8") for p in sorted(FOLDER.glob("*.[ch]")) if p.name != "all.c"}
+
+
 @cache
 def library() -> ctypes.CDLL:
     """Return the library that suits this processor. Raises ImportError where it was not built."""

@@ -76,7 +76,7 @@ static integer find_switch(run *r)
         return met ? aim : NONE; /* the step aimed at this switch and met it */
     }
     bad = bisect(r, bad, &event);
-    if (bad < 0.98 && bad * r->hs > 1e-12 * (r->end - r->start)) {
+    if (bad < 0.98 && bad * r->hs > 1e-12 * r->span) {
         /* Step again up to the switch itself: the dense output is less exact than the step. */
         r->h = bad * r->hs;
         r->aim = event;
@@ -106,8 +106,6 @@ static void add_echo(run *r, integer i, double order)
 {
     integer width = r->width;
     double at = r->t + r->lag[i];
-    if (!(at < r->end))
-        return;
     double *echo = r->echo + r->echoes * (2 + width);
     echo[0] = at;
     echo[1] = order;
@@ -172,7 +170,7 @@ static enum status cross(run *r, integer event)
 static enum status pass_switch(run *r, integer event)
 {
     r->events++;
-    if (event == r->last_switch && r->t - r->last_event < 1e-9 * (r->end - r->start)) {
+    if (event == r->last_switch && r->t - r->last_event < 1e-9 * r->span) {
         if (++r->chatter > 40)
             return CHATTER;
     } else {

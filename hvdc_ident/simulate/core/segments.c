@@ -68,6 +68,18 @@ static void write_rows(run *r)
     }
 }
 
+/* Add a step of length h from t to the history of delayed signals; r->nodes holds each source at 0, 1/4, 1/2, 3/4 and 1 of it. */
+static void keep_step(run *r, double t, double h)
+{
+    integer rows = 1 + r->width;
+    double *step = r->history + (2 + r->nd * NODES * rows) * r->kept;
+    step[0] = t;
+    step[1] = h;
+    for (integer i = 0; i < r->nd; i++)
+        quartics(r->nodes + i * NODES * rows, step + 2 + i * NODES * rows, rows);
+    r->kept++;
+}
+
 /* Add the present step to the history of delayed signals. */
 static void remember(run *r)
 {
@@ -84,12 +96,7 @@ static void remember(run *r)
                 node[1 + c] = r->src[nd + r->nq + i * width + c];
         }
     }
-    double *step = r->history + (2 + nd * NODES * rows) * r->kept;
-    step[0] = r->t;
-    step[1] = r->step_end - r->t;
-    for (integer i = 0; i < nd; i++)
-        quartics(r->nodes + i * NODES * rows, step + 2 + i * NODES * rows, rows);
-    r->kept++;
+    keep_step(r, r->t, r->step_end - r->t);
 }
 
 /* --- the beginning of a segment --- */
@@ -222,7 +229,7 @@ static bool begin_segment(run *r)
 /* The length that changes the states by a hundredth of themselves, in the error's weights, or the last step's if shorter. */
 static void first_step(run *r)
 {
-    double span = r->end - r->start, d0 = 0.0, d1 = 0.0;
+    double span = r->span, d0 = 0.0, d1 = 0.0;
     for (integer i = 0; i < r->nx; i++) {
         double weight = r->atol + r->rtol * fabs(r->y[i]);
         d0 += (r->y[i] / weight) * (r->y[i] / weight);
@@ -238,8 +245,8 @@ static void first_step(run *r)
     r->h = r->h == 0.0 || guess < r->h ? fmin(fmax(guess, 1e-9 * span), 0.1 * span) : fmin(r->h, guess);
 }
 
-/* Set the constants of the segment, the switches' tolerances and the first step's length. */
-static void prepare_segment(run *r)
+/* Set what holds in the whole segment. */
+static void describe_segment(run *r)
 {
     r->segments++;
     bool still = enter_segment(r);
@@ -248,6 +255,11 @@ static void prepare_segment(run *r)
     r->still = still;
     r->quiet = still && r->nd == 0;
     force(r);
+}
+
+/* Set the switches' tolerances and the first step's length. */
+static void prepare_segment(run *r)
+{
     if (r->ns) {
         evaluate(r, r->do_sw, r->y, r->sv);
         for (integer i = 0; i < r->ns; i++) {
