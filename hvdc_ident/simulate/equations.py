@@ -170,6 +170,24 @@ class ModelEquations:
             width,
         )
 
+    def head(self, rosenbrock: bool) -> dict[str, int]:
+        """Return what a run's record states of these equations, but for addresses: {field of the core's head: number}."""
+        s, e = self.sizes, self.elimination if rosenbrock else None
+        n = s.nx + s.nz
+        return {
+            **{k: getattr(s, k) for k in ("nx", "nz", "nu", "nd", "nq", "ns", "no", "np", "width")},
+            "n": n,
+            "size": n * (1 + s.width),
+            "stride": padded(n * (1 + s.width)),
+            "nw": 1 + s.nu + s.nd + s.nq,
+            "hessians": len(self.second) if rosenbrock else 0,
+            "factors": e.count if e else 0,
+            "timed": self.moves_by_itself,
+            "rosenbrock": rosenbrock,
+            "sliding": -1 if self.switch is None else self.switch,
+            "twin": self.twin,
+        }
+
     # --- derivatives ---
 
     def partial(self, node: int, group: str) -> dict[int, int]:

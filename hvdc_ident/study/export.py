@@ -164,8 +164,8 @@ def _card(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOp
 def _fmu(source: Study | Model, selected: ValueSet | None, path: Path, options: FmuOptions) -> Written:
     from hvdc_ident.fmu.export import export_fmu
 
-    ends = [float(e.time[-1]) for e in source.experiments] if isinstance(source, Study) else []
-    stop = max((t for t in ends if t > 0.0), default=1.0)
+    experiments = source.experiments if isinstance(source, Study) else ()
+    stop = max((t for e in experiments if (t := float(e.time[-1])) > 0.0), default=1.0)
     found = export_fmu(
         _described(source, selected),
         path,
@@ -173,6 +173,7 @@ def _fmu(source: Study | Model, selected: ValueSet | None, path: Path, options: 
         kinds=options.kinds,
         binary=options.binary,
         stop=stop,
+        experiments=experiments,
     )
     return Written(found.path, f"FMI {found.version}, {' and '.join(found.kinds)}; {found.note}")
 

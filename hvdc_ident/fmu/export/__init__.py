@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import uuid
@@ -13,14 +14,15 @@ from pathlib import Path
 
 import numpy as np
 
-from hvdc_ident.errors import ModelError
+from hvdc_ident.data import Experiment
+from hvdc_ident.errors import HvdcIdentError, ModelError
 from hvdc_ident.files import write_bytes
 from hvdc_ident.fmu.compile import binary_folder, compiled, compiler, library_suffix
 from hvdc_ident.fmu.export.c_model import CModel
 from hvdc_ident.fmu.export.model_description import KINDS, ExportedVariables, build_description, description
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, used_names, without_delays
-from hvdc_ident.simulate import core_sources, engine_of
+from hvdc_ident.simulate import core_sources, engine_of, simulate
 
 VERSIONS = ("2.0", "3.0")
 _SHELL = ("fmu.c", "instance.c", "start.c", "progress.c", "values.c", "snapshot.c", "fmi.c", "internal.h", "fmi.h")
@@ -49,12 +51,14 @@ def export_fmu(
     kinds: Sequence[str] = tuple(KINDS),
     binary: bool | None = None,
     stop: float = 1.0,
+    experiments: Sequence[Experiment] = (),
 ) -> FmuFile:
     """Write a model as an FMU to path; return what was written.
 
     model: the model, or its equations as C, where several FMUs are made of them. kinds: "model-exchange", "co-simulation"
     or both. binary: True needs a C compiler, False leaves the sources alone, None compiles where there is a compiler.
-    stop: end of the default experiment, s.
+    stop: end of the default experiment, s. experiments: where a run of one slides along a limit, so can the co-simulation, for
+    each such limit with as much code again as the model has; along others it stops with an error.
 
     The FMU starts from the steady state of the inputs and parameters given to it before its initialisation ends (states
     with a start of their own from that), with exact derivatives of that start. A delay that is 0 at the model's values is left
@@ -74,7 +78,7 @@ def export_fmu(
             expected="cc, gcc, clang or what CC names",
             hint="leave the binary out",
         )
-    code = model if isinstance(model, CModel) else CModel(_without_zero_delays(model))
+    code = model if isinstance(model, CModel) else _code(model, experiments)
     identifier = identifier_of(code.model.name)
     content = _content(code, version, chosen, identifier, stop)
     folder = None
@@ -85,6 +89,15 @@ def export_fmu(
         content[f"binaries/{folder}/{identifier}{library_suffix()}"] = compiled(command, sources, _TO_COMPILE)
         note = f"binary for {folder}, and sources"
     return FmuFile(write_bytes(Path(path), _zipped(content)), version, chosen, folder, note)
+
+
+def _code(model: Model, experiments: Sequence[Experiment]) -> CModel:
+    """Return the model as C, with the slides that runs of the experiments get into, as far as they run."""
+    whole = _without_zero_delays(model)
+    for experiment in experiments:
+        with contextlib.suppress(HvdcIdentError):  # such an experiment is no reason not to export the model
+            simulate(whole, experiment, outputs=tuple(whole.outputs))
+    return CModel(whole, engine_of(whole).slides if experiments else ())
 
 
 def _without_zero_delays(model: Model) -> Model:

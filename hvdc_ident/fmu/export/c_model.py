@@ -16,8 +16,10 @@ from hvdc_ident.simulate import Function, ModelEquations, c_array, c_function, c
 TOLERANCE = 1e-8
 """Relative tolerance of co-simulation where the importer names none; the absolute one is a hundredth of it."""
 
-_FUNCTIONS = ("f", "jac", "ft", "sw", "swd", "modes", "out", "src", "srcd", "const", "rest", "rest_jac")
-"""Functions of the model that the core calls, as `ModelEquations` names them."""
+_IN_A_RUN = ("f", "jac", "ft", "sw", "swd", "out", "src", "srcd")
+"""Functions that the core calls in every run, as `ModelEquations` names them."""
+_ALIASES = {"rhs": "f", "observe": "out", "sources": "src"}
+"""What else of the core's head they are, where there are no sensitivities."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +27,8 @@ class CModel:
     """The model's equations as C text, with the numbers that its files and its description share."""
 
     model: Model
+    along: tuple[int, ...] = ()
+    """The switches along whose surfaces it can slide: each takes as much code as the whole model, and more."""
 
     @cached_property
     def structure(self) -> ModelEquations:
@@ -65,12 +69,16 @@ class CModel:
         names = list(self.model.parameters)
         return frozenset(names[i] for v in self.structure.timing for i in self.structure.partial(v, "p"))
 
+    @cached_property
+    def slides(self) -> dict[int, ModelEquations]:
+        """The equations of each slide, by its switch."""
+        return {k: ModelEquations(self.model, switch=k) for k in self.along}
+
     def header(self, token: str, version: str) -> str:
         """Return the text of model.h. token: what an importer has to name to get an instance. version: of FMI."""
-        s, e = self.structure.sizes, self.structure.elimination
+        s = self.structure.sizes
         sizes = {"NX": s.nx, "NZ": s.nz, "NU": s.nu, "ND": s.nd, "NQ": s.nq, "NS": s.ns, "NO": s.no}
-        sizes |= {"NP": len(self.model.parameters), "FACTORS": e.count if e else 0}
-        sizes |= {"TIMED": int(self.structure.moves_by_itself)}
+        sizes |= {"NP": len(self.model.parameters)}
         return "\n".join(
             [
                 f"/* {_comment(self.model.name)}: sizes; generated. */",
@@ -89,7 +97,7 @@ class CModel:
     def source(self) -> str:
         """The text of model.c: values, names, equations."""
         head = f"/* {_comment(self.model.name)}: values, names and equations; generated. */\n#include <math.h>\n"
-        return "\n".join([head, *self._tables, "", *self._functions()])
+        return "\n".join([head, *self._tables, "", *self._functions(), *self._heads()])
 
     @property
     def _tables(self) -> list[str]:
@@ -113,13 +121,21 @@ class CModel:
         known = {f.name: f for f in s.functions}
         rest = [node for _, node in known["rest"].nodes]
         observed = [*s.rhs, *s.observed, *s.graph.switches]
-        made = [known[name] for name in _FUNCTIONS]
+        made = [known[name] for name in ("modes", "const", "rest", "rest_jac")]
         made += [self._tangents("tangent", observed), self._tangents("rest_tangent", rest)]
         for function in made:
             yield c_function(s.graph, function, f"model_{function.name}")
-        if s.elimination:
-            yield c_function(s.elimination.graph, s.elimination.function, "model_lu")
-            yield c_solve(s.elimination, "model_solve")
+        yield from _of_a_run(s, "model")
+        for switch, equations in self.slides.items():
+            yield from _of_a_run(equations, f"slide{switch}")
+
+    def _heads(self) -> Iterator[str]:
+        """The core's heads: of the slide on each switch, zeros where there is none, then of the model without a slide."""
+        yield "static const head model_heads[NS + 1] = {"
+        for switch, equations in self.slides.items():
+            yield f"    [{switch}] = {_head(equations, f'slide{switch}', ('surface',))},"
+        yield f"    [NS] = {_head(self.structure, 'model', ('modes',))},"
+        yield "};\n"
 
     def _tangents(self, name: str, nodes: Sequence[int]) -> Function:
         """Return the function of nodes' derivatives along directions: in yd, in wd, and in p behind the parameters' values."""
@@ -133,6 +149,25 @@ class CModel:
             return total
 
         return Function(name, [(k, along(n)) for k, n in enumerate(nodes)])
+
+
+def _of_a_run(equations: ModelEquations, prefix: str) -> Iterator[str]:
+    """Return the functions that the core calls of one set of equations, named after the prefix."""
+    for function in equations.functions:
+        if function.name in (*_IN_A_RUN, "surface"):
+            yield c_function(equations.graph, function, f"{prefix}_{function.name}")
+    if e := equations.elimination:
+        yield c_function(e.graph, e.function, f"{prefix}_lu")
+        yield c_solve(e, f"{prefix}_solve")
+
+
+def _head(equations: ModelEquations, prefix: str, more: Sequence[str]) -> str:
+    """Return the core's head of one set of equations, as an initialiser. more: functions beside those of every run."""
+    numbers = {name: str(int(value)) for name, value in equations.head(rosenbrock=True).items()}
+    late = ("lu", "solve") if equations.elimination else ()
+    functions = {name: name for name in (*_IN_A_RUN, *more, *late)} | _ALIASES
+    fields = numbers | {f"do_{name}": f"{prefix}_{same}" for name, same in functions.items()}
+    return "{" + ", ".join(f".{name} = {value}" for name, value in fields.items()) + "}"
 
 
 def _comment(name: str) -> str:

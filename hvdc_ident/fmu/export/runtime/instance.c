@@ -1,18 +1,6 @@
 /* An instance: what it is made of, and its equations at an instant. Functions return 1 or, with a message in the instance, 0. */
 #include "internal.h"
 
-static const head equations = {
-    .nx = NX, .nz = NZ, .nu = NU, .nd = ND, .nq = NQ, .ns = NS, .no = NO, .n = NY, .size = NY,
-    .stride = (NY + LANES - 1) / LANES * LANES, .nw = NW, .factors = FACTORS, .timed = TIMED, .rosenbrock = 1,
-    .sliding = NONE, .twin = NONE,
-    .do_f = model_f, .do_jac = model_jac, .do_ft = model_ft, .do_sw = model_sw, .do_swd = model_swd, .do_modes = model_modes,
-    .do_out = model_out, .do_src = model_src, .do_srcd = model_srcd, .do_rhs = model_f, .do_observe = model_out,
-    .do_sources = model_src,
-#if FACTORS
-    .do_lu = model_lu, .do_solve = model_solve,
-#endif
-};
-
 static void say(Instance *i, const char *format, ...)
 {
     va_list list;
@@ -21,13 +9,16 @@ static void say(Instance *i, const char *format, ...)
     va_end(list);
 }
 
-/* 1 for a run that goes on; else 0, with the reason as the instance's message. */
+/* 1 for a run that goes on; else 0, with the reason as the instance's message.
+
+   A slide that is not among the model's equations, and one on two surfaces, end a run as chattering does. */
 static int explain(Instance *i, enum status status)
 {
+    static const char chatters[] = "a limit switches on and off without end";
     static const char *const reasons[] = {
         [STEP_LIMIT] = "too many steps: loosen the tolerance or look for a very fast part of the model",
         [NOT_FINITE] = "a value grew without bound or left a function's domain",
-        [CHATTER] = "a limit switches on and off without end",
+        [CHATTER] = chatters, [SLIDING] = chatters, [TWO_SLIDES] = chatters,
         [INCONSISTENT] = "the algebraic loop has no solution there",
         [OUT_OF_MEMORY] = "not enough memory"};
     if (status == CONVERGED)
@@ -36,15 +27,23 @@ static int explain(Instance *i, enum status status)
     return 0;
 }
 
-/* Give the run its equations, the instance's own vectors and places in the workspace. */
-static void bind(Instance *i)
+/* Give every vector of a run its place in the workspace, with room for the largest equations; returns how many doubles they take. */
+static size_t place(run *r, double *work)
+{
+#define LARGEST(name) r->name = 0; for (int k = 0; k <= NS; k++) if (model_heads[k].name > r->name) r->name = model_heads[k].name;
+    SIZES(LARGEST)
+#undef LARGEST
+    return arrange(r, work);
+}
+
+/* Give the run its equations (a row of model_heads), the instance's own vectors and places in the workspace. */
+static void bind(Instance *i, integer row)
 {
     run *r = &i->r;
     State *s = &i->s;
-    *(head *)r = equations;
-    arrange(r, i->work);
-    for (integer k = 0; k < NX; k++)
-        r->mass[k] = 1.0;
+    place(r, i->work);
+    r->heads = (integer *)model_heads;
+    use(r, row);
     r->p = s->p;
     r->constants = s->timing;
     r->times = s->times;
@@ -64,7 +63,8 @@ static void reset(Instance *i)
     r->history_room = kept.history_room;
     r->echo = kept.echo;
     r->echo_room = kept.echo_room;
-    bind(i);
+    bind(i, NS);
+    r->slides = i->cosimulation;
     r->rtol = DEFAULT_TOLERANCE;
     r->atol = 0.01 * r->rtol;
     r->span = 1.0;
@@ -100,8 +100,7 @@ static Instance *make(const char *name, const char *token, int cosimulation)
     Instance *i = calloc(1, sizeof *i);
     if (!i)
         return NULL;
-    *(head *)&i->r = equations;
-    i->doubles = arrange(&i->r, NULL);
+    i->doubles = place(&i->r, NULL);
     i->work = malloc(i->doubles * sizeof(double));
     i->name = calloc(strlen(name ? name : "") + 1, 1);
     if (!i->work || !i->name) {
@@ -171,7 +170,7 @@ static int refresh(Instance *i)
     if (!i->s.stale)
         return 1;
     take_inputs(i);
-    if (!consistent(&i->r, i->s.phase != CONTINUOUS))
+    if (!(i->s.phase == CONTINUOUS ? consistent(&i->r, false) : settle(&i->r)))
         return explain(i, INCONSISTENT);
     i->s.stale = 0;
     return 1;

@@ -41,7 +41,7 @@ static int pass_event(Instance *i)
     if (!begin_segment(r))
         return explain(i, INCONSISTENT);
     if (NS) {
-        evaluate(r, model_sw, r->y, r->sv);
+        evaluate(r, r->do_sw, r->y, r->sv);
         widen(r);
     }
     r->first = 0;

@@ -26,10 +26,10 @@ static size_t bytes_of(const Header *h)
 static void put_in_place(Instance *i)
 {
     run *r = &i->r, first = i->r;
-    arrange(&first, i->work);
+    place(&first, i->work);
     if (r->y == first.y)
         return;
-    for (int k = 0; k < NY; k++)
+    for (integer k = 0; k < r->n; k++)
         exchange(&r->y[k], &r->yn[k]);
     r->y = first.y;
     r->yn = first.yn;
@@ -77,7 +77,7 @@ static int restore(Instance *i, const void *given)
     r->echo_room = own.echo_room;
     const double *from = copied->vectors;
     memcpy(i->work, from, i->doubles * sizeof(double));
-    bind(i);
+    bind(i, r->sliding == NONE ? NS : r->sliding);
     from += i->doubles;
     copy(r->history, from, steps * HISTORY_ROW);
     copy(r->echo, from + steps * HISTORY_ROW, echoes * ECHO_ROW);

@@ -6,7 +6,7 @@ static int get_rates(Instance *i, double *values)
     run *r = &i->r;
     if (!current(i))
         return 0;
-    evaluate(r, model_f, r->y, r->e);
+    evaluate(r, r->do_f, r->y, r->e);
     for (int k = 0; k < NX; k++) {
         if (!isfinite(r->e[k])) {
             say(i, "t = %.9g s: the derivative of '%s' is not finite", r->t, model_rest_names[k]);
@@ -23,7 +23,7 @@ static int get_indicators(Instance *i, double *values)
     run *r = &i->r;
     if (!current(i))
         return 0;
-    evaluate(r, model_sw, r->y, values);
+    evaluate(r, r->do_sw, r->y, values);
     for (int k = 0; k < NS; k++)
         values[k] += r->m[k] > 0.5 ? -r->slack[k] : r->slack[k];
     return 1;
@@ -63,7 +63,7 @@ static int read_values(Instance *i, const unsigned int *refs, size_t n, double *
             values[k] = rate[ref - REF_RATE];
         } else if (ref < REF_PARAMETER) {
             if (!has_outputs)
-                evaluate(r, model_out, r->y, output);
+                evaluate(r, r->do_out, r->y, output);
             has_outputs = 1;
             values[k] = output[ref - REF_OUTPUT];
         } else {
@@ -234,6 +234,10 @@ static int directional_by_reference(Instance *i, const unsigned int *unknown, si
     Derivatives found;
     if (!current(i))
         return 0;
+    if (i->r.sliding != NONE) {
+        say(i, "t = %.9g s: a model that slides along a limit has no directional derivative", i->r.t);
+        return 0;
+    }
     for (size_t k = 0; k < nk; k++) {
         unsigned int ref = known[k];
         if (ref >= REF_INPUT && ref < REF_STATE) {
