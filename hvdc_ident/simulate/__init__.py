@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from hvdc_ident.simulate.equations import ACCURACY, ModelEquations, by_structure, torn
     from hvdc_ident.simulate.experiment_run import ModelSimulator, chains_of, simulate, with_recording
     from hvdc_ident.simulate.graph import Graph
-    from hvdc_ident.simulate.object_code import Code, evaluate
+    from hvdc_ident.simulate.machine_code import Code, evaluate
     from hvdc_ident.simulate.simulation import Simulation, Statistics
     from hvdc_ident.simulate.steady_state import Equilibria, equilibria, resting, with_guesses
 else:
@@ -25,7 +25,7 @@ else:
             "engine": "Engine Method Tolerance check_times engine_of",
             "equations": "ACCURACY ModelEquations by_structure torn",
             "graph": "Graph",
-            "object_code": "Code evaluate",
+            "machine_code": "Code evaluate",
             "experiment_run": "ModelSimulator chains_of simulate with_recording",
             "simulation": "Simulation Statistics",
             "steady_state": "Equilibria equilibria resting with_guesses",

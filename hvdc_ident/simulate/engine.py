@@ -17,7 +17,7 @@ from hvdc_ident.model import Model
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.core import GIVEN, GIVEN_INSTANTS, HEAD_FIELDS, PLACE, RUN_FIELDS, address, integrate, room
 from hvdc_ident.simulate.equations import ModelEquations, by_structure
-from hvdc_ident.simulate.object_code import Code, evaluate
+from hvdc_ident.simulate.machine_code import Code, evaluate
 from hvdc_ident.simulate.simulation import HINTS, Statistics
 from hvdc_ident.simulate.steady_state import Equilibria
 

@@ -22,7 +22,7 @@ from hvdc_ident.model import Model, dependency_order, reached
 from hvdc_ident.simulate.codegen import Elimination, Function, Row, eliminate, function_text, solve_text
 from hvdc_ident.simulate.core import NUMBERS
 from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.object_code import Code
+from hvdc_ident.simulate.machine_code import Code
 from hvdc_ident.simulate.sliding_equations import sliding
 
 ACCURACY, SHORTEST, TINY = (NUMBERS[n] for n in ("ACCURACY", "SHORTEST", "TINY"))
