@@ -166,7 +166,7 @@ static enum status run_segments(run *r)
             return CONVERGED;
         prepare_segment(r);
         while (r->t < r->tb) {
-            if (r->nd && !(make_room(&r->history, &r->history_room, r->kept, 1, of_history) &&
+            if (r->nd && !(make_room(&r->history, &r->history_room, r->kept, PIECES, of_history) &&
                            make_room(&r->echo, &r->echo_room, r->echoes, r->nd, line)))
                 return OUT_OF_MEMORY;
             enum status status = take_step(r);
