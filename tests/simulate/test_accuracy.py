@@ -105,3 +105,14 @@ def test_a_delayed_signal_is_exact_where_it_moves_faster_than_the_states(method)
     inside = (time > 0.301) & (time < 1.099)
     slope = 125 * u / (1 + 25 * u**2) ** 2  # the ramp goes 2.5 a second
     np.testing.assert_allclose(run.gradient("d")[inside, 0], slope[inside], rtol=0, atol=100 * RTOL * slope.max())
+
+
+def test_a_first_step_over_many_time_constants_is_exact_within():
+    """x = r - T s on a ramp r = s t: a step that begins at rest has to leave it first, and only its end is sure to be right."""
+    T, rtol = 1e-6, 1e-6
+    model = Model("lag", parameters={"T": T}, inputs={"u": 0.0}, states={"x": "(u - x)/T"}, outputs={"x": "x"})
+    time = np.linspace(0.0, 0.8, 801)
+    case = experiment("ramp", time, {"u": InputSignal.ramp(0.1, 0.0, 0.9, 0.8)})
+    run = simulate(model, case, {}, rtol=rtol, method="rosenbrock")
+    behind = np.clip(time - 0.1, 0.0, None)
+    np.testing.assert_allclose(run["x"], behind - T * (1 - np.exp(-behind / T)), rtol=0, atol=rtol * 0.1)
