@@ -28,7 +28,8 @@ enum status { CONVERGED, STEP_LIMIT, NOT_FINITE, CHATTER, INCONSISTENT, STIFF, S
 enum {
     NONE = -1,   /* no switch */
     AGAIN = -2,  /* the step is to be taken once more */
-    NODES = 5    /* a delayed signal is kept as a quartic in each step, through five equidistant values */
+    NODES = 5,   /* a delayed signal is kept as a quartic in each step, through five equidistant values */
+    PIECES = 16  /* or in as many pieces of a step at most */
 };
 
 /* --- numbers that the caller reads from here too --- */

@@ -169,16 +169,16 @@ static void forget(run *r)
         r->history[q] = r->history[old * line + q];
 }
 
-/* Make room for what a step or the beginning of a segment may add: jumps that come back, and one step to look back to. False: no
-   memory. */
+/* Make room for what a step or the beginning of a segment may add: jumps that come back, and pieces of a step to look back to.
+   False: no memory. */
 static bool make_rooms(run *r)
 {
     integer line = 2 + r->width, of_history = 2 + r->nd * NODES * (1 + r->width);
     if (r->nd == 0)
         return true;
-    if (r->kept == r->history_room)
+    if (r->kept + PIECES > r->history_room)
         forget(r);
-    return make_room(&r->history, &r->history_room, r->kept, 1, of_history) &&
+    return make_room(&r->history, &r->history_room, r->kept, PIECES, of_history) &&
            make_room(&r->echo, &r->echo_room, r->echoes, r->nd + 1, line);
 }
 

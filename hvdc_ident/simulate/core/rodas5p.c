@@ -69,10 +69,14 @@ static int rodas_factor(run *r)
     return lu(r->matrix, r->pivots, n) ? 2 : 0;
 }
 
-/* The work of the generated solve by dense linear algebra: from the right-hand side in k to the stage. */
-static void rodas_solve(run *r, double *k)
+/* From the right-hand side in k to the stage, with the factors of that kind; to the right-hand side comes r->add. */
+static void rodas_solve(run *r, int kind, double *k)
 {
     integer n = r->n, width = r->width;
+    if (kind == 1) {
+        r->do_solve(r->add, r->hessian, r->w, r->wd, r->factor, r->m, k);
+        return;
+    }
     EACH(q, r->stride)
         k[q] += r->add[q];
     solve(r->matrix, r->pivots, k, n);
@@ -82,6 +86,43 @@ static void rodas_solve(run *r, double *k)
     for (integer q = 0; q < r->hessians; q++)
         subtract(rows + r->hess_row[q] * width, r->hessian + q * width, -k[r->hess_column[q]], width);
     solve_rows(r->matrix, r->pivots, rows, n, width);
+}
+
+/* Write the quartic of the step that ended in r->yn into r->dense. */
+static void rodas_dense(run *r)
+{
+    integer count = r->stride;
+    const double *restrict k0 = r->k, *restrict k1 = k0 + count, *restrict k2 = k1 + count, *restrict k3 = k2 + count;
+    const double *restrict k4 = k3 + count, *restrict k5 = k4 + count, *restrict k6 = k5 + count, *restrict k7 = k6 + count;
+    const double *restrict y = r->y, *restrict yn = r->yn;
+    double *restrict d0 = r->dense, *restrict d1 = d0 + count, *restrict d2 = d1 + count, *restrict d3 = d2 + count;
+    EACH(i, count) {
+        double a = SUM8(RODAS_H[0]), b = SUM8(RODAS_H[1]), c = SUM8(RODAS_H[2]);
+        d0[i] = (yn[i] - y[i]) + a;
+        d1[i] = b - a;
+        d2[i] = c - b;
+        d3[i] = -c;
+    }
+}
+
+/* The error of the step's quartic near its beginning, over the first `rows` unknowns.
+
+   A step may be much longer than a fast mode, and right at its end, while the mode has still to begin: to go from rest to where it
+   stays while an input ramps. Once begun it is where the step takes it to be. Leaves the quartic in r->dense. */
+static double rodas_inside(run *r, int kind, integer rows)
+{
+    double x = 0.1, inverse = 1.0 / r->hs;
+    rodas_dense(r);
+    interpolate(r, x, r->size, r->u);
+    const double *restrict a = r->dense, *restrict b = a + r->stride, *restrict c = b + r->stride, *restrict d = c + r->stride;
+    const double *restrict mass = r->mass;
+    double *restrict add = r->add;
+    EACH(i, r->stride)
+        add[i] = -mass[i] * inverse * (a[i] + x * (2 * b[i] + x * (3 * c[i] + x * 4 * d[i])));
+    outside(r, r->t + x * r->hs, r->t);
+    evaluate(r, r->do_rhs, r->u, r->e);
+    rodas_solve(r, kind, r->e);
+    return error_norm(r, r->e, rows);
 }
 
 /* One step into r->yn. Returns the error over the first `rows` unknowns. */
@@ -105,31 +146,12 @@ static double rodas_step(run *r, integer rows)
         rodas_prepare(r, stage);
         double *k = r->k + r->stride * stage;
         evaluate(r, r->do_rhs, stage ? r->u : r->y, k);
-        if (kind == 1)
-            r->do_solve(r->add, r->hessian, r->w, r->wd, r->factor, r->m, k);
-        else
-            rodas_solve(r, k);
+        rodas_solve(r, kind, k);
     }
     const double *restrict error = r->k + r->stride * 7, *restrict u = r->u;
     double *restrict yn = r->yn;
     EACH(i, r->stride)
         yn[i] = u[i] + error[i];
-    return error_norm(r, error, rows);
-}
-
-/* Write the quartic of the step that ended in r->yn into r->dense. */
-static void rodas_dense(run *r)
-{
-    integer count = r->stride;
-    const double *restrict k0 = r->k, *restrict k1 = k0 + count, *restrict k2 = k1 + count, *restrict k3 = k2 + count;
-    const double *restrict k4 = k3 + count, *restrict k5 = k4 + count, *restrict k6 = k5 + count, *restrict k7 = k6 + count;
-    const double *restrict y = r->y, *restrict yn = r->yn;
-    double *restrict d0 = r->dense, *restrict d1 = d0 + count, *restrict d2 = d1 + count, *restrict d3 = d2 + count;
-    EACH(i, count) {
-        double a = SUM8(RODAS_H[0]), b = SUM8(RODAS_H[1]), c = SUM8(RODAS_H[2]);
-        d0[i] = (yn[i] - y[i]) + a;
-        d1[i] = b - a;
-        d2[i] = c - b;
-        d3[i] = -c;
-    }
+    double size = error_norm(r, error, rows);
+    return r->fresh && size <= 1.0 ? fmax(size, rodas_inside(r, kind, rows)) : size;
 }
