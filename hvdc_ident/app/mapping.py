@@ -22,9 +22,10 @@ from hvdc_ident.study.assemble import study_of
 from hvdc_ident.study.column_matching import Kind, Matching
 from hvdc_ident.study.new_study import matched
 from hvdc_ident.study.parse import checked
-from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments, with_derived
+from hvdc_ident.study.recordings import Recordings, read_experiments, with_derived
 from hvdc_ident.study.study import with_nuisances
 from hvdc_ident.study.summary import Summary
+from hvdc_ident.summary.levels import NoiseNote
 
 WRITTEN = ("name", "data", "role", "inputs", "outputs", "columns", "event", "window")
 """Keys of an experiment that a mapping states; all others are kept."""

@@ -36,7 +36,8 @@ from hvdc_ident.study.column_matching import (
 )
 from hvdc_ident.study.json_schema import SCHEMA_LINE, write_schemas
 from hvdc_ident.study.phase_columns import of_use, phases_text, proposed_phases, ways_to_count, without_phases
-from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments, smoothed, with_derived
+from hvdc_ident.study.recordings import Recordings, read_experiments, smoothed, with_derived
+from hvdc_ident.summary.levels import NoiseNote
 from hvdc_ident.text import listed, quantity
 
 MOST_LISTED = 40
