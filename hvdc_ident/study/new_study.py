@@ -15,12 +15,13 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment, Trajectory, event_time, input_signal, scaled
 from hvdc_ident.data.three_phase import PHASE_QUANTITIES
 from hvdc_ident.display import Shown
-from hvdc_ident.errors import ComputationError, InputError, located
+from hvdc_ident.errors import ComputationError, InputError, in_python, located
 from hvdc_ident.files import write_text
 from hvdc_ident.formats import read_waveforms
 from hvdc_ident.model import AnyModel
 from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.models import is_shipped, load_model
+from hvdc_ident.next_step import Door, NextStep, next_phrase
 from hvdc_ident.plants import LEVELS
 from hvdc_ident.study import schema
 from hvdc_ident.study.column_matching import (
@@ -81,12 +82,16 @@ class Mapped:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NewStudy(Shown):
-    """A study that was written. path: its file. model: of the study. recordings: one for each experiment. dyr: where its unit is from."""
+    """A study that was written. path: its file. model: of the study. recordings: one for each experiment. dyr: where its unit is from.
+
+    door: where its screen is read.
+    """
 
     path: Path
     model: AnyModel
     recordings: tuple[Mapped, ...]
     dyr: DyrOfStudy | None = None
+    door: Door = "python"
 
     def to_dict(self) -> dict[str, Any]:
         """Return by experiment which column is which signal, the candidates of the others, and what is not used."""
@@ -119,9 +124,10 @@ class NewStudy(Shown):
             yield "\n".join([*used, *_open_lines(r)])
         proposed = any(r.columns.proposed for r in self.recordings)
         first = f"take out the # before the candidates that are right in {self.path}, then " if proposed else ""
-        yield f"Next: {first}hvdc-ident check {self.path}"
+        yield f"Next: {first}{next_phrase(NextStep('check', str(self.path)), self.door)}."
 
 
+@in_python
 def new_study(
     folder: str | Path,
     recordings: str | Path | Sequence[str | Path],
