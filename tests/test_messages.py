@@ -15,7 +15,7 @@ from hvdc_ident.next_step import ON_DASK, NextStep, next_phrase
 from hvdc_ident.study.executors import check_executor
 
 PACKAGE = Path(hi.__file__).parent
-SPEAK_TO_THE_SHELL = re.compile(r"(?<![-\w,])--(?!force-reinstall)[a-z]{2}|hvdc-ident [a-z]+")  # pip has options of its own
+SPEAK_TO_THE_SHELL = ("cli.py", "command.py", "run_commands.py", "next_step.py", "app/", "report/", "summary/")
 """Views and commands, and the one table of words."""
 WRITE_FOR_THE_SHELL = (
     "study/examples.py", "study/new_study.py", "study/schema.py", "study/value_files.py",  # comments in files, and a file's reference

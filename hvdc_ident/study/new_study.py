@@ -191,13 +191,22 @@ def matched(
     return matching(columns_of(record, event, ways), targets_of(model, levels), model.parameters), why
 
 
-def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
-    record = read_waveforms(file)
+def proposal(
+    record: Trajectory, model: AnyModel, name: str
+) -> tuple[Matching, str, tuple[schema.PhasesTable, ...]]:
+    """Return what a recording may be of a model: the columns by signal, those among them that are made of three phases, and of which.
+
+    The text says why the model's levels are not known; empty where they are. name: of the experiment.
+    """
     phases = proposed_phases(record)
     made = with_derived(phases, (), record, name)
     found, why = matched(without_phases(made, phases), model, phases)
     phases = of_use(phases, [m.column.name for m in (*found.mapped, *found.proposed)])
-    found = replace(found, unused=tuple(c for c in found.unused if c in record))
+    return replace(found, unused=tuple(c for c in found.unused if c in record)), why, phases
+
+
+def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
+    found, why, phases = proposal(read_waveforms(file), model, name)
     data = _relative(file, folder)
     by_kind = {
         kind: {m.target.name: m.column.name for m in found.mapped if m.target.kind == kind}
