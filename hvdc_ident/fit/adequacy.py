@@ -341,7 +341,7 @@ class Whiteness:
 
 
 @dataclass(frozen=True)
-class Runs:
+class RunsTest:
     """The number of runs of one sign against the number that chance gives, with its p."""
 
     runs: int
@@ -366,7 +366,7 @@ class ResidualTest:
     mean: float
     std: float
     ljung_box: Whiteness
-    runs: Runs
+    runs: RunsTest
     inputs: Mapping[str, InputCorrelation]
 
 
@@ -409,7 +409,7 @@ def ljung_box(r: Array, parts: Sequence[slice] = ()) -> Whiteness:
     return Whiteness(statistic, lags, float(chdtrc(lags, statistic)))
 
 
-def runs(r: Array) -> Runs:
+def runs(r: Array) -> RunsTest:
     """Return the number of runs of one sign against what chance gives (Wald and Wolfowitz 1940), with its two-sided p."""
     signs = np.sign(r)
     signs = signs[signs != 0]
@@ -417,12 +417,12 @@ def runs(r: Array) -> Runs:
     count = int(1 + (np.diff(signs) != 0).sum()) if signs.size else 0
     n = up + down
     if not up or not down or n < 3:
-        return Runs(count, None, None)
+        return RunsTest(count, None, None)
     expected = 1.0 + 2.0 * up * down / n
     variance = (expected - 1.0) * (expected - 2.0) / (n - 1.0)
     if variance <= 0:
-        return Runs(count, expected, None)
-    return Runs(count, expected, math.erfc(abs(count - expected) / math.sqrt(2.0 * variance)))
+        return RunsTest(count, expected, None)
+    return RunsTest(count, expected, math.erfc(abs(count - expected) / math.sqrt(2.0 * variance)))
 
 
 def cross_correlation(r: Array, u: Array) -> InputCorrelation:

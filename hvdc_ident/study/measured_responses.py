@@ -27,7 +27,13 @@ from hvdc_ident.linearize import (
 from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
 from hvdc_ident.study.checks import names_of_model
-from hvdc_ident.summary.responses import ChannelError, ComparedResponse, Curves, DescribedResponse, ModelResponse
+from hvdc_ident.summary.compared_responses import (
+    ChannelError,
+    ComparedResponse,
+    Curves,
+    DescribedResponse,
+    ModelResponse,
+)
 from hvdc_ident.toml_tables import check_names
 
 if TYPE_CHECKING:

@@ -19,8 +19,8 @@ from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.stages import stages
 from hvdc_ident.study.study import Study, candidate_lines
 from hvdc_ident.summary.candidate import Candidate
+from hvdc_ident.summary.compared_responses import DescribedResponse
 from hvdc_ident.summary.levels import InitialValue, NoiseNote
-from hvdc_ident.summary.responses import DescribedResponse
 from hvdc_ident.text import one_of, quantity
 
 

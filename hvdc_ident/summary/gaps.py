@@ -9,7 +9,7 @@ from hvdc_ident.text import figures, quantity
 
 
 @dataclass(frozen=True)
-class Gap:
+class SignalGap:
     """How far recorded and simulated output are apart over the rows that are compared, in the output's unit.
 
     rmse: root mean square of recorded - simulated. nrmse: the same over the range that was recorded. noise: standard
@@ -35,7 +35,7 @@ class Gap:
         return f"{self.output} in {self.experiment}, RMSE {', '.join([quantity(self.rmse, self.unit), *over])}"
 
 
-def worst_first(gaps: Sequence[Gap]) -> list[Gap]:
+def worst_first(gaps: Sequence[SignalGap]) -> list[SignalGap]:
     """Return the gaps from the largest: in units of the noise where every noise is known, else over the recorded range."""
     known = all(g.noise_units is not None for g in gaps)
     return sorted(gaps, key=lambda g: -((g.noise_units if known else g.nrmse) or 0.0))

@@ -24,7 +24,7 @@ from hvdc_ident.linearize.modal import NamedMode
 from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.reduction import Peak
 from hvdc_ident.linearize.stability import EIGENVALUES, Stability
-from hvdc_ident.summary.responses import ComparedResponse, response_lines
+from hvdc_ident.summary.compared_responses import ComparedResponse, response_lines
 from hvdc_ident.text import quantity
 
 MODES_SHOWN = 8

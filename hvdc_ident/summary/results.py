@@ -18,10 +18,10 @@ from hvdc_ident.errors import InputError, located
 from hvdc_ident.files import csv_name
 from hvdc_ident.fit.judgement import WindowErrors
 from hvdc_ident.next_step import NextStep
+from hvdc_ident.summary.compared_responses import ComparedResponse
 from hvdc_ident.summary.decisions import STAGES, judgements_of, lines_of, summarise
 from hvdc_ident.summary.levels import InitialValue
 from hvdc_ident.summary.linear import Linearisation
-from hvdc_ident.summary.responses import ComparedResponse
 from hvdc_ident.summary.run_summary import RunSummary
 from hvdc_ident.summary.stage_results import ExperimentContext, StageResults
 

@@ -13,9 +13,9 @@ from hvdc_ident.fit.judgement import Judgements
 from hvdc_ident.fit.result import Estimate, FitResult
 from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.summary.candidate import Candidate
-from hvdc_ident.summary.gaps import Gap
+from hvdc_ident.summary.compared_responses import ComparedResponse
+from hvdc_ident.summary.gaps import SignalGap
 from hvdc_ident.summary.levels import NoiseNote
-from hvdc_ident.summary.responses import ComparedResponse
 
 Json = Mapping[str, Any]
 NO_ESTIMATES = ("failed", "not-converged")
@@ -58,7 +58,7 @@ class Context(Coded):
     units: Mapping[str, str] = field(default_factory=dict)
     experiments: Mapping[str, ExperimentContext] = field(default_factory=dict)
     noise: Mapping[str, Mapping[str, NoiseNote]] = field(default_factory=dict)
-    gaps: tuple[Gap, ...] = ()
+    gaps: tuple[SignalGap, ...] = ()
     judgement: Judgements = field(default_factory=Judgements)
     derived: Mapping[str, Derived] = field(default_factory=dict)
     responses: tuple[ComparedResponse, ...] = ()

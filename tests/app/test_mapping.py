@@ -286,7 +286,8 @@ def test_three_phases_are_proposed_as_a_new_study_proposes_them(tmp_path: Path) 
     shown = columns_with_derived(mapping, record, "study.toml")
     assert {"p", "v-rms", "UA"} <= set(shown.names) and "p" not in record
     draft = drafted(mapping, record, model, None, "", "study.toml")
-    assert draft.experiment.measured["P"][0] == pytest.approx(1e8, rel=1e-2) and draft.experiment.event == pytest.approx(0.3, abs=0.025)  # a cycle
+    assert draft.experiment.measured["P"][0] == pytest.approx(1e8, rel=1e-2)
+    assert draft.experiment.event == pytest.approx(0.3, abs=0.025)  # a cycle
     file = tmp_path / "study.toml"
     write_mapping(Seen.now(file), mapping, "r", str(tmp_path / "c.toml"))
     (read,) = hi.load_study(file).experiments

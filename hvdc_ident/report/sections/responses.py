@@ -8,7 +8,7 @@ from hvdc_ident.colours import SERIES
 from hvdc_ident.report.drawing import bode_axes, draw_response, figure, svg
 from hvdc_ident.report.html import Section, captioned, number, rows_of, text
 from hvdc_ident.summary import Results
-from hvdc_ident.summary.responses import ComparedResponse
+from hvdc_ident.summary.compared_responses import ComparedResponse
 
 STYLES = {"given": "--", "fitted": "-"}
 

@@ -83,8 +83,8 @@ def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str
 def lines_of(data: Mapping[str, Any]) -> list[str]:
     """The status and the verdict on the residuals, the values, what is to be said of each, and what to do next."""
     from hvdc_ident.summary import summarise
+    from hvdc_ident.summary.compared_responses import response_lines
     from hvdc_ident.summary.phrases import remarks
-    from hvdc_ident.summary.responses import response_lines
     from hvdc_ident.summary.screen import lines_of as screen
     from hvdc_ident.summary.stage_results import Context, fit_of
     from hvdc_ident.text import capital

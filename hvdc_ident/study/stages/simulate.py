@@ -10,7 +10,7 @@ from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment, Trajectory
     from hvdc_ident.study.study import Study
-    from hvdc_ident.summary.gaps import Gap
+    from hvdc_ident.summary.gaps import SignalGap
     from hvdc_ident.summary.stage_results import ExperimentContext
 
 
@@ -27,7 +27,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
 
     need_experiments(study, "simulate")
     table: dict[str, dict[str, float | None]] = {}
-    gaps: list[Gap] = []
+    gaps: list[SignalGap] = []
     experiments: dict[str, ExperimentContext] = {}
     files: dict[str, str] = {}
     curves = {}
@@ -89,12 +89,12 @@ def _until(experiment: Experiment, rows: int) -> Experiment:
     )
 
 
-def _gap(study: Study, experiment: Experiment, simulated: Trajectory, output: str) -> Gap:
+def _gap(study: Study, experiment: Experiment, simulated: Trajectory, output: str) -> SignalGap:
     """Return how far recorded and simulated output are apart. Raises StudyError where no row is compared."""
     import numpy as np
 
     from hvdc_ident.fit.residual import compared_rows
-    from hvdc_ident.summary.gaps import Gap
+    from hvdc_ident.summary.gaps import SignalGap
 
     rows = compared_rows(experiment, output)
     assert experiment.measured is not None
@@ -104,7 +104,7 @@ def _gap(study: Study, experiment: Experiment, simulated: Trajectory, output: st
     note = study.noise[experiment.name][output]
     noise = note.std if note.source in ("given", "estimated") and note.std > 0.0 else None
     k = int(np.argmax(np.abs(difference)))
-    return Gap(
+    return SignalGap(
         output,
         experiment.name,
         study.model.outputs[output].unit,
