@@ -311,7 +311,7 @@ class LinearModel(Shown):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LinearModel:
-        """Return the model that `to_dict` wrote, without its operating point. Raises ModelError for anything else."""
+        """Return the model that `to_dict` wrote, its delays in their Pade form. Raises ModelError or InputError for anything else."""
         if not isinstance(data, Mapping) or data.get("schema") != SCHEMA or "A" not in data:
             raise ModelError(
                 "this is no linear model",
@@ -322,6 +322,8 @@ class LinearModel(Shown):
             fields: dict[str, Any] = {k: data[k] for k in "ABCDE"}
             fields |= {f"{k}_{w}": tuple(data[f"{k}_{w}"]) for k in KINDS for w in ("names", "units")}
             fields |= {k: tuple(data[k]) for k in ("x0", "u0", "y0")}
+            if "operating_point" in data:
+                fields["point"] = OperatingPoint.from_dict(data["operating_point"])
             return cls(**fields, name=data["model"], provenance=FrozenMap(data.get("provenance", {})))
         except (KeyError, TypeError, ValueError) as e:
             raise ModelError(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from hvdc_ident.codec import Coded, stored_as
+from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import delayed_modes
@@ -169,7 +169,7 @@ SHARE = 0.5
 class NamedMode:
     """A mode, the parts that name it joined by " + ", and the participation of each part (they sum to 1)."""
 
-    mode: Mode
+    mode: Mode = field(metadata=INLINE)
     name: str
     parts: FrozenMap[float]
 

@@ -124,7 +124,7 @@ def point_of(model: AnyModel, search: EquilibriumSearch, root: Root, branch: Bra
     n_extra = 1 + size.nu
     method = root.method + (", least norm" if len(search.rows) < len(search.variables) else "")
     return OperatingPoint(
-        model,
+        model.name,
         _named(s.states, y[: size.nx]),
         _named(s.unknowns, y[size.nx :]),
         _named(s.extras, w[n_extra:]),
@@ -132,13 +132,14 @@ def point_of(model: AnyModel, search: EquilibriumSearch, root: Root, branch: Bra
         FrozenMap(wanted),
         _named(s.parameters, p),
         float(root.shares.max(initial=0.0)),
-        s.limits(y, w, p),
         root.iterations,
         method,
         search.at,
         search.time,
-        search,
         branch,
+        s.limits(y, w, p),
+        model,
+        search,
     )
 
 

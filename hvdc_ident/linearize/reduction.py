@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize_scalar
 
-from hvdc_ident.codec import Coded
+from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
@@ -25,20 +25,28 @@ from hvdc_ident.linearize.system import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Reduction:
+class Reduction(Coded):
     """A smaller model. removed: eigenvalues that went; hankel: singular values of the whole; bound: on max |G - Gr|.
 
     kept: how many states carry modes that are not stable; these are never reduced. match_dc: whether the dc gain is the
     whole's. stable: the stable part before and after.
     """
 
-    model: LinearModel
+    model: LinearModel = field(metadata=INLINE)
     removed: tuple[complex, ...]
     hankel: tuple[float, ...]
     bound: float
-    kept: int = 0
+    kept: int = field(default=0, metadata=stored_as("not_stable_states_kept"))
     match_dc: bool = False
-    stable: tuple[LinearModel, LinearModel] | None = field(default=None, repr=False)
+    stable: tuple[LinearModel, LinearModel] | None = field(
+        default=None, repr=False, metadata=stored_as("stable_parts", optional=True)
+    )
+    stored_properties: ClassVar[tuple[str, ...]] = ("order",)
+
+    @property
+    def order(self) -> int:
+        """The number of states that stay."""
+        return len(self.model.state_names)
 
     @property
     def error(self) -> Peak:
@@ -46,26 +54,9 @@ class Reduction:
         return Peak(0.0, 0.0) if self.stable is None else linf_norm(difference(*self.stable))
 
     def __str__(self) -> str:
-        order = len(self.model.state_names)
         dc = ", with the dc gain kept" if self.match_dc else ""
-        listed = ", ".join(f"{v:.3g}" for v in self.hankel[: order + 3])
-        return f"{order} states{dc}; the gain is off by {self.bound:.4g} at most\nHankel singular values {listed}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the reduced model as plain numbers."""
-        m = self.model
-        return {
-            "order": len(m.state_names),
-            "A": m.A.tolist(),
-            "B": m.B.tolist(),
-            "C": m.C.tolist(),
-            "D": m.D.tolist(),
-            "bound": self.bound,
-            "hankel": list(self.hankel),
-            "removed": [[v.real, v.imag] for v in self.removed],
-            "not_stable_states_kept": self.kept,
-            "match_dc": self.match_dc,
-        }
+        listed = ", ".join(f"{v:.3g}" for v in self.hankel[: self.order + 3])
+        return f"{self.order} states{dc}; the gain is off by {self.bound:.4g} at most\nHankel singular values {listed}"
 
 
 def minimal(model: LinearModel, tolerance: float = TOLERANCE) -> Reduction:
@@ -247,7 +238,7 @@ class Peak(Coded):
     """The largest singular value over all frequencies and where it is, rad/s (0 and infinity are places)."""
 
     value: float
-    omega: float
+    omega: float = float("inf")
 
 
 def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:

@@ -333,7 +333,7 @@ class Stability(Coded):
     """The verdict on a model's stability: without delays by its eigenvalues, with delays by its characteristic equation.
 
     verdict: "stable", "on the limit of stability", "unstable" or "not decided". unstable: roots right of the axis, None
-    where not decided, infinite where there are infinitely many; from below where there is a reason. rightmost: the first
+    where not decided, infinite (None in JSON) where there are infinitely many; from below where there is a reason. rightmost: the first
     root, None where there is none or none was found.
     """
 
@@ -346,9 +346,9 @@ class Stability(Coded):
     @property
     def count_text(self) -> str:
         """How many roots lie right of the imaginary axis, in words."""
-        if self.unstable is None:
+        if self.verdict == "not decided":
             return "an unknown number of roots right of the imaginary axis"
-        if np.isinf(self.unstable):
+        if self.unstable is None or np.isinf(self.unstable):
             return "infinitely many roots right of the imaginary axis"
         number = f"{self.unstable:.0f} root{'' if self.unstable == 1 else 's'} right of the imaginary axis"
         return f"at least {number}" if self.reason else number

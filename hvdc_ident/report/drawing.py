@@ -97,11 +97,6 @@ def draw_response(
     return True
 
 
-def complex_of(real: Any, imaginary: Any) -> NDArray[np.complex128]:
-    """The complex numbers of two lists of a JSON."""
-    return np.asarray(np.array(real, dtype=float) + 1j * np.array(imaginary, dtype=float))
-
-
 def svg(fig: Figure, label: str) -> str:
     """The figure as an `<svg>` element, the same bytes each time; text stays text."""
     import matplotlib

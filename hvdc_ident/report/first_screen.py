@@ -76,9 +76,9 @@ def _warnings(results: Results, s: RunSummary) -> list[str]:
     """Stages that failed, experiments without a run, and results of an earlier state of the study."""
     lines = [f"<strong>{text(n)} failed</strong>: {prose(why.rstrip('.'))}." for n, why in s.failures.items()]
     lines += [
-        f"Experiment <strong>{text(n)}</strong> could not be simulated: {prose(str(e.get('reason', '')).rstrip('.'))}."
+        f"Experiment <strong>{text(n)}</strong> could not be simulated: {prose(e.reason.rstrip('.'))}."
         for n, e in results.experiments.items()
-        if e.get("status") == "failed"
+        if e.status == "failed"
     ]
     for name, data in results.stages.items():
         if data.get("sources") != results.heading.get("sources"):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.codec import Coded, read_fields
+from hvdc_ident.codec import Coded, plain, read_fields
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.errors import ComputationError, require_known, unknown_name
@@ -65,6 +65,42 @@ class _Point:
     reason: str = ""
     poles: NDArray[np.complex128] | None = None
     bode: Mapping[str, Mapping[str, NDArray[np.complex128]]] | None = None
+
+
+@dataclass(frozen=True)
+class SeriesBest:
+    """The smallest and the largest RMSE of an output in an experiment, in its unit; at: the parameters' values at the smallest."""
+
+    output: str
+    experiment: str
+    unit: str
+    smallest: float
+    largest: float
+    at: Mapping[str, float]
+
+    @property
+    def text(self) -> str:
+        """The smallest RMSE and where it is, in words; of a flat line none is the best."""
+        size = f"{self.smallest:.4g} {self.unit}".rstrip()
+        at = ", ".join(f"{n} = {v:.6g}" for n, v in self.at.items())
+        flat = f"{self.smallest:.3g}" == f"{self.largest:.3g}"
+        return f"{self.output} in {self.experiment}: " + (f"RMSE {size} at every point" if flat else f"smallest RMSE {size}, at {at}")
+
+
+@dataclass(frozen=True)
+class SweepSummary(Coded):
+    """A sweep without its points. count, failed: points; failure: the reason of the first that failed. best: by series."""
+
+    parameters: Mapping[str, _Swept]
+    count: int
+    failed: int
+    failure: str = ""
+    best: tuple[SeriesBest, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """How many points of which parameters."""
+        return f"{self.count} points of {', '.join(self.parameters)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +193,17 @@ class SweepResult(Coded, Shown):
         row = int(np.nanargmin(errors))
         return dict(zip(self.parameters, self.points.rows(row, row + 1)[0].tolist(), strict=True))
 
+    @property
+    def bests(self) -> tuple[SeriesBest, ...]:
+        """The smallest and the largest error of each series; none of one without an error."""
+        found = []
+        for (output, experiment), unit in zip(self.series, self.series_units, strict=True):
+            errors = self.error(output, experiment)
+            if np.isfinite(errors).any():
+                low, high = float(np.nanmin(errors)), float(np.nanmax(errors))
+                found.append(SeriesBest(output, experiment, unit, low, high, self.best(output, experiment)))
+        return tuple(found)
+
     def row(self, index: int) -> dict[str, Any]:
         """One point as sweep.json has it: values, rmse, status, reason, poles and bode where wanted."""
         return self._row(index, self.points.rows(index, index + 1)[0].tolist())
@@ -206,6 +253,8 @@ class SweepResult(Coded, Shown):
             **({"omega": self.omega.tolist()} if "bode" in self.wanted else {}),
             "count": len(self),
             "failed": len(self.failed),
+            "failure": self.failed[min(self.failed)] if self.failed else "",
+            "best": plain(self.bests),
         }
 
     def to_dict(self) -> dict[str, Any]:
@@ -331,11 +380,9 @@ class SweepResult(Coded, Shown):
     def _screen(self) -> Iterator[str | Table]:
         yield f"Sweep of {', '.join(self.parameters)}: {len(self)} points, {len(self.failed)} failed"
         rows = []
-        for k, ((o, e), unit) in enumerate(zip(self.series, self.series_units, strict=True)):
-            if np.isfinite(self.rmse[:, k]).any():
-                at = ", ".join(f"{n} = {v:.6g} {self.units[n]}".rstrip() for n, v in self.best(o, e).items())
-                low, high = float(np.nanmin(self.rmse[:, k])), float(np.nanmax(self.rmse[:, k]))
-                rows.append((o, e, unit, low, at, high))
+        for line in self.bests:
+            at = ", ".join(f"{n} = {v:.6g} {self.units[n]}".rstrip() for n, v in line.at.items())
+            rows.append((line.output, line.experiment, line.unit, line.smallest, at, line.largest))
         yield Table(("output", "experiment", "unit", "smallest RMSE", "at", "largest"), tuple(rows)) if rows else ""
         if "poles" in self.wanted and np.isfinite(self.poles).any():
             right = self.poles.real[np.isfinite(self.poles).all(axis=1)].max(axis=1)

@@ -45,13 +45,11 @@ def _render(results: Results) -> str:
 
 def _best(found: SweepResult) -> str:
     rows = []
-    for (output, experiment), unit in zip(found.series, found.series_units, strict=True):
-        errors = found.error(output, experiment)
-        extremes = [number(float(np.nanmin(errors)), 3), number(float(np.nanmax(errors)), 3)]
-        best = found.best(output, experiment)
+    for line in found.bests:
+        extremes = [number(line.smallest, 3), number(line.largest, 3)]
         flat = extremes[0] == extremes[1]  # of a flat line none is the best
-        at = ["–" if flat else number(v, 5) for v in best.values()]
-        rows.append([text(output), text(experiment), *at, *extremes, text(unit)])
+        at = ["–" if flat else number(v, 5) for v in line.at.values()]
+        rows.append([text(line.output), text(line.experiment), *at, *extremes, text(line.unit)])
     header = ["output", "experiment", *(f"best {text(n)}" for n in found.parameters), "smallest RMSE", "largest", "unit"]
     return table(header, rows, words=(0, 1, len(header) - 1)) if rows else ""
 
