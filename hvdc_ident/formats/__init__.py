@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Trajectory, scaled
-from hvdc_ident.errors import InputError, WaveformError, unknown_name
+from hvdc_ident.errors import WaveformError, unknown_name
 
 __all__ = [
     "MAX_BYTES",
@@ -41,6 +41,8 @@ __all__ = [
     "write_csv",
 ]
 
+TOP = 65536
+"""Bytes at the start of a file that are looked at to recognise its format."""
 MAX_BYTES = 2 * 1024**3
 """Largest file, and largest table in memory, in bytes."""
 
@@ -64,20 +66,15 @@ class Format(Protocol):
     SUMMARY: str
     SUFFIXES: tuple[str, ...]
 
-    def recognises(self, path: Path) -> bool:
-        """True for a file of this format, and for no file of another one."""
+    def recognises(self, path: Path, top: bytes) -> bool:
+        """True for a file of this format, and for no file of another one. top: its first `TOP` bytes."""
 
     def read(self, path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         """The waveforms, all or those named in that order; WaveformError where the file cannot be used."""
 
-    def signals(self, path: Path) -> list[tuple[str, str]]:
-        """Name and unit of every signal, without reading the waveforms."""
-
-    def sample(self, path: Path) -> None:
-        """Write a small valid file to the path."""
-
-    # A module that can also write its format has `write(trajectory, path) -> None`, for `convert`; one whose recordings
-    # stand in several files has `files(path) -> list[Path]`, all of them that are there.
+    # A module that can list name and unit of every signal without reading the waveforms has `signals(path)`; one that can
+    # also write its format `write(trajectory, path) -> None`, for `convert`; one whose recordings stand in several files
+    # `files(path) -> list[Path]`, all of them that are there.
 
 
 @cache
@@ -171,7 +168,13 @@ def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[s
         fits = re.compile(pattern, re.IGNORECASE | re.DOTALL).fullmatch
     else:
         fits = re.compile(re.escape(search), re.IGNORECASE).search
-    return [(name, unit) for name, unit in _units(_format_of(file).signals(file)) if fits(name)]
+    module = _format_of(file)
+    if hasattr(module, "signals"):
+        listed = module.signals(file)
+    else:
+        found = module.read(file)
+        listed = list(zip(found.names, found.units, strict=True))
+    return [(name, unit) for name, unit in _units(listed) if fits(name)]
 
 
 def convert(
@@ -342,9 +345,12 @@ SPREADSHEETS = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods", ".numbers")
 
 def _format_of(path: Path) -> Format:
     known = formats().values()
+    with open(path, "rb") as file:
+        top = file.read(TOP)
     for module in known:
-        if _recognised(module, path):
-            return module
+        with contextlib.suppress(OSError):  # of a file beside it
+            if module.recognises(path, top):
+                return module
     for module in known:  # damaged: the format its name promises has the better message
         if path.suffix.lower() in module.SUFFIXES:
             return module
@@ -364,13 +370,6 @@ def _format_of(path: Path) -> Format:
         got=f"'{path.suffix}'" if path.suffix else "no ending",
         hint="export it as CSV from the tool that wrote it, or give it its usual ending",
     )
-
-
-def _recognised(module: Format, path: Path) -> bool:
-    try:
-        return module.recognises(path)
-    except (OSError, InputError):
-        return False
 
 
 def check_times(found: Trajectory, path: Path, rows: int = 2) -> None:

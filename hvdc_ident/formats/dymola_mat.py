@@ -70,11 +70,9 @@ def starts_as_version_4(top: bytes) -> bool:
     return known and imaginary in (0, 1) and 1 < length <= _MAX_NAME and rows >= 0 and columns >= 0
 
 
-def recognises(path: Path) -> bool:
+def recognises(path: Path, top: bytes) -> bool:
     """True for a file that starts with the `Aclass` matrix every result file starts with."""
-    with open(path, "rb") as file:
-        top = file.read(_HEADER + 7)
-    return len(top) == _HEADER + 7 and _order(top) is not None and top[_HEADER:] == b"Aclass\0"
+    return _order(top) is not None and top[_HEADER:].startswith(b"Aclass\0")
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -105,27 +103,6 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     names = tuple(result.names[i] for i in wanted)
     origin = Origin(rows=time.size, dropped=int(np.count_nonzero(~keep)), time_unit="s")
     return Trajectory(time[keep], values, names, tuple(result.units[i] for i in wanted), origin)
-
-
-def sample(path: Path) -> None:
-    """Write a small result (parameter, variable, negative alias, event) to the path."""
-    rows = [(0.0, 1.0), (0.1, 1.0), (0.1, 1.5), (0.1, 2.0), (0.25, 1.75)]
-    names, texts = ("time", "c.R", "c.v", "c.n"), ("Time [s]", "Resistance [Ohm]", "Voltage [V|kV]", "Its negative [V]")
-    info = [(0, 1, 0, -1), (1, 2, 0, 0), (2, 2, 0, 0), (2, -2, 0, 0)]
-    aclass = ("Atrajectory", "1.1", "", "binTrans")
-    with open(path, "wb") as file:
-        file.write(_matrix_bytes("Aclass", np.array([list(s.ljust(11).encode()) for s in aclass], np.uint8).T, 51))
-        file.write(_matrix_bytes("name", np.array([list(s.ljust(4).encode()) for s in names], np.uint8), 51))
-        file.write(_matrix_bytes("description", np.array([list(s.ljust(16).encode()) for s in texts], np.uint8), 51))
-        file.write(_matrix_bytes("dataInfo", np.array(info, "<i4"), 20))
-        file.write(_matrix_bytes("data_1", np.array([(0.0, 1e-3), (0.25, 1e-3)], "<f8"), 0))
-        file.write(_matrix_bytes("data_2", np.array(rows, "<f8"), 0))
-
-
-def _matrix_bytes(name: str, stored: NDArray[Any], kind: int) -> bytes:
-    columns, rows = stored.shape
-    text = name.encode() + b"\0"
-    return struct.pack("<5i", kind, rows, columns, 0, len(text)) + text + stored.tobytes()
 
 
 def _open(path: Path) -> _Result:

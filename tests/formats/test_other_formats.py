@@ -11,6 +11,7 @@ import pytest
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import convert, list_signals, read_waveforms
+from tests.formats.samples import SAMPLES
 
 TIME = np.array([0.0, 0.1, 0.2, 0.3])
 Y = np.array([1.0, 1.0, 1.5, 1.25])
@@ -105,9 +106,8 @@ def test_version_7_3(tmp_path: Path) -> None:
 
 
 def test_pscad_channels_beyond_ten_stand_in_the_second_file(tmp_path: Path) -> None:
-    from hvdc_ident.formats import pscad
 
-    pscad.sample(tmp_path / "run.inf")
+    SAMPLES["pscad"](tmp_path / "run.inf")
     found = read_waveforms(tmp_path / "run.inf", ["S12", "S3"])
     np.testing.assert_allclose(found.values, np.column_stack([12 + found.time, 3 + found.time]))
     assert found.units == ("MW", "kV")
