@@ -372,9 +372,9 @@ def _format_of(path: Path) -> Format:
     )
 
 
-def check_times(found: Trajectory, path: Path, rows: int = 2) -> None:
-    """Raise WaveformError where there are fewer rows, or the times are not finite or go back."""
-    t, where = found.time, str(path)
+def check_times(t: Array, path: Path, rows: int = 2) -> None:
+    """Raise WaveformError where there are fewer rows, or the times, (n,) in s, are not finite or go back."""
+    where = str(path)
     if t.size < rows:
         hint = "export it again; it may have been cut off"
         raise WaveformError("too few rows", where=where, expected=f"at least {rows}", got=f"{t.size}", hint=hint)
@@ -387,7 +387,7 @@ def check_times(found: Trajectory, path: Path, rows: int = 2) -> None:
     back = np.flatnonzero(np.diff(t) < 0)
     if back.size:
         raise WaveformError(
-            f"the time goes back from {t[back[0]]:g} s to {t[back[0] + 1]:g} s",
+            f"the time goes back in row {back[0] + 2}, from {t[back[0]]:g} s to {t[back[0] + 1]:g} s",
             where=where,
             expected="increasing times",
             hint="sort the rows by time, or cut the record where its time begins again",
@@ -396,7 +396,7 @@ def check_times(found: Trajectory, path: Path, rows: int = 2) -> None:
 
 def _check(found: Trajectory, path: Path, rows: int = 2) -> None:
     """Refuse a trajectory without the properties that every format promises, which its module need not check."""
-    check_times(found, path, rows)
+    check_times(found.time, path, rows)
     where = str(path)
     if not event_rows(found.time).all():
         raise WaveformError("one time stands more than twice", where=where, expected="two rows at a jump")

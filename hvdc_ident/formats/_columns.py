@@ -124,7 +124,7 @@ def chosen(found: Trajectory, signals: Sequence[str] | None, path: Path) -> Traj
 
 def checked(record: Trajectory, path: Path) -> Trajectory:
     """Return the record with the first and last row of every instant alone. Raises WaveformError as `check_times`."""
-    check_times(record, path)
+    check_times(record.time, path)
     return once(record)
 
 
