@@ -148,8 +148,7 @@ class Instance:
             self._running = False
             with contextlib.suppress(FmiError):  # an FMU that has ended by itself refuses; the next call decides
                 library.terminate()
-            reuse = self.learned.get("restart")
-            if reuse == "reset" or (reuse is None and self.description.once_per_process):
+            if self.learned.get("restart") == "reset":
                 library.reset()
             else:
                 library.free()

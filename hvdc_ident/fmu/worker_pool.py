@@ -47,7 +47,7 @@ class Limits:
     deadline: float = 60.0
     load: float = 60.0
     memory: int | None = 2 * 2**30
-    runs: int = 500
+    runs: int = 2000
     workers: int | None = None
 
     def __post_init__(self) -> None:

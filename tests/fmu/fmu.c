@@ -1,6 +1,6 @@
 /* The calls of FMI 2.0 or 3.0 around a small model. The model defines, before this file is included:
    NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
-   faults AT_INSTANTIATE, AT_SETUP, AT_ENTER(r) into the initialization mode, AT_STEP, AT_SLOPES, AT_RESET, AT_GET(r),
+   faults AT_INSTANTIATE, AT_SETUP, AT_ENTER(r) into the initialization mode, AT_STEP, AT_SLOPES, AT_TERMINATE, AT_RESET, AT_GET(r),
    AT_SET(r, reference, value), BEGIN(t, has_end, end). Of co-simulation: INTERNAL, the length of the FMU's own steps, s;
    STOPS_AT(t, h), the instant that a step reaches; SAYS(reached), what FMI 3.0 says of it; SLOPE(r, reference, slope); ENDS(r, t) asks for the end.
    STEP_EVENT(r): whether an event is wanted after a completed step. States are r[0 .. NX-1], their derivatives
@@ -17,6 +17,9 @@ typedef struct { double r[NR]; double t, next, point, inner; int timed; void (*l
 #define N (NX > 0 ? NX : 1)
 #ifndef AT_ENTER
 #define AT_ENTER(r)
+#endif
+#ifndef AT_TERMINATE
+#define AT_TERMINATE
 #endif
 #ifndef STEP_EVENT
 #define STEP_EVENT(r) 0
@@ -143,7 +146,7 @@ int fmi2SetupExperiment(Instance c, int d, double tol, double t, int e, double e
 }
 int fmi2EnterInitializationMode(Instance c) { AT_ENTER(M->r); return 0; }
 int fmi2ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
-int fmi2Terminate(Instance c) { return 0; }
+int fmi2Terminate(Instance c) { AT_TERMINATE; return 0; }
 int fmi2Reset(Instance c) {
 #ifdef AT_RESET
     AT_RESET;
@@ -220,8 +223,13 @@ void fmi3FreeInstance(Instance c) { free(c); }
 int fmi3EnterInitializationMode(Instance c, bool d, double tol, double t, bool e, double end) { AT_ENTER(M->r); return begin(M, t, e, end); }
 int fmi3ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
 int fmi3EnterEventMode(Instance c) { return 0; }
-int fmi3Terminate(Instance c) { return 0; }
-int fmi3Reset(Instance c) { fresh(M); return 0; }
+int fmi3Terminate(Instance c) { AT_TERMINATE; return 0; }
+int fmi3Reset(Instance c) {
+#ifdef AT_RESET
+    AT_RESET;
+#endif
+    fresh(M); return 0;
+}
 int fmi3GetFloat64(Instance c, const unsigned *v, size_t n, double *x, size_t m) { return get(M, v, n, x); }
 int fmi3SetFloat64(Instance c, const unsigned *v, size_t n, const double *x, size_t m) { return set(M, v, n, x); }
 int fmi3GetInt32(Instance c, const unsigned *v, size_t n, int *x, size_t m) { for (size_t i = 0; i < n; i++) x[i] = (int)M->r[v[i]]; return 0; }

@@ -32,6 +32,7 @@ FROZEN = ("AT_RESET frozen = 1", "AT_INSTANTIATE frozen = 0")
     [
         ("reset", begun("plain"), None),
         ("reset", begun("timed", more=(CLOCK,)), None),  # an output that no two runs repeat judges nothing
+        ("reset", begun("ended", "AT_TERMINATE ended = 1", "AT_RESET if (!ended--) return 3"), None),
         ("instance", begun("frozen", *FROZEN), "each run has a new instance"),
         ("instance", begun("refusing", "AT_RESET return 3"), "each run has a new instance"),
         ("instance", begun("fatal", "AT_RESET abort()"), "each run has a new instance"),
