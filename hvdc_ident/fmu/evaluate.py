@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import ModelError
-from hvdc_ident.fmu.gradients import DifferentiatedRun, RunRequest, Varied
+from hvdc_ident.fmu.gradients import DifferentiatedRun, Differentiation, RunRequest, Varied
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import Simulation, Statistics, Tolerance
@@ -19,6 +19,7 @@ from hvdc_ident.simulate import Simulation, Statistics, Tolerance
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
 
+KEPT = 64 * 2**20  # bytes of the runs that are kept, the last one in any case
 REUSE_NOTES = {
     "instance": "a reset does not bring the FMU back to its start: each run has a new instance",
     "process": "neither a reset nor a new instance brings the FMU back to its start: each run has a new process",
@@ -40,24 +41,33 @@ def simulate_without_effects(
 ) -> Simulation:
     """Return the run of the FMU itself.
 
-    fresh: whether it is run even where the last run was the same one, whose rows are given else. partial: whether the
+    The last runs are not run again, as many as take `KEPT` bytes: refits of effects at the outputs request the same ones
+    many times. fresh: whether it is run all the same. partial: whether the
     rows up to an end that the FMU asks for are accepted. noise_key: shared by runs whose noise and difference steps are
     alike though their inputs differ. directions: in which all inputs move; derivatives along them come after those of the
     sensitivities.
     """
-    if fresh:
-        model.pool.last = None
+    cache: dict[bytes, DifferentiatedRun] = model.pool.cache
     signals = PackedInputs.of(list(inputs_of(model, experiment, given).values()))
     run = RunRequest(changed(model, given), signals, experiment.time, names, tolerance.rtol)
     varied = [*_varied(model, run, sensitivities), *directions]
-    made = DifferentiatedRun(model.pool, run, varied, noise_key, partial).make()
+    labels = [v.label for v in varied]
+    made = None if fresh else cache.pop(run.key, None)
+    if made is None or not made.has(labels):
+        made = Differentiation(model.pool, run, varied, noise_key, partial, made).result()
+    if made.end is None:
+        cache[run.key] = made
+    while sum(r.outputs.nbytes + r.gradients.nbytes for r in cache.values()) > KEPT and len(cache) > 1:
+        del cache[next(iter(cache))]
+    columns = [made.labels.index(label) for label in labels]
+    errors = made.errors[columns]
     notes = {**_learned_notes(model.pool.learned), **made.notes}
     if not model.fmu.outputs and set(names) == set(model.fmu.shown):
         notes["outputs"] = "the FMU declares none: its states are recorded"
-    worst = int(np.argmax(made.errors)) if varied else None
-    if worst is not None and made.errors[worst] > 0.0:
-        model.pool.sensitivity_error = max(model.pool.sensitivity_error, float(made.errors[worst]))
-        notes["sensitivity error"] = f"{made.errors[worst]:.2g} of the derivative by {varied[worst].name}, the least certain"
+    if errors.max(initial=0.0) > 0.0:
+        worst = int(np.argmax(errors))
+        model.pool.sensitivity_error = max(model.pool.sensitivity_error, float(errors[worst]))
+        notes["sensitivity error"] = f"{errors[worst]:.2g} of the derivative by {varied[worst].name}, the least certain"
     time, rows = experiment.time[: made.outputs.shape[0]], made.outputs
     status = "converged" if time.size == experiment.time.size else "ended"
     method = "lsoda" if model.has_equations else "co-simulation"
@@ -65,7 +75,7 @@ def simulate_without_effects(
     return Simulation(
         Trajectory(time, rows, names, tuple(model.outputs[n].unit for n in names)),
         tuple(v.name for v in varied),
-        made.gradients[: time.size],
+        made.gradients[:, :, columns],
         Statistics(status, method, accepted, 0, events, evaluations, segments, 0),
         FrozenMap(notes),
     )

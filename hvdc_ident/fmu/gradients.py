@@ -83,6 +83,11 @@ class Varied:
     variable: Variable | None = None
     points: Array | None = None
 
+    @property
+    def label(self) -> str:
+        """What tells it from others of a run."""
+        return self.name if self.points is None else f"{self.name} {sha256(self.points.tobytes()).hexdigest()}"
+
     def moved(self, run: RunRequest, value: float) -> RunRequest:
         """Return the run at another value."""
         if self.points is None:
@@ -94,34 +99,64 @@ class Varied:
         return Line(lambda value: self.moved(run, value), self.value, self.size, self.low, self.high, middle)
 
 
+@dataclass(frozen=True, eq=False)
 class DifferentiatedRun:
-    """A run and its derivatives.
+    """A run with derivatives.
+
+    outputs: (n, names). labels: of what it is differentiated by. gradients: (n, names, labels). errors: (labels,) relative.
+    counts: steps, events, evaluations and segments. notes: on the methods. end: the instant at which the FMU asked for the
+    end, s, or None. directional: whether derivatives of the FMU's own were integrated with it.
+    """
+
+    outputs: Array
+    labels: tuple[str, ...]
+    gradients: Array
+    errors: Array
+    counts: list[int]
+    notes: Mapping[str, str]
+    end: float | None
+    directional: bool
+
+    def has(self, labels: Sequence[str]) -> bool:
+        """Return whether it has these derivatives, and is the run that is made for them: plain where none are wanted."""
+        return set(labels) <= set(self.labels) and bool(labels or not self.directional)
+
+
+class Differentiation:
+    """The making of a run with its derivatives.
 
     noise_key: shared by runs whose noise and difference steps are alike though their inputs differ. partial: whether the
-    rows up to an end that the FMU asks for are accepted. After `make`: outputs, (n, names); gradients, (n, names, varied);
-    errors, (varied,) relative; counts: steps, events, evaluations and segments; notes on the methods.
+    rows up to an end that the FMU asks for are accepted. known: the same run with other derivatives, or none.
     """
 
     def __init__(
-        self, pool: WorkerPool, run: RunRequest, varied: Sequence[Varied], noise_key: str = "", partial: bool = False
+        self,
+        pool: WorkerPool,
+        run: RunRequest,
+        varied: Sequence[Varied],
+        noise_key: str = "",
+        partial: bool = False,
+        known: DifferentiatedRun | None = None,
     ) -> None:
         self.pool, self.run, self.varied, self.partial = pool, run, varied, partial
         self.noise_key = run.experiment(noise_key)
         self.notes: dict[str, str] = {}
         self.counts = [0, 0, 0, 0]
+        self.end: float | None = None
         self.gradients = np.zeros((run.time.size, len(run.names), len(varied)))
         self.errors = np.zeros(len(varied))
+        self._made = (known.outputs, known.counts) if known is not None and not known.directional else None
 
-    def make(self) -> DifferentiatedRun:
-        """Make the runs that are needed; return this. Raises SimulationError where one fails."""
+    def result(self) -> DifferentiatedRun:
+        """Make the runs that are needed. Raises SimulationError where one fails."""
         if "restart" not in self.pool.learned:
             self._plain()  # finds it out
-        confirmed = self._confirmed()
-        integrated = self._integrated(confirmed) if confirmed else None
-        self.outputs = self._plain() if integrated is None else integrated
-        directional = confirmed if integrated is not None else []
+        directional = self._confirmed()
+        outputs = self._integrated(directional) if directional else None
+        if outputs is None:
+            directional, outputs = [], self._plain()
         others = [v for v in self.varied if v not in directional]
-        for v, (column, error) in zip(others, self._by_differences(others), strict=True):
+        for v, (column, error) in zip(others, self._by_differences(others, outputs), strict=True):
             self._enter(v, column)
             self.errors[self.varied.index(v)] = error
         lost = self.errors > LOST_IN_NOISE
@@ -135,21 +170,23 @@ class DifferentiatedRun:
             methods.setdefault(method, []).append(v.name)
         if methods:
             self.notes["sensitivities"] = "; ".join(f"{m}: {', '.join(names)}" for m, names in methods.items())
-        return self
+        labels, gradients = tuple(v.label for v in self.varied), self.gradients[: outputs.shape[0]]
+        integrated = bool(directional)
+        return DifferentiatedRun(
+            outputs, labels, gradients, self.errors, self.counts, self.notes, self.end, integrated
+        )
 
     def _enter(self, v: Varied, column: Array) -> None:
         self.gradients[:, :, self.varied.index(v)] = column
 
     def _plain(self) -> Array:
-        """(n, outputs) of the run itself. The pool's last one is kept."""
-        if self.pool.last is None or self.pool.last[0] != self.run.key:
+        """(n, outputs) of the run itself, which is made once."""
+        if self._made is None:
             answer, out = self.pool.ask(*self.run.message(partial=self.partial))
-            if answer["end"] is not None:
-                self.counts, end = answer["counts"], answer["end"]
-                self.notes["end"] = f"the FMU asked for the end of the run at {end:.6g} s: the rows go up to there"
-                return out["outputs"]
-            self.pool.last = (self.run.key, out["outputs"], answer["counts"])
-        _, outputs, self.counts = self.pool.last
+            self._made, self.end = (out["outputs"], answer["counts"]), answer["end"]
+            if self.end is not None:
+                self.notes["end"] = f"the FMU asked for the end of the run at {self.end:.6g} s: the rows go up to there"
+        outputs, self.counts = self._made
         return outputs
 
     def _rows(self, runs: Sequence[RunRequest]) -> list[Array]:
@@ -158,14 +195,14 @@ class DifferentiatedRun:
 
     # --- by differences of runs ---
 
-    def _by_differences(self, varied: Sequence[Varied]) -> list[tuple[Array, float]]:
-        """Return each derivative, (n, outputs), and its relative error."""
+    def _by_differences(self, varied: Sequence[Varied], outputs: Array) -> list[tuple[Array, float]]:
+        """Return each derivative, (n, outputs), and its relative error. outputs: of the run itself."""
         steps, noise = self.pool.steps, np.empty(0)
         if any(self._step_key(v) not in steps for v in varied):
-            noise = self._noise()
+            noise = self._noise(outputs)
 
         def column(v: Varied) -> Differences[RunRequest, tuple[Array, float]]:
-            line, key = v.line(self.run, self.outputs), self._step_key(v)
+            line, key = v.line(self.run, outputs), self._step_key(v)
             if (step := steps.get(key)) is not None:
                 return (yield from difference(line, step)), step.error
             rows, step = yield from first_difference(line, noise)
@@ -179,7 +216,7 @@ class DifferentiatedRun:
         octave = round(float(np.log2(abs(v.value)))) if v.value else 0
         return self.noise_key + f"{v.key} {octave}".encode()
 
-    def _noise(self) -> Array:
+    def _noise(self, outputs: Array) -> Array:
         """(outputs,) noise of a run of this experiment."""
 
         def displaced(steps: float) -> RunRequest:
@@ -192,7 +229,7 @@ class DifferentiatedRun:
 
         known = self.pool.noise.get(self.noise_key)
         if known is None:
-            (known,) = together([noise_of(displaced, self.outputs)], self._rows)
+            (known,) = together([noise_of(displaced, outputs)], self._rows)
             _keep(self.pool.noise, self.noise_key, known)
         return known
 

@@ -22,7 +22,7 @@ from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.effects import EffectUse, apply_effects, effects, joined_sources
 from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, require_known, unknown_name
 from hvdc_ident.expression import parse, symbol
-from hvdc_ident.fmu.evaluate import changed, inputs_of, simulate_without_effects
+from hvdc_ident.fmu.evaluate import inputs_of, simulate_without_effects
 from hvdc_ident.fmu.gradients import Varied
 from hvdc_ident.fmu.piecewise_linear import kept_rows, refined_grid, sampling_grid, signal_of
 from hvdc_ident.immutable import FrozenMap
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 
 MIN_ROWS = 4000  # on which outputs are recorded where an effect at them has memory
-RUNS_KEPT = 12  # of an FMU: refits of effects at its outputs request the same ones many times
 JUMP_RATIO = 2.0  # of the changes on the two sides of a parameter's value, above which one of them has a jump in it
 SPIKE_SHARE = 0.02  # share of the run for which a derivative would have its largest value to have its mean
 PARAMETER_SHIFT = 0.01  # of a parameter whose derivative comes from runs, in its sizes
@@ -194,33 +193,17 @@ class RunWithEffects:
         sensitivities: tuple[str, ...] = (),
         directions: Sequence[Varied] = (),
     ) -> Simulation:
-        """Return the FMU's run on inputs, with derivatives by its parameters and along directions of its inputs.
-
-        The last RUNS_KEPT are not run again.
-        """
-        cache: dict[bytes, Simulation] = self.model.pool.cache
-        values = sorted(changed(self.model, self.given).items())
-        along = sorted((d.name, d.points.tobytes() if d.points is not None else b"") for d in directions)
-        names = (*sensitivities, *(d.name for d in directions))
-        text = repr((values, self.fmu_outputs, self.tolerance.rtol, _digest_of(inputs), along)).encode()
-        key = self.time.tobytes() + text
-        run = cache.pop(key, None)
-        if run is None or not set(names) <= set(run.parameters):
-            run = simulate_without_effects(
-                self.model,
-                Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs)),
-                self.given,
-                sensitivities,
-                self.fmu_outputs,
-                self.tolerance,
-                noise_key=_digest_of(self.signals),
-                directions=directions,
-            )
-        cache[key] = run
-        while len(cache) > RUNS_KEPT:
-            del cache[next(iter(cache))]
-        columns = [run.parameters.index(n) for n in names]
-        return replace(run, parameters=names, gradients=run.gradients[:, :, columns])
+        """Return the FMU's run on inputs, with derivatives by its parameters and along directions of its inputs."""
+        return simulate_without_effects(
+            self.model,
+            Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs)),
+            self.given,
+            sensitivities,
+            self.fmu_outputs,
+            self.tolerance,
+            noise_key=_digest_of(self.signals),
+            directions=directions,
+        )
 
     def _difference(self, name: str, inputs: Mapping[str, InputSignal], outputs: Array) -> Array:
         """(n, outputs) derivative by a parameter of the effects at the inputs, from runs on both sides of its value.

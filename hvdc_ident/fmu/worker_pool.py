@@ -154,12 +154,12 @@ class WorkerPool:
     """The workers of one FMU. A pickled pool has none; it starts its own where it is unpickled.
 
     learned: what workers have found out about the FMU in its first runs, for all: "restart", how it is brought back to its
-    start (see `hvdc_ident.fmu.instance`), "restart at a point", and how a co-simulation is called (see
+    start (see `hvdc_ident.fmu.runner`), "restart at a point", and how a co-simulation is called (see
     `hvdc_ident.fmu.co_simulation`). confirmed: by parameter or input, whether a run confirmed the FMU's own derivatives.
-    steps, noise: of differences of runs, by a digest of the experiment. last: key, outputs and counts of the last plain
-    run. cache: runs that callers keep, see `hvdc_ident.fmu.terminal_effects`. memory: bytes of the first worker after its
-    last answer. sensitivity_error: largest relative error of a derivative by differences. started: processes so far.
-    runs: whole runs of the FMU so far, those for derivatives among them.
+    steps, noise: of differences of runs, by a digest of the experiment. cache: the last runs, see
+    `hvdc_ident.fmu.evaluate`. memory: bytes of the first worker after its last answer. sensitivity_error: largest relative
+    error of a derivative by differences. started: processes so far. runs: whole runs of the FMU so far, those for
+    derivatives among them.
     """
 
     description: Description
@@ -179,7 +179,6 @@ class WorkerPool:
         self._busy = 1  # workers of the last request
         self.steps: dict[bytes, DifferenceStep] = {}
         self.noise: dict[bytes, Array] = {}
-        self.last: tuple[bytes, Array, list[int]] | None = None
         self.cache: dict[bytes, Any] = {}
         self.memory = 0
         self.sensitivity_error = 0.0
