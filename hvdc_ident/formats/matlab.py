@@ -121,7 +121,7 @@ def _from_hdf5(item: Any, file: Any, path: Path, depth: int) -> Any:
     kind = item.attrs.get("MATLAB_class", b"").decode("ascii", "replace")
     if kind == "char":
         check_size(1, item.size, path)
-        return "".join(map(chr, np.asarray(item).ravel().astype(int))) if item.size > 2 or not _empty(item) else ""
+        return "" if _empty(item) else "".join(map(chr, np.asarray(item).ravel().astype(int)))
     if item.dtype.kind == "O":  # references: the elements of a structure array
         return [_from_hdf5(file[r], file, path, depth + 1) for r in np.asarray(item).ravel()]
     values = np.asarray(item) if item.dtype.kind in "fiub" or item.dtype.names == ("real", "imag") else None

@@ -37,6 +37,7 @@ FROZEN = ("AT_RESET frozen = 1", "AT_INSTANTIATE frozen = 0")
         ("instance", begun("refusing", "AT_RESET return 3"), "each run has a new instance"),
         ("instance", begun("fatal", "AT_RESET abort()"), "each run has a new instance"),
         ("process", begun("spoilt", "SPOILT 0.1"), "each run has a new process"),
+        ("process", begun("slight", "SPOILT 1e-5"), "each run has a new process"),
         ("process", begun("both", *FROZEN, "SPOILT 0.1", more=(CLOCK,)), "each run has a new process"),
     ],
     ids=lambda x: getattr(x, "name", None),

@@ -11,6 +11,7 @@ import pytest
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import convert, list_signals, read_waveforms
+from hvdc_ident.formats._columns import own_names
 from tests.formats.samples import SAMPLES
 
 TIME = np.array([0.0, 0.1, 0.2, 0.3])
@@ -106,7 +107,6 @@ def test_version_7_3(tmp_path: Path) -> None:
 
 
 def test_pscad_channels_beyond_ten_stand_in_the_second_file(tmp_path: Path) -> None:
-
     SAMPLES["pscad"](tmp_path / "run.inf")
     found = read_waveforms(tmp_path / "run.inf", ["S12", "S3"])
     np.testing.assert_allclose(found.values, np.column_stack([12 + found.time, 3 + found.time]))
@@ -115,6 +115,20 @@ def test_pscad_channels_beyond_ten_stand_in_the_second_file(tmp_path: Path) -> N
     assert read_waveforms(tmp_path / "run.inf", ["S3"]).names == ("S3",)
     with pytest.raises(WaveformError, match=r"run_02\.out"):
         read_waveforms(tmp_path / "run.inf")
+
+
+def test_pscad_channels_up_to_ten_may_stand_in_one_file_without_a_number(tmp_path: Path) -> None:
+    """Those beyond ten do not stand there."""
+    SAMPLES["pscad"](tmp_path / "run.inf")
+    (tmp_path / "run_01.out").rename(tmp_path / "run.out")
+    assert read_waveforms(tmp_path / "run.inf", ["S3"])["S3"].tolist() == [3.0, 3.05, 3.1]
+    (tmp_path / "run_02.out").unlink()
+    with pytest.raises(WaveformError, match=r"channels 11 to 20 is missing.*run_02\.out"):
+        read_waveforms(tmp_path / "run.inf", ["S12"])
+
+
+def test_names_that_stand_twice_are_numbered_past_those_that_are_there() -> None:
+    assert own_names(["a", "a", "b", "a (2)", "a"]) == ("a", "a (3)", "b", "a (2)", "a (4)")
 
 
 ALL = ("a.parquet", "a.inf", "a.h5", "a.mat")
