@@ -28,6 +28,10 @@ limits system delays sampling characteristic stability equilibrium plot derivati
 fmu_linear jacobian operating_point linearisation mode delayed_modes delayed_locus modal gain_limits loops reduction distance
 transfer_function formula impedance response_file export
 """,
+    "fmu": """
+archive description piecewise_linear differences fmi instance runner derivatives model_exchange co_simulation experiment_run worker
+worker_pool gradients evaluate terminal_effects capabilities model compile export
+""",
 }
 
 ALLOWED = {

@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.fmi import DISCARD, ERROR, FmiError, TerminationRequested, Vector
-from hvdc_ident.fmu.instance import REPEAT_TOLERANCE, Instance, RunEnded, RunFailed, difference, moving
+from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
+from hvdc_ident.fmu.runner import REPEAT_TOLERANCE, difference, moving
 
 MAX_EARLY_RETURNS = 10_000  # in one communication step
 TRIAL_ROWS = 300  # of a trial from the first change of an input on: solvers' own steps may be tens of rows long
@@ -149,30 +150,6 @@ def find_held(learned: dict[str, Any], time: Array, run: Callable[[Array], Array
     earlier = time[1:] - 0.5 * behind  # after the last own step before the row
     run(np.union1d(time, earlier[earlier > time[:-1]]))
     learned["behind"] = behind  # of the rows that were asked for
-
-
-def notes(learned: Mapping[str, Any]) -> dict[str, str]:
-    """Return notes for the user on how the FMU was called, by subject."""
-    texts = {}
-    if learned.get("reading") == "never":
-        texts["outputs at jumps"] = (
-            "the FMU loses jumps of its inputs where outputs are read right after them: rows at jumps are before them"
-        )
-    if learned.get("sloping") == "ignored":
-        texts["ramps of inputs"] = (
-            "the FMU offers to take slopes of its inputs, but was further off with them than with inputs held at their "
-            "mean over each step: they are held"
-        )
-    if learned.get("steps") == "even":
-        texts["steps"] = (
-            "the FMU refuses steps of different lengths: it took even ones, rows between are joined by lines"
-        )
-    if learned.get("outputs held"):
-        texts["internal steps"] = (
-            f"the FMU takes steps of its own and its outputs at a row are those of the last one, up to "
-            f"{learned['behind']:.3g} s earlier"
-        )
-    return texts
 
 
 # --- trials ---

@@ -1,34 +1,24 @@
-"""Derivatives of an FMU: directional derivatives and the Jacobian at a point, and differences of whole runs.
+"""Derivatives of an FMU as it computes them itself, and its Jacobian at a point. In worker processes only.
 
-Directional derivatives are used where the FMU offers them and they agree with differences. In worker processes only.
-
-A run has noise (its integrator's, and that of rows which an event passes): fourth differences over short steps of all
-parameters at once show it. A pair of runs around a parameter then gives its derivative, and the curvature from which the
-best step of a one-sided difference follows: from the second time on, a derivative costs one run. Where one side cannot be
-accurate, the step of a central difference is chosen against the noise. J. J. More and S. M. Wild, ACM TOMS 38 (2012) 19.
+Directional derivatives are used where the FMU offers them and they agree with differences.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
+from hvdc_ident.fmu.differences import SHORT_STEP
 from hvdc_ident.fmu.fmi import FATAL, FmiError, Vector
 from hvdc_ident.fmu.instance import Instance, RunFailed
 
 CENTRAL_STEP = float(np.cbrt(np.finfo(float).eps))  # of a central difference, in sizes of the variable
 AGREEMENT = 1e-5  # of a row's largest entry: directional derivatives that differ by more from differences are not used
 KINK = 1e-3  # share of a row's largest entry by which differences of two steps disagree beside a limit
-SHORT_STEP = 1e-3  # of the differences that show a run's noise, in sizes of the parameter: as long as those of a search
-SECOND_STEP = 4.0  # the second pair's step, in those of the first
-LEAST_STEP, LARGEST_STEP = 1e-6, 5e-2  # that are chosen from, in sizes of the parameter
-SUFFICIENT = 1e-3
-"""Relative error of a derivative that one-sided differences may leave. It turns a Gauss-Newton step by as much and
-changes a standard error by as much, a tenth of what the second figure of an interval shows."""
 
 
 class DirectionalDerivative:
@@ -122,10 +112,7 @@ class PointEvaluation:
         library = self.instance.library
         library.set_time(self.t)
         library.set_states(self.x)
-        library.enter_event_mode()
-        self.instance.inputs.set(self.u)
-        changed = self.instance.update_discrete_states(self.t)
-        library.enter_continuous_time_mode()
+        changed = self.instance.handle_event(self.t, self.u)
         if changed and not np.allclose(library.get_states(), self.x, rtol=1e-12, atol=1e-12):
             raise RunFailed("an event of the FMU sets the states elsewhere at this point", self.t)
 
@@ -253,108 +240,3 @@ class PointJacobian:
     directional: NDArray[np.bool_]
     error: float
     near: bool
-
-
-# --- differences of runs ---
-
-RunBy = Callable[[float], Array]
-"""A run as a function of the parameter: (n, outputs)."""
-
-
-@dataclass(frozen=True)
-class DifferenceStep:
-    """A difference step. h: step in the parameter's unit. error: relative, that it leaves. sides: 1 or 2."""
-
-    h: float
-    error: float
-    sides: int = 2
-
-
-def noise_of(run: RunBy, middle: Array) -> Array:
-    """Return the noise of each output, (outputs,) rms over rows, from six runs.
-
-    run: a run at a number of short steps, all parameters moved at once: one that changes nothing shows no noise. Fourth
-    differences over half a step and over a whole one hold the same noise, and the curvature 16 times: their squares tell
-    both. So what jumps over a few steps, as a row does that an event passes, counts as noise, and what bends does not.
-    """
-    at = {0.0: middle, **{k: run(k) for k in (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)}}
-    half, whole = (at[0.0] - 4.0 * at[k] + 6.0 * at[2 * k] - 4.0 * at[3 * k] + at[4 * k] for k in (0.5, 1.0))
-    rounding = np.finfo(float).eps * np.abs(middle).max(axis=0, initial=0.0)
-    # 1 + 16 + 36 + 16 + 1 times the square of one run's noise.
-    square = (256.0 * np.mean(half**2, axis=0) - np.mean(whole**2, axis=0)) / (255.0 * 70.0)
-    return np.asarray(np.sqrt(np.maximum(square, rounding**2)))
-
-
-def first_difference(
-    run: RunBy, value: float, size: float, low: float, high: float, middle: Array, noise: Array
-) -> tuple[Array, DifferenceStep]:
-    """Return the derivative (n, outputs) at a value within [low, high], from two runs or four, and the step for later.
-
-    size: a typical size of the parameter. middle: the run at the value. noise: (outputs,). Errors are those of the
-    output with the largest, rms over rows and in its range.
-    """
-    room = max(value - low, high - value)
-    size = min(size, 10.0 * room) if np.isfinite(room) and room > 0 else size
-    scale = _ranges(middle)
-    level = float((noise / scale).max(initial=0.0))
-    # A pair's best step is cbrt(3 level) sizes where the third derivative is as large as the parameter's size makes it:
-    # that is the second pair's. The first, closer one bears a third derivative sixteen times as large.
-    close = _clipped(float(np.cbrt(3.0 * level)) * size, size) / SECOND_STEP
-    near, second_derivative = difference_pair(run, value, close, low, high, middle)
-    strength, curvature = _largest(near, scale), _largest(second_derivative, scale)
-    if strength == 0.0:
-        return near, DifferenceStep(close, 0.0, 1)
-    h = _clipped(2.0 * float(np.sqrt(level / curvature)) if curvature > 0.0 else LARGEST_STEP * size, size)
-    error = (0.5 * curvature * h + 2.0 * level / h) / strength
-    pair_error = level / (close * strength) + (close / size) ** 2 / 6.0
-    if max(error, pair_error) <= SUFFICIENT:
-        return near, DifferenceStep(h, float(max(error, pair_error)), 1)
-    far, _ = difference_pair(run, value, SECOND_STEP * close, low, high, middle)
-    third = _largest(near - far, scale) / ((SECOND_STEP**2 - 1.0) * close**2)
-    h = _clipped(float(np.cbrt(level / (2.0 * third))) if third > 0.0 else LARGEST_STEP * size, size)
-    step = DifferenceStep(h, float((third * h * h + level / h) / strength))
-    ratios = [abs(float(np.log(h / c))) for c in (close, SECOND_STEP * close)]
-    if min(ratios) < np.log(2.0):  # within a factor of two of the best step the error is within twice the least
-        return (near if ratios[0] < ratios[1] else far), step
-    return difference(run, value, step, low, high, middle), step
-
-
-def difference(run: RunBy, value: float, step: DifferenceStep, low: float, high: float, middle: Array) -> Array:
-    """Return the derivative (n, outputs) at a value, to the order of the step: from one run, or from two."""
-    h = step.h
-    if step.sides == 1:
-        side = h if value + h <= high else -h
-        return np.asarray((run(value + side) - middle) / side)
-    return difference_pair(run, value, h, low, high, middle)[0]
-
-
-def difference_pair(run: RunBy, value: float, h: float, low: float, high: float, middle: Array) -> tuple[Array, Array]:
-    """Return first and second derivative from two more runs: on both sides, or on one where a bound is near."""
-    if value - h >= low and value + h <= high:
-        up, down = run(value + h), run(value - h)
-        return np.asarray((up - down) / (2.0 * h)), np.asarray((up - 2.0 * middle + down) / h**2)
-    side = h if value + 2.0 * h <= high else -h
-    one, two = run(value + side), run(value + 2.0 * side)
-    first = (-3.0 * middle + 4.0 * one - two) / (2.0 * side)
-    return np.asarray(first), np.asarray((middle - 2.0 * one + two) / side**2)
-
-
-def _clipped(h: float, size: float) -> float:
-    return float(np.clip(h, LEAST_STEP * size, LARGEST_STEP * size))
-
-
-def _ranges(outputs: Array) -> Array:
-    """Return the range of each output, (outputs,), or its size where it is constant, or 1."""
-    spread = np.ptp(outputs, axis=0)
-    size = np.abs(outputs).max(axis=0, initial=0.0)
-    return np.where(spread > 1e-9 * size, spread, np.where(size > 0.0, size, 1.0))
-
-
-def _largest(change: Array, scale: Array) -> float:
-    """Return the root mean square over rows of the output that changes most, in its range."""
-    return float(rms(change / scale).max()) if change.size else 0.0
-
-
-def rms(rows: Array) -> Array:
-    """Return the root mean square over rows, (outputs,)."""
-    return np.asarray(np.sqrt(np.mean(rows**2, axis=0)))

@@ -78,7 +78,7 @@ class Description:
     without any, the states. tool: that generated it; needs_tool: whether it runs in that tool alone. completed_step:
     whether it needs the calls after integrator steps. directional: whether it offers directional derivatives.
     variable_step: whether communication steps may differ. interpolates: whether it takes the derivatives of inputs.
-    step: communication step that it suggests, s, or None. once_per_process: whether a process may make one instance only.
+    step: communication step that it suggests, s, or None.
     """
 
     path: Path
@@ -98,7 +98,6 @@ class Description:
     variable_step: bool = True
     interpolates: bool = False
     step: float | None = None
-    once_per_process: bool = False
     text: str = ""
     tool: str = ""
     needs_tool: bool = False
@@ -183,7 +182,6 @@ def read_description(
         interpolates=bool(getattr(chosen, "canInterpolateInputs", False)) and given.fmiMajorVersion == 2,
         step=_number(getattr(chosen, "fixedInternalStepSize", None))
         or _number(experiment.stepSize if experiment else None),
-        once_per_process=bool(getattr(chosen, "canBeInstantiatedOnlyOncePerProcess", False)),
         text=given.description or "",
         tool=given.generationTool or "",
         needs_tool=bool(getattr(chosen, "needsExecutionTool", False)),

@@ -1,75 +1,29 @@
-"""An FMU evaluated in its workers: over an experiment, with effects at its terminals, or at a point."""
+"""An FMU evaluated in its workers: over an experiment or at a point."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
-from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, require_known
+from hvdc_ident.errors import ModelError
+from hvdc_ident.fmu.gradients import DifferentiatedRun, Differentiation, RunRequest, Varied
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.simulate import Simulation, Statistics, Tolerance, chains_of
+from hvdc_ident.simulate import Simulation, Statistics, Tolerance
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
 
-UNBOUNDED = 1e300  # a bound where there is none: JSON has no infinity
-
-
-@dataclass(frozen=True, eq=False)
-class Direction:
-    """A direction in which the inputs of a run move, scaled such that one of them moves by its range.
-
-    points: of all inputs, joined as `PackedInputs.values`. key: shared by directions that need the same difference step.
-    """
-
-    points: Array
-    key: str
-
-
-def simulate(
-    model: FmuModel,
-    experiment: Experiment,
-    values: Mapping[str, float],
-    sensitivities: tuple[str, ...],
-    outputs: Sequence[str] | None,
-    tolerance: Tolerance,
-    partial: bool = False,
-) -> Simulation:
-    """Return the run with its recording chains and effects. See `FmuModel.simulate`."""
-    from hvdc_ident.fmu.terminal_effects import RunWithEffects
-
-    where = f"experiment '{experiment.name}'"
-    given = {**experiment.values, **values}
-    names = tuple(model.outputs if outputs is None else outputs)
-    try:
-        recording = model.recording((*names, *experiment.instrument))
-        checked = recording.driven(experiment.drive).with_effects(chains_of(experiment.instrument))
-    except InputError as e:
-        raise e.at(where) from None
-    known = {**checked.parameters, **checked.inputs}
-    require_known("parameter or input", (*given, *experiment.inputs, *sensitivities), known, where)
-    if experiment.starts:
-        raise ModelError(
-            "an FMU begins where its own initialisation puts it",
-            where=where,
-            expected="no starts of states",
-            got=", ".join(experiment.starts),
-            hint="a parameter of the FMU that is a start value, where it has one",
-        )
-    require_known("input", experiment.offsets, checked.inputs, f"{where}, offsets")
-    try:
-        if checked.effects:
-            return RunWithEffects(checked, experiment, given, names, tolerance).simulation(sensitivities)
-        accept_end = partial and not sensitivities
-        return simulate_without_effects(checked, experiment, given, sensitivities, names, tolerance, partial=accept_end)
-    except HvdcIdentError as e:
-        raise e.at(where) from None
+KEPT = 64 * 2**20  # bytes of the runs that are kept, the last one in any case
+REUSE_NOTES = {
+    "instance": "a reset does not bring the FMU back to its start: each run has a new instance",
+    "process": "neither a reset nor a new instance brings the FMU back to its start: each run has a new process",
+}
 
 
 def simulate_without_effects(
@@ -83,63 +37,74 @@ def simulate_without_effects(
     partial: bool = False,
     fresh: bool = False,
     noise_key: str = "",
-    directions: Mapping[str, Direction] | None = None,
+    directions: Sequence[Varied] = (),
 ) -> Simulation:
     """Return the run of the FMU itself.
 
-    fresh: whether it is run even where the last run was the same one, whose rows are given else. partial: whether the
+    The last runs are not run again, as many as take `KEPT` bytes: refits of effects at the outputs request the same ones
+    many times. fresh: whether it is run all the same. partial: whether the
     rows up to an end that the FMU asks for are accepted. noise_key: shared by runs whose noise and difference steps are
-    alike though their inputs differ. directions: in which all inputs move, by a name that is no parameter's; derivatives
-    along them come after those of the sensitivities.
+    alike though their inputs differ. directions: in which all inputs move; derivatives along them come after those of the
+    sensitivities.
     """
-    along = directions or {}
+    cache: dict[bytes, DifferentiatedRun] = model.pool.cache
     signals = PackedInputs.of(list(inputs_of(model, experiment, given).values()))
-    scales = [*_scales(model, sensitivities), *([1.0, (-UNBOUNDED, UNBOUNDED), 0.0] for _ in along)]
-    sizes, bounds, starts = zip(*scales, strict=True) if scales else ((), (), ())
-    sensitivities = (*sensitivities, *along)
-    heading = {
-        "do": "simulate",
-        "values": changed(model, given),
-        "outputs": names,
-        "parameters": sensitivities,
-        "sizes": sizes,
-        "bounds": bounds,
-        "starts": starts,
-        "tolerance": tolerance.rtol,
-        "partial": partial,
-        "fresh": fresh,
-        "noise key": noise_key,
-        "directions": {n: d.key for n, d in along.items()},
-    }
-    arrays = {
-        "time": experiment.time,
-        "sizes": signals.sizes,
-        "times": signals.times,
-        "points": signals.values,
-        "breaks": signals.breaks,
-    }
-    if along:
-        arrays["directions"] = np.array([d.points for d in along.values()])
-    answer, out = model.pool.ask(heading, arrays)
-    notes = dict(answer["notes"])
+    run = RunRequest(changed(model, given), signals, experiment.time, names, tolerance.rtol)
+    varied = [*_varied(model, run, sensitivities), *directions]
+    labels = [v.label for v in varied]
+    made = None if fresh else cache.pop(run.key, None)
+    if made is None or not made.has(labels):
+        made = Differentiation(model.pool, run, varied, noise_key, partial, made).result()
+    if made.end is None:
+        cache[run.key] = made
+    while sum(r.outputs.nbytes + r.gradients.nbytes for r in cache.values()) > KEPT and len(cache) > 1:
+        del cache[next(iter(cache))]
+    columns = [made.labels.index(label) for label in labels]
+    errors = made.errors[columns]
+    notes = {**_learned_notes(model.pool.learned), **made.notes}
     if not model.fmu.outputs and set(names) == set(model.fmu.shown):
         notes["outputs"] = "the FMU declares none: its states are recorded"
-    errors = dict(zip(sensitivities, out["errors"].tolist(), strict=True))
-    model.pool.sensitivity_error = max([model.pool.sensitivity_error, *errors.values()])
-    worst = max(errors, key=lambda n: errors[n], default=None)
-    if worst is not None and errors[worst] > 0.0:
-        notes["sensitivity error"] = f"{errors[worst]:.2g} of the derivative by {worst}, the least certain"
-    rows = out["outputs"]
-    status = "converged" if rows.shape[0] == experiment.time.size else "ended"
+    if errors.max(initial=0.0) > 0.0:
+        worst = int(np.argmax(errors))
+        model.pool.sensitivity_error = max(model.pool.sensitivity_error, float(errors[worst]))
+        notes["sensitivity error"] = f"{errors[worst]:.2g} of the derivative by {varied[worst].name}, the least certain"
+    time, rows = experiment.time[: made.outputs.shape[0]], made.outputs
+    status = "converged" if time.size == experiment.time.size else "ended"
     method = "lsoda" if model.has_equations else "co-simulation"
-    accepted, events, evaluations, segments = answer["counts"]
+    accepted, events, evaluations, segments = made.counts
     return Simulation(
-        Trajectory(experiment.time[: rows.shape[0]], rows, names, tuple(model.outputs[n].unit for n in names)),
-        sensitivities,
-        out["gradients"],
+        Trajectory(time, rows, names, tuple(model.outputs[n].unit for n in names)),
+        tuple(v.name for v in varied),
+        made.gradients[:, :, columns],
         Statistics(status, method, accepted, 0, events, evaluations, segments, 0),
         FrozenMap(notes),
     )
+
+
+def _learned_notes(learned: Mapping[str, Any]) -> dict[str, str]:
+    """Return notes for the user on how the FMU has to be run, by subject."""
+    texts = {}
+    if learned.get("restart") in REUSE_NOTES:
+        texts["restart"] = REUSE_NOTES[learned["restart"]]
+    if learned.get("reading") == "never":
+        texts["outputs at jumps"] = (
+            "the FMU loses jumps of its inputs where outputs are read right after them: rows at jumps are before them"
+        )
+    if learned.get("sloping") == "ignored":
+        texts["ramps of inputs"] = (
+            "the FMU offers to take slopes of its inputs, but was further off with them than with inputs held at their "
+            "mean over each step: they are held"
+        )
+    if learned.get("steps") == "even":
+        texts["steps"] = (
+            "the FMU refuses steps of different lengths: it took even ones, rows between are joined by lines"
+        )
+    if learned.get("outputs held"):
+        texts["internal steps"] = (
+            f"the FMU takes steps of its own and its outputs at a row are those of the last one, up to "
+            f"{learned['behind']:.3g} s earlier"
+        )
+    return texts
 
 
 def inputs_of(model: FmuModel, experiment: Experiment, given: Mapping[str, float]) -> dict[str, InputSignal]:
@@ -168,23 +133,31 @@ def changed(model: FmuModel, given: Mapping[str, float]) -> dict[str, float]:
     return values
 
 
-def _scales(model: FmuModel, sensitivities: Sequence[str]) -> list[tuple[float, tuple[float, float], float]]:
-    """Return typical size, bounds and start of each parameter or input by which derivatives are asked for."""
-    scales = []
-    for name in sensitivities:
+def _varied(model: FmuModel, run: RunRequest, names: Sequence[str]) -> list[Varied]:
+    """Return parameters and inputs as what a run is differentiated by; inputs by constants added to them."""
+    varied = []
+    for name in names:
         variable = model.fmu.parameters.get(name) or model.fmu.inputs[name]
-        if variable.whole:
-            raise ModelError(
-                f"there is no derivative by '{name}', which takes whole numbers only", where=f"model '{model.name}'"
-            )
-        start = variable.start or 0.0
         if parameter := model.parameters.get(name):
-            bounds = max(parameter.min, -UNBOUNDED), min(parameter.max, UNBOUNDED)
-            scales.append((parameter.size, bounds, start))
+            value = run.values.get(name, variable.start or 0.0)
+            size, low, high = _size(model, name), parameter.min, parameter.max
+            varied.append(Varied(name, name, value, size, low, high, variable))
         else:
-            size = max(abs(model.inputs[name].value), variable.nominal)
-            scales.append((size, (-UNBOUNDED, UNBOUNDED), start))
-    return scales
+            points = run.signals.constant(list(model.inputs).index(name))
+            varied.append(Varied(name, name, 0.0, _size(model, name), variable=variable, points=points))
+    return varied
+
+
+def _size(model: FmuModel, name: str) -> float:
+    """Return the typical size of a parameter or an input that is a real number. Raises ModelError for any other."""
+    variable = model.fmu.parameters.get(name) or model.fmu.inputs[name]
+    if variable.whole:
+        raise ModelError(
+            f"there is no derivative by '{name}', which takes whole numbers only", where=f"model '{model.name}'"
+        )
+    if parameter := model.parameters.get(name):
+        return parameter.size
+    return max(abs(model.inputs[name].value), variable.nominal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +213,7 @@ def at_point(
         "outputs": list(outputs),
         "check": check,
         "parameters": list(parameters),
-        "sizes": [size for size, _, _ in _scales(model, parameters)],
+        "sizes": [_size(model, name) for name in parameters],
     }
     u = np.array([float(values.get(n, i.value)) for n, i in model.inputs.items()])
     answer, out = model.pool.ask(heading, {"u": u, **({} if states is None else {"x": states})})

@@ -195,7 +195,7 @@ class FmuModel:
 
         Raises UnknownNameError for names it has not, SimulationError where the run fails.
         """
-        from hvdc_ident.fmu.evaluate import simulate
+        from hvdc_ident.fmu.terminal_effects import simulate
 
         chosen = outputs if outputs is not None else (experiment.outputs or None)
         return simulate(self, experiment, values or {}, tuple(sensitivities), chosen, tolerance or Tolerance(), partial)
@@ -223,7 +223,9 @@ def read_fmu(
     described = read_description(path.resolve(), interface)
     pool = WorkerPool(described, Limits.of(limits))
     if any(v.start is None for v in described.parameters.values()):
-        starts = pool.ask({"do": "starts"}, {})[1]["parameters"].tolist()
+        inputs = np.array([[v.start or 0.0 for v in described.inputs.values()]])
+        request = {"do": "initial", "values": [{}], "time": 0.0, "tolerance": None}
+        starts = pool.ask(request, {"u": inputs})[1]["parameters"][0].tolist()
         pool.close()  # the next worker gets the starts
         parameters = {
             n: v if v.start is not None else replace(v, start=start)

@@ -45,7 +45,7 @@ class Counts:
 class ModelExchangeRun:
     """One run. names: of the recorded variables. equations: of the sensitivities, or None. start: (nx, np) dx0/dp.
 
-    max_steps: after which the run is given up. outputs (n, names) and gradients (n, names, np) are filled row by row.
+    max_steps: after which it is given up. outputs (n, names) and gradients (n, names, np) are filled row by row.
     """
 
     instance: Instance
@@ -78,15 +78,19 @@ class ModelExchangeRun:
         self.end = float(self.time[-1])
         self.segment_end = self.end
         self.close: list[float] = []
-        self.before = self.counts.accepted
         self.events = self.state_events = 0  # of this run
         self.last_digit = float(np.spacing(np.abs(self.time[[0, -1]]).max()))
         self.rounding = 0.0  # difference up to which instants are one
 
-    def go(self, values: Mapping[str, float]) -> None:
+    def begin(self, values: Mapping[str, float]) -> None:
+        """Initialise the instance with these values of parameters. Raises RunFailed or FmiError."""
+        t = float(self.time[0])
+        self.instance.begin(values, self._inputs_at(t, before_jump=True), t, self.end, self.tolerance)
+
+    def go(self) -> None:
         """Fill every row. Raises RunFailed, FmiError or SensitivitiesLost; RunEnded with the rows up to the end."""
         try:
-            self._go(values)
+            self._go()
         except RunEnded as e:
             while self.row < self.time.size and self.row > 0 and self.time[self.row] <= float(e.t or 0.0):
                 self.outputs[self.row] = self.recorded.get()  # the FMU is at this instant
@@ -94,9 +98,8 @@ class ModelExchangeRun:
             e.rows = self.outputs[: self.row].copy()
             raise
 
-    def _go(self, values: Mapping[str, float]) -> None:
+    def _go(self) -> None:
         t = float(self.time[0])
-        self.instance.begin(values, self._inputs_at(t, before_jump=True), t, self.end, self.tolerance)
         x = self.library.get_states()
         self.atol = 1e-2 * self.tolerance * self.instance.nominals()
         y = np.concatenate([x, *(self.start.T if self.start is not None and self.columns else [])])
@@ -207,7 +210,7 @@ class ModelExchangeRun:
             raise RunFailed(
                 f"the integrator gave up: {' '.join(text.split())[:200]}", float(solver.t), "check parameter values"
             )
-        if self.counts.accepted - self.before > self.max_steps:
+        if self.counts.accepted > self.max_steps:
             raise RunFailed(
                 f"more than {self.max_steps} steps", float(solver.t), "look for a very fast part of the model"
             )
@@ -330,12 +333,9 @@ class ModelExchangeRun:
         """
         old = self.library.get_derivatives().copy()
         self.library.get_indicators()
-        self.library.enter_event_mode()
+        changed = self.instance.handle_event(t, u)
         if u is not None:
-            self.instance.inputs.set(u)
             self.applied = None
-        changed = self.instance.update_discrete_states(t)
-        self.library.enter_continuous_time_mode()
         x = self.library.get_states() if changed else y[: self.nx]
         if self.columns:
             jumped = bool(np.abs(x - y[: self.nx]).max(initial=0.0) > 0.0)

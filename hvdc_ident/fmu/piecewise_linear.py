@@ -46,10 +46,9 @@ class PackedInputs:
             list(zip(np.split(self.times, ends), np.split(self.values, ends), strict=True)) if self.sizes.size else []
         )
 
-    def raised(self, k: int, by: float) -> PackedInputs:
-        """Return the inputs with a constant added to one."""
-        values = [v + by if i == k else v for i, (_, v) in enumerate(self.each())]
-        return PackedInputs(self.sizes, self.times, np.concatenate(values), self.breaks)
+    def constant(self, k: int) -> Array:
+        """Return values that are 1 at the points of one input, and 0 at those of the others."""
+        return np.repeat(np.arange(self.sizes.size) == k, self.sizes.astype(int)).astype(float)
 
     def stepped(self, by: Sequence[float], at: float) -> PackedInputs:
         """Return the inputs with a step added to each at an instant, s."""

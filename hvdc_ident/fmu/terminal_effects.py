@@ -20,14 +20,15 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.effects import EffectUse, apply_effects, effects, joined_sources
-from hvdc_ident.errors import InputError, ModelError, unknown_name
+from hvdc_ident.errors import HvdcIdentError, InputError, ModelError, require_known, unknown_name
 from hvdc_ident.expression import parse, symbol
-from hvdc_ident.fmu.evaluate import Direction, changed, inputs_of, simulate_without_effects
+from hvdc_ident.fmu.evaluate import inputs_of, simulate_without_effects
+from hvdc_ident.fmu.gradients import Varied
 from hvdc_ident.fmu.piecewise_linear import kept_rows, refined_grid, sampling_grid, signal_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, Output
 from hvdc_ident.parameters import Input, Parameter
-from hvdc_ident.simulate import Simulation, Tolerance
+from hvdc_ident.simulate import Simulation, Tolerance, chains_of
 from hvdc_ident.simulate import simulate as engine_run
 
 if TYPE_CHECKING:
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
 
 MIN_ROWS = 4000  # on which outputs are recorded where an effect at them has memory
-RUNS_KEPT = 12  # of an FMU: refits of effects at its outputs request the same ones many times
 JUMP_RATIO = 2.0  # of the changes on the two sides of a parameter's value, above which one of them has a jump in it
 SPIKE_SHARE = 0.02  # share of the run for which a derivative would have its largest value to have its mean
 PARAMETER_SHIFT = 0.01  # of a parameter whose derivative comes from runs, in its sizes
@@ -65,6 +65,44 @@ def _free_prefix(model: FmuModel, use: EffectUse) -> str:
     names = effects()[use.effect].parameters
     tried = (first, *(f"{first}_{k}" for k in range(2, 10_000)))
     return next(p for p in tried if not any(f"{p}_{n}" in model.parameters for n in names))
+
+
+def simulate(
+    model: FmuModel,
+    experiment: Experiment,
+    values: Mapping[str, float],
+    sensitivities: tuple[str, ...],
+    outputs: Sequence[str] | None,
+    tolerance: Tolerance,
+    partial: bool = False,
+) -> Simulation:
+    """Return the run with its recording chains and effects. See `FmuModel.simulate`."""
+    where = f"experiment '{experiment.name}'"
+    given = {**experiment.values, **values}
+    names = tuple(model.outputs if outputs is None else outputs)
+    try:
+        recording = model.recording((*names, *experiment.instrument))
+        checked = recording.driven(experiment.drive).with_effects(chains_of(experiment.instrument))
+    except InputError as e:
+        raise e.at(where) from None
+    known = {**checked.parameters, **checked.inputs}
+    require_known("parameter or input", (*given, *experiment.inputs, *sensitivities), known, where)
+    if experiment.starts:
+        raise ModelError(
+            "an FMU begins where its own initialisation puts it",
+            where=where,
+            expected="no starts of states",
+            got=", ".join(experiment.starts),
+            hint="a parameter of the FMU that is a start value, where it has one",
+        )
+    require_known("input", experiment.offsets, checked.inputs, f"{where}, offsets")
+    try:
+        if checked.effects:
+            return RunWithEffects(checked, experiment, given, names, tolerance).simulation(sensitivities)
+        accept_end = partial and not sensitivities
+        return simulate_without_effects(checked, experiment, given, sensitivities, names, tolerance, partial=accept_end)
+    except HvdcIdentError as e:
+        raise e.at(where) from None
 
 
 class RunWithEffects:
@@ -104,8 +142,8 @@ class RunWithEffects:
             for n in by_inputs
             if n in self.input_chain.parameters and (jumps or any(map(_has_spikes, derivatives[n].values())))
         ]
-        directions = {n: _direction(inputs, derivatives[n]) for n in by_inputs if n not in by_runs}
-        run = self._fmu_run(inputs, by_fmu, {n: d for n, (d, size) in directions.items() if size > 0.0})
+        directions = {n: _direction(n, inputs, derivatives[n]) for n in by_inputs if n not in by_runs}
+        run = self._fmu_run(inputs, by_fmu, [d for d, size in directions.values() if size > 0.0])
         outputs = run.trajectory.values
         gradients = {n: run.gradients[:, :, k] for k, n in enumerate(run.parameters)}
         for n, (_, size) in directions.items():
@@ -153,35 +191,19 @@ class RunWithEffects:
         self,
         inputs: Mapping[str, InputSignal],
         sensitivities: tuple[str, ...] = (),
-        directions: Mapping[str, Direction] | None = None,
+        directions: Sequence[Varied] = (),
     ) -> Simulation:
-        """Return the FMU's run on inputs, with derivatives by its parameters and along directions of its inputs.
-
-        The last RUNS_KEPT are not run again.
-        """
-        along = directions or {}
-        cache: dict[bytes, Simulation] = self.model.pool.cache
-        values = sorted(changed(self.model, self.given).items())
-        names = (*sensitivities, *along)
-        text = repr((values, self.fmu_outputs, self.tolerance.rtol, _digest_of(inputs), sorted(along))).encode()
-        key = b"".join([self.time.tobytes(), text, *(along[n].points.tobytes() for n in sorted(along))])
-        run = cache.pop(key, None)
-        if run is None or not set(names) <= set(run.parameters):
-            run = simulate_without_effects(
-                self.model,
-                Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs)),
-                self.given,
-                sensitivities,
-                self.fmu_outputs,
-                self.tolerance,
-                noise_key=_digest_of(self.signals),
-                directions=along,
-            )
-        cache[key] = run
-        while len(cache) > RUNS_KEPT:
-            del cache[next(iter(cache))]
-        columns = [run.parameters.index(n) for n in names]
-        return replace(run, parameters=names, gradients=run.gradients[:, :, columns])
+        """Return the FMU's run on inputs, with derivatives by its parameters and along directions of its inputs."""
+        return simulate_without_effects(
+            self.model,
+            Experiment(self.time, self.experiment.name, inputs=FrozenMap(inputs)),
+            self.given,
+            sensitivities,
+            self.fmu_outputs,
+            self.tolerance,
+            noise_key=_digest_of(self.signals),
+            directions=directions,
+        )
 
     def _difference(self, name: str, inputs: Mapping[str, InputSignal], outputs: Array) -> Array:
         """(n, outputs) derivative by a parameter of the effects at the inputs, from runs on both sides of its value.
@@ -250,13 +272,15 @@ class RunWithEffects:
         return np.column_stack([run[y] for y in recorded]), np.stack([run.gradient(y) for y in recorded], axis=1)
 
 
-def _direction(inputs: Mapping[str, InputSignal], derivative: Mapping[str, InputSignal]) -> tuple[Direction, float]:
+def _direction(
+    name: str, inputs: Mapping[str, InputSignal], derivative: Mapping[str, InputSignal]
+) -> tuple[Varied, float]:
     """Return the direction of a derivative, and the derivative's size in it: 0 where nothing moves."""
     ranges = {n: max(np.ptp(s.values), 1e-6 * np.abs(s.values).max(), 1e-12) for n, s in inputs.items()}
     sizes = {n: float(np.abs(derivative[n].values).max()) / r for n, r in ranges.items()}
     size = max(sizes.values(), default=0.0)
     points = np.concatenate([derivative[n].values for n in inputs]) / (size or 1.0)
-    return Direction(points, "along " + ", ".join(n for n, s in sizes.items() if s > 0.0)), size
+    return Varied(name, "along " + ", ".join(n for n, s in sizes.items() if s > 0.0), points=points), size
 
 
 def _digest_of(inputs: Mapping[str, InputSignal]) -> str:

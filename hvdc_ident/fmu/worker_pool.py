@@ -6,7 +6,6 @@ This contains crashes, hangs and leaks. It does not contain malice: load only FM
 from __future__ import annotations
 
 import contextlib
-import json
 import linecache
 import math
 import multiprocessing
@@ -16,8 +15,6 @@ import signal
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from hashlib import sha256
-from itertools import islice
 from multiprocessing.util import Finalize
 from pathlib import Path
 from threading import Lock
@@ -27,6 +24,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import InputError, SimulationError, require_known
 from hvdc_ident.fmu.archive import Folder, shared_folder, unpacked_folder
 from hvdc_ident.fmu.description import Description, Message, Setup
+from hvdc_ident.fmu.differences import DifferenceStep
 from hvdc_ident.parallel import Child, Ending, Watch, available_cores
 from hvdc_ident.parallel.progress import RESIDENT, SPACE, begin
 
@@ -49,7 +47,7 @@ class Limits:
     deadline: float = 60.0
     load: float = 60.0
     memory: int | None = 2 * 2**30
-    runs: int = 500
+    runs: int = 2000
     workers: int | None = None
 
     def __post_init__(self) -> None:
@@ -100,8 +98,7 @@ class Budget:
 
 @dataclass(eq=False)
 class _FmuWorker:
-    """A process with the FMU in it. memory: bytes that the FMU may take. runs: requests so far. findings: number of those in
-    the pool that were sent to it.
+    """A process with the FMU in it. memory: bytes that the FMU may take. runs: requests so far.
 
     resident, space: bytes of memory and of address space after its last answer.
     """
@@ -109,7 +106,6 @@ class _FmuWorker:
     process: Child
     memory: int | None
     runs: int = 0
-    findings: int = 0
     resident: int = 0
     space: int = 0
 
@@ -157,16 +153,19 @@ class _Processes:
 class WorkerPool:
     """The workers of one FMU. A pickled pool has none; it starts its own where it is unpickled.
 
-    learned: what was found out about the FMU in its first runs, for later workers: "restart", how it is brought back to
-    its start (see `hvdc_ident.fmu.instance`), and "restart at a point"; "derivatives", by parameter whether a run confirmed the FMU's own.
-    cache: runs that callers keep, see `hvdc_ident.fmu.terminal_effects`. memory: bytes of the first worker after its last
-    answer. sensitivity_error: largest relative error of a derivative by differences. started: processes so far. runs:
-    whole runs of the FMU so far, those for derivatives among them.
+    learned: what workers have found out about the FMU in its first runs, for all: "restart", how it is brought back to its
+    start (see `hvdc_ident.fmu.runner`), "restart at a point", and how a co-simulation is called (see
+    `hvdc_ident.fmu.co_simulation`). confirmed: by parameter or input, whether a run confirmed the FMU's own derivatives.
+    steps, noise: of differences of runs, by a digest of the experiment. cache: the last runs, see
+    `hvdc_ident.fmu.evaluate`. memory: bytes of the first worker after its last answer. sensitivity_error: largest relative
+    error of a derivative by differences. started: processes so far. runs: whole runs of the FMU so far, those for
+    derivatives among them.
     """
 
     description: Description
     limits: Limits = field(default_factory=Limits)
     learned: dict[str, Any] = field(default_factory=dict)
+    confirmed: dict[str, bool] = field(default_factory=dict)
     unpacked: Path | None = None  # the folder of the process it comes from, used again where it is still there
 
     def __post_init__(self) -> None:
@@ -178,8 +177,8 @@ class WorkerPool:
             0.0  # s that a worker takes to begin; of requests that workers can share
         )
         self._busy = 1  # workers of the last request
-        self._findings: dict[str, Any] = {}  # noise of runs and difference steps, see `hvdc_ident.fmu.sensitivity_run`
-        self._base: tuple[bytes, Array] | None = None  # the last run, and its outputs
+        self.steps: dict[bytes, DifferenceStep] = {}
+        self.noise: dict[bytes, Array] = {}
         self.cache: dict[bytes, Any] = {}
         self.memory = 0
         self.sensitivity_error = 0.0
@@ -188,11 +187,17 @@ class WorkerPool:
 
     def __getstate__(self) -> dict[str, Any]:
         at = self._processes.folder.path if self._processes is not None else self.unpacked
-        return {"description": self.description, "limits": self.limits, "learned": self.learned, "unpacked": at}
+        kept = {n: getattr(self, n) for n in ("description", "limits", "learned", "confirmed")}
+        return {**kept, "unpacked": at}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
         self.__post_init__()
+
+    @property
+    def isolated(self) -> bool:
+        """True where each run has a process of its own, as far as is known."""
+        return self.learned.get("restart", "process") == "process"
 
     def ask(self, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
         """Return a worker's answer. Raises SimulationError where the run failed or the FMU ended, hung or used up memory.
@@ -200,54 +205,37 @@ class WorkerPool:
         An answer {"again": 1} says that a new process may do what this one, which was used before, cannot: the process
         is replaced and asked once more, and only its answer counts.
         """
+        return self.ask_all([(dict(heading), dict(arrays))])[0]
+
+    def ask_all(self, requests: Sequence[Message]) -> list[Message]:
+        """Return the answers to requests that several workers may share. Raises what `ask` raises, of the first that fails."""
         with self._lock:
-            begun = time.monotonic()
-            shares = self._shares(heading)
-            run = _run_of(heading, arrays)
-            if len(shares) > 1 and self._prepared(len(shares)):
-                known = {"base": self._base[1]} if self._base is not None and self._base[0] == run else {}
-                parts = self._together([{**heading, "wanted": names} for names in shares], {**arrays, **known})
-                answer, out = _combined(heading["parameters"], shares, parts)
-            else:
-                answer, out = self._together([heading], arrays)[0]
-            if heading["do"] == "simulate":
-                self._base = (run, out["outputs"])
-            if len(shares) > 1:
+            begun, answers = time.monotonic(), list[Message]()
+            count = self._workers_for(len(requests))
+            for k in range(0, len(requests), count):
+                answers += self._together(requests[k : k + count])
+            if len(requests) > 1:
                 self._shareable_time += time.monotonic() - begun
-            self.runs += int(answer.get("whole runs", 0))
-            return answer, out
+            self.runs += sum(int(answer.get("whole runs", 0)) for answer, _ in answers)
+            return answers
 
     def close(self) -> None:
         """End the processes; the next run starts others."""
         with self._lock:
             self._close()
 
-    # --- shares of a request ---
+    # --- several requests ---
 
-    def _shares(self, heading: Mapping[str, Any]) -> list[list[str]]:
-        """Return the parameters of each worker where derivatives come from differences of whole runs; empty for one worker.
-
-        Columns of one worker and of several are the same to the last digit: the noise of runs and the difference steps
-        that a worker finds are sent to all of them.
-        """
-        names: list[str] = heading.get("parameters", [])
-        if heading["do"] != "simulate" or len(names) < 2 or "restart" not in self.learned:
-            return []
-        d, confirmed = self.description, self.learned.get("derivatives", {})
-        directions = heading.get("directions", {})
-        if d.directional and d.states and any(n not in directions and confirmed.get(n, True) for n in names):
-            return []
-        count = min(self.limits.workers or idle_cores(self._busy), len(names))
-        return [names[i::count] for i in range(count)]
-
-    def _prepared(self, count: int) -> bool:
-        """Return whether so many workers run: they are started once requests took as much time as their start takes.
+    def _workers_for(self, requests: int) -> int:
+        """Return the number of workers that share requests: they are started once requests took as much time as their start takes.
 
         The total is then at most twice the least possible. A number that the limits state is started at once. An FMU
         that begins in one process only, as for its licence, stays in one.
         """
-        if self._single or not (self.limits.workers or self._shareable_time >= self._loading_time):
-            return False
+        count = min(self.limits.workers or idle_cores(self._busy), requests)
+        worthwhile = self.limits.workers or self._shareable_time >= self._loading_time
+        if self._single or count < 2 or not worthwhile:
+            return 1
         try:
             for number in range(count):
                 self._ready(number)
@@ -255,32 +243,31 @@ class WorkerPool:
             if 0 not in self._own_processes().workers:
                 raise
             self._single, self._broken = True, None
-        return not self._single
+            return 1
+        return count
 
-    def _together(self, headings: Sequence[Mapping[str, Any]], arrays: Mapping[str, Array]) -> list[Message]:
-        """Return the answers of as many workers as headings, all asked at once. Raises the first failure among them."""
-        sent = [self._sent(self._ready(number), h, arrays) for number, h in enumerate(headings)]
+    def _together(self, requests: Sequence[Message]) -> list[Message]:
+        """Return the answers of as many workers as requests, all asked at once. Raises the first failure among them."""
+        sent = [self._sent(self._ready(number), request) for number, request in enumerate(requests)]
         self._busy = len(sent)
         answers: list[Message] = []
         failures: list[SimulationError] = []
-        for number, (worker, h) in enumerate(zip(sent, headings, strict=True)):
+        for number, (worker, request) in enumerate(zip(sent, requests, strict=True)):
             try:
-                answers.append(self._answer(number, worker, h, arrays))
+                answers.append(self._answer(number, worker, request))
             except SimulationError as e:  # the others are heard all the same, so that they can be asked again
                 failures.append(e)
         if failures:
             raise failures[0]
         return answers
 
-    def _answer(
-        self, number: int, worker: _FmuWorker, heading: Mapping[str, Any], arrays: Mapping[str, Array]
-    ) -> Message:
+    def _answer(self, number: int, worker: _FmuWorker, request: Message) -> Message:
         """Return the answer of a worker that was asked, or of the one that replaces it."""
         fresh = worker.runs == 1
         answer, out = self._heard(worker, "run")
         if answer.get("again") and not fresh:
             self._end(worker)
-            worker = self._sent(self._ready(number), heading, arrays)
+            worker = self._sent(self._ready(number), request)
             answer, out = self._heard(worker, "run")
         if "failed" in answer:
             raise self._failure(worker, answer)
@@ -288,21 +275,18 @@ class WorkerPool:
             raise self._error("the FMU's worker wants a new process, and had one")
         if number == 0:
             self.memory = worker.resident
-        self.learned |= answer.get("learned", {})
-        for key, value in answer.get("found", {}).items():
-            self._findings.setdefault(key, value)
+        self.learned |= answer["learned"]
         return answer, out
 
     # --- one answer ---
 
-    def _sent(self, worker: _FmuWorker, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> _FmuWorker:
+    def _sent(self, worker: _FmuWorker, request: Message) -> _FmuWorker:
         """Send a request to a worker, with what others have found out meanwhile; return the worker."""
         worker.runs += 1
         begin(worker.process.progress)
-        new = dict(islice(self._findings.items(), worker.findings, None))
-        worker.findings = len(self._findings)
+        heading, arrays = request
         with contextlib.suppress(OSError):  # it is gone: noticed when it is heard
-            worker.process.connection.send(({**heading, "found": new}, dict(arrays)))
+            worker.process.connection.send(({**heading, "learned": self.learned}, arrays))
         return worker
 
     def _heard(self, worker: _FmuWorker, what: str) -> Message:
@@ -438,27 +422,6 @@ class WorkerPool:
             self._finalizer.cancel()
             self._processes.close()
             self._processes = None
-
-
-def _run_of(heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> bytes:
-    """Return a digest of everything that decides the outputs of a run."""
-    decisive = {n: heading.get(n) for n in ("do", "values", "outputs", "tolerance")}
-    return sha256(b"".join([json.dumps(decisive).encode(), *(n.encode() + a.tobytes() for n, a in arrays.items())])).digest()
-
-
-def _combined(parameters: list[str], shares: list[list[str]], parts: list[Message]) -> Message:
-    """Return one answer with the columns that several workers have computed."""
-    (first, out), notes = parts[0], dict(parts[0][0]["notes"])
-    gradients, errors = out["gradients"].copy(), out["errors"].copy()
-    for names, (answer, columns) in zip(shares[1:], parts[1:], strict=True):
-        at = [parameters.index(n) for n in names]
-        gradients[:, :, at], errors[at] = columns["gradients"][:, :, at], columns["errors"][at]
-        for name, text in answer["notes"].items():
-            if notes.setdefault(name, text) != text:  # both list some of the parameters
-                listed = {*notes[name].split(", "), *text.split(", ")}
-                notes[name] = ", ".join(n for n in parameters if n in listed)
-    runs = sum(answer["whole runs"] for answer, _ in parts)
-    return {**first, "notes": notes, "whole runs": runs}, {**out, "gradients": gradients, "errors": errors}
 
 
 def idle_cores(busy: int) -> int:

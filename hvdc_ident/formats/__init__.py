@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Trajectory, scaled
-from hvdc_ident.errors import InputError, WaveformError, in_python, unknown_name
+from hvdc_ident.errors import WaveformError, in_python, unknown_name
 
 __all__ = [
     "MAX_BYTES",
@@ -41,6 +41,8 @@ __all__ = [
     "write_csv",
 ]
 
+TOP = 65536
+"""Bytes at the start of a file that are looked at to recognise its format."""
 MAX_BYTES = 2 * 1024**3
 """Largest file, and largest table in memory, in bytes."""
 
@@ -64,20 +66,15 @@ class Format(Protocol):
     SUMMARY: str
     SUFFIXES: tuple[str, ...]
 
-    def recognises(self, path: Path) -> bool:
-        """True for a file of this format, and for no file of another one."""
+    def recognises(self, path: Path, top: bytes) -> bool:
+        """True for a file of this format, and for no file of another one. top: its first `TOP` bytes."""
 
     def read(self, path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         """The waveforms, all or those named in that order; WaveformError where the file cannot be used."""
 
-    def signals(self, path: Path) -> list[tuple[str, str]]:
-        """Name and unit of every signal, without reading the waveforms."""
-
-    def sample(self, path: Path) -> None:
-        """Write a small valid file to the path."""
-
-    # A module that can also write its format has `write(trajectory, path) -> None`, for `convert`; one whose recordings
-    # stand in several files has `files(path) -> list[Path]`, all of them that are there.
+    # A module that can list name and unit of every signal without reading the waveforms has `signals(path)`; one that can
+    # also write its format `write(trajectory, path) -> None`, for `convert`; one whose recordings stand in several files
+    # `files(path) -> list[Path]`, all of them that are there.
 
 
 @cache
@@ -172,7 +169,13 @@ def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[s
         fits = re.compile(pattern, re.IGNORECASE | re.DOTALL).fullmatch
     else:
         fits = re.compile(re.escape(search), re.IGNORECASE).search
-    return [(name, unit) for name, unit in _units(_format_of(file).signals(file)) if fits(name)]
+    module = _format_of(file)
+    if hasattr(module, "signals"):
+        listed = module.signals(file)
+    else:
+        found = module.read(file)
+        listed = list(zip(found.names, found.units, strict=True))
+    return [(name, unit) for name, unit in _units(listed) if fits(name)]
 
 
 def convert(
@@ -343,9 +346,12 @@ SPREADSHEETS = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods", ".numbers")
 
 def _format_of(path: Path) -> Format:
     known = formats().values()
+    with open(path, "rb") as file:
+        top = file.read(TOP)
     for module in known:
-        if _recognised(module, path):
-            return module
+        with contextlib.suppress(OSError):  # of a file beside it
+            if module.recognises(path, top):
+                return module
     for module in known:  # damaged: the format its name promises has the better message
         if path.suffix.lower() in module.SUFFIXES:
             return module
@@ -367,16 +373,9 @@ def _format_of(path: Path) -> Format:
     )
 
 
-def _recognised(module: Format, path: Path) -> bool:
-    try:
-        return module.recognises(path)
-    except (OSError, InputError):
-        return False
-
-
-def check_times(found: Trajectory, path: Path, rows: int = 2) -> None:
-    """Raise WaveformError where there are fewer rows, or the times are not finite or go back."""
-    t, where = found.time, str(path)
+def check_times(t: Array, path: Path, rows: int = 2) -> None:
+    """Raise WaveformError where there are fewer rows, or the times, (n,) in s, are not finite or go back."""
+    where = str(path)
     if t.size < rows:
         hint = "export it again; it may have been cut off"
         raise WaveformError("too few rows", where=where, expected=f"at least {rows}", got=f"{t.size}", hint=hint)
@@ -389,7 +388,7 @@ def check_times(found: Trajectory, path: Path, rows: int = 2) -> None:
     back = np.flatnonzero(np.diff(t) < 0)
     if back.size:
         raise WaveformError(
-            f"the time goes back from {t[back[0]]:g} s to {t[back[0] + 1]:g} s",
+            f"the time goes back in row {back[0] + 2}, from {t[back[0]]:g} s to {t[back[0] + 1]:g} s",
             where=where,
             expected="increasing times",
             hint="sort the rows by time, or cut the record where its time begins again",
@@ -398,7 +397,7 @@ def check_times(found: Trajectory, path: Path, rows: int = 2) -> None:
 
 def _check(found: Trajectory, path: Path, rows: int = 2) -> None:
     """Refuse a trajectory without the properties that every format promises, which its module need not check."""
-    check_times(found, path, rows)
+    check_times(found.time, path, rows)
     where = str(path)
     if not event_rows(found.time).all():
         raise WaveformError("one time stands more than twice", where=where, expected="two rows at a jump")

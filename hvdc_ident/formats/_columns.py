@@ -31,16 +31,13 @@ MEMORY = 3 * MAX_BYTES
 
 def own_names(labels: Sequence[str]) -> tuple[str, ...]:
     """The labels with those that stand more than once numbered: `a`, `a`, `b` become `a`, `a (2)`, `b`."""
-    taken = set(labels)
-    found: list[str] = []
+    labelled, found = set(labels), dict[str, None]()
     for label in labels:
         name, n = label, 1
-        while name in found:
+        while name in found or (n > 1 and name in labelled):
             n += 1
             name = f"{label} ({n})"
-            if name in taken and name not in found:
-                continue
-        found.append(name)
+        found[name] = None
     return tuple(found)
 
 
@@ -124,7 +121,7 @@ def chosen(found: Trajectory, signals: Sequence[str] | None, path: Path) -> Traj
 
 def checked(record: Trajectory, path: Path) -> Trajectory:
     """Return the record with the first and last row of every instant alone. Raises WaveformError as `check_times`."""
-    check_times(record, path)
+    check_times(record.time, path)
     return once(record)
 
 

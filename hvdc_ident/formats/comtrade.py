@@ -61,17 +61,12 @@ class _Record:
     ranges: tuple[Range | None, ...]
 
 
-def recognises(path: Path) -> bool:
+def recognises(path: Path, top: bytes) -> bool:
     """True for a .cff with a section header, or a .cfg whose second line counts channels."""
-    suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        return False
-    with open(path, "rb") as file:
-        top = file.read(4096)
-    if suffix == ".cff":
+    if path.suffix.lower() == ".cff":
         found = _SECTION.search(top)
         return found is not None and found[1].upper() == b"CFG"
-    return _counts(decoded(top)) is not None
+    return path.suffix.lower() == ".cfg" and _counts(decoded(top)) is not None
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -111,21 +106,6 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
 def files(path: Path) -> list[Path]:
     """The .dat of a .cfg; nothing beside a .cff."""
     return [] if path.suffix.lower() == ".cff" else [_beside(path)]
-
-
-def sample(path: Path) -> None:
-    """Write a small ASCII record with an analog channel of two kinds and a digital one."""
-    header = (
-        "STATION,REC,1999\r\n3,2A,1D\r\n1,Vdc,,,kV,0.5,1,0,-32767,32767,1,1,P\r\n2,P,,,MW,0.1,0,0,-32767,32767,1,1,P\r\n"
-        "1,TRIP,,,0\r\n50\r\n1\r\n1000,4\r\n01/01/2020,00:00:00.000000\r\n01/01/2020,00:00:00.002000\r\nASCII\r\n1\r\n"
-    )
-    rows = "1,0,100,-20,0\r\n2,1000,101,-21,0\r\n3,2000,140,-60,1\r\n4,3000,141,-61,1\r\n"
-    if path.suffix.lower() == ".cff":
-        text = f"--- file type: CFG ---\r\n{header}--- file type: DAT ASCII ---\r\n{rows}"
-        path.write_text(text, "ascii", newline="")
-        return
-    path.write_text(header, "ascii", newline="")
-    path.with_suffix(".dat").write_text(rows, "ascii", newline="")
 
 
 def _open(path: Path) -> _Record:

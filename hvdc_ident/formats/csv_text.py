@@ -23,7 +23,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Origin, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import LONGEST, event_rows, once, pick, unit_since_1970
+from hvdc_ident.formats import LONGEST, TOP, event_rows, once, pick, unit_since_1970
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
 from hvdc_ident.formats._labels import is_date_name, merged, names_and_units, time_column, unit_in_name
 from hvdc_ident.formats._text import WIDE, encoding_of
@@ -96,13 +96,9 @@ class _Layout:
         return [i for i in range(len(self.labels)) if i not in (self.time, self.date)]
 
 
-def recognises(path: Path) -> bool:
+def recognises(path: Path, top: bytes) -> bool:
     """True for a file whose ending is one of text columns and that starts like text."""
-    if path.suffix.lower() not in SUFFIXES:
-        return False
-    with open(path, "rb") as file:
-        top = file.read(65536)
-    return top.startswith(WIDE) or b"\0" not in top
+    return path.suffix.lower() in SUFFIXES and (top.startswith(WIDE) or b"\0" not in top)
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -137,11 +133,6 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     time = table[:, 0] - table[0, 0] if dated else table[:, 0]
     time = scaled(time, layout.scale)
     return once(Trajectory(time, table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]), origin))
-
-
-def sample(path: Path) -> None:
-    """Write a small file with a unit and a jump to the path."""
-    path.write_text("# two signals\ntime,u [pu],y\n0.0,1.0,0.4\n0.1,1.0,0.4\n0.1,1.5,0.4\n0.25,1.5,-2e-3\n", "utf-8")
 
 
 def _layout(path: Path) -> _Layout:
@@ -251,7 +242,7 @@ def _is_row(line: str) -> bool:
 
 def _encoding(path: Path) -> str:
     with open(path, "rb") as file:
-        return encoding_of(file.read(65536))
+        return encoding_of(file.read(TOP))
 
 
 def _lines(path: Path, encoding: str) -> Iterator[tuple[int, str]]:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Origin, Trajectory
-from hvdc_ident.formats import event_rows, pick
+from hvdc_ident.formats import check_times, once, pick
 from hvdc_ident.formats._columns import check_size, damaged
 from hvdc_ident.formats._text import decoded
 
@@ -70,11 +70,9 @@ def starts_as_version_4(top: bytes) -> bool:
     return known and imaginary in (0, 1) and 1 < length <= _MAX_NAME and rows >= 0 and columns >= 0
 
 
-def recognises(path: Path) -> bool:
+def recognises(path: Path, top: bytes) -> bool:
     """True for a file that starts with the `Aclass` matrix every result file starts with."""
-    with open(path, "rb") as file:
-        top = file.read(_HEADER + 7)
-    return len(top) == _HEADER + 7 and _order(top) is not None and top[_HEADER:] == b"Aclass\0"
+    return _order(top) is not None and top[_HEADER:].startswith(b"Aclass\0")
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -93,39 +91,17 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     result = _open(path)
     known = np.flatnonzero(result.is_signal)
     wanted = known[pick(path, signals, [result.names[i] for i in known])]
-    time = _time(result, path)
-    keep = event_rows(time)
-    check_size(int(keep.sum()), wanted.size, path)
-    values = np.empty((int(keep.sum()), wanted.size))
+    time = np.asarray(result.tables[2][:, :1], dtype=float).ravel()
+    check_times(time, path)
+    check_size(time.size, wanted.size, path)
+    values = np.empty((time.size, wanted.size))
     for number in np.unique(result.table[wanted]):
         places = np.flatnonzero(result.table[wanted] == number)
         signed = result.column[wanted[places]]
         columns = _resampled(result, int(number), np.abs(signed) - 1, time, path)
-        values[:, places] = columns[keep if len(columns) == time.size else slice(None)] * np.sign(signed)
-    names = tuple(result.names[i] for i in wanted)
-    origin = Origin(rows=time.size, dropped=int(np.count_nonzero(~keep)), time_unit="s")
-    return Trajectory(time[keep], values, names, tuple(result.units[i] for i in wanted), origin)
-
-
-def sample(path: Path) -> None:
-    """Write a small result (parameter, variable, negative alias, event) to the path."""
-    rows = [(0.0, 1.0), (0.1, 1.0), (0.1, 1.5), (0.1, 2.0), (0.25, 1.75)]
-    names, texts = ("time", "c.R", "c.v", "c.n"), ("Time [s]", "Resistance [Ohm]", "Voltage [V|kV]", "Its negative [V]")
-    info = [(0, 1, 0, -1), (1, 2, 0, 0), (2, 2, 0, 0), (2, -2, 0, 0)]
-    aclass = ("Atrajectory", "1.1", "", "binTrans")
-    with open(path, "wb") as file:
-        file.write(_matrix_bytes("Aclass", np.array([list(s.ljust(11).encode()) for s in aclass], np.uint8).T, 51))
-        file.write(_matrix_bytes("name", np.array([list(s.ljust(4).encode()) for s in names], np.uint8), 51))
-        file.write(_matrix_bytes("description", np.array([list(s.ljust(16).encode()) for s in texts], np.uint8), 51))
-        file.write(_matrix_bytes("dataInfo", np.array(info, "<i4"), 20))
-        file.write(_matrix_bytes("data_1", np.array([(0.0, 1e-3), (0.25, 1e-3)], "<f8"), 0))
-        file.write(_matrix_bytes("data_2", np.array(rows, "<f8"), 0))
-
-
-def _matrix_bytes(name: str, stored: NDArray[Any], kind: int) -> bytes:
-    columns, rows = stored.shape
-    text = name.encode() + b"\0"
-    return struct.pack("<5i", kind, rows, columns, 0, len(text)) + text + stored.tobytes()
+        values[:, places] = columns * np.sign(signed)
+    names, units = tuple(result.names[i] for i in wanted), tuple(result.units[i] for i in wanted)
+    return once(Trajectory(time, values, names, units, Origin(time_unit="s")))
 
 
 def _open(path: Path) -> _Result:
@@ -188,23 +164,6 @@ def _check_places(result: _Result, path: Path) -> None:
         seen: set[str] = set()
         double = next(n for n in result.names if n in seen or seen.add(n))  # type: ignore[func-returns-value]
         raise damaged(path, f"two signals have the name '{double[:80]}'")
-
-
-def _time(result: _Result, path: Path) -> Array:
-    """(n,) the times of the table of variables in s."""
-    table = result.tables[2]
-    if table.shape[0] < 2 or table.shape[1] < 1:
-        raise damaged(path, "matrix 'data_2' holds too few times", expected="at least 2", got=_shape(table))
-    time = np.asarray(table[:, 0], dtype=float)
-    if not np.isfinite(time).all():
-        raise damaged(path, f"the time in row {int(np.argmin(np.isfinite(time))) + 1} of 'data_2' is not finite")
-    back = np.flatnonzero(np.diff(time) < 0)
-    if back.size:
-        a, b = time[back[0]], time[back[0] + 1]
-        raise damaged(
-            path, f"the time goes back in row {int(back[0]) + 2} of 'data_2'", f"at least {a:g} s", f"{b:g} s"
-        )
-    return time
 
 
 def _resampled(result: _Result, number: int, columns: NDArray[np.int64], time: Array, path: Path) -> Array:

@@ -24,35 +24,14 @@ _MAX_DEPTH = 8
 _MAX_SETS = 100_000
 
 
-def recognises(path: Path) -> bool:
+def recognises(path: Path, top: bytes) -> bool:
     """True for a file that starts as HDF5 or netCDF 3 does."""
-    with open(path, "rb") as file:
-        top = file.read(8)
-    return top == _HDF5 or top[:4] in _NETCDF3
-
-
-def signals(path: Path) -> list[tuple[str, str]]:
-    """Name, with the groups it stands in, and unit of every signal."""
-    found = _waveforms(path)
-    return list(zip(found.names, found.units, strict=True))
+    return top.startswith((_HDF5, *_NETCDF3))
 
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
-    """The signals, all or those named in that order; records of several rates stand at their own rows."""
-    return chosen(_waveforms(path), signals, path)
-
-
-def sample(path: Path) -> None:
-    """Write a small HDF5 file with two signals and a unit."""
-    with package("h5py", path).File(path, "w") as file:
-        file["time"] = np.array([0.0, 0.1, 0.1, 0.3])
-        file["grid/P"] = np.array([1.0, 1.0, 1.5, 1.4])
-        file["grid/P"].attrs["units"] = "MW"
-        file["u"] = np.array([0.0, 0.0, 1.0, 1.0])
-
-
-def _waveforms(path: Path) -> Trajectory:
-    return guarded(waveforms_unguarded, path)
+    """The signals under names with the groups they stand in, all or those named in that order; several rates at their own rows."""
+    return chosen(guarded(waveforms_unguarded, path), signals, path)
 
 
 def waveforms_unguarded(path: Path) -> Trajectory:

@@ -49,36 +49,19 @@ class _Object:
     """A variable in a form that is not published: an object, a function, a timeseries."""
 
 
-def recognises(path: Path) -> bool:
+def recognises(path: Path, top: bytes) -> bool:
     """Return whether the file starts as MATLAB's versions 4 to 7.3 do, and is no result file of Dymola's."""
-    with open(path, "rb") as file:
-        top = file.read(64)
     if top.startswith((_V5, _V73)):
         return True
-    return path.suffix.lower() in SUFFIXES and starts_as_version_4(top) and not is_result_file(path)
-
-
-def signals(path: Path) -> list[tuple[str, str]]:
-    """Name of every signal, without a unit: MATLAB keeps none."""
-    found = _waveforms(path)
-    return list(zip(found.names, found.units, strict=True))
+    return path.suffix.lower() in SUFFIXES and starts_as_version_4(top) and not is_result_file(path, top)
 
 
 def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
-    """The signals, all or those named in that order. An instant with more than two rows keeps its first and last."""
-    return chosen(_waveforms(path), signals, path)
+    """The signals, all or those named in that order, without units: MATLAB keeps none.
 
-
-def sample(path: Path) -> None:
-    """Write a small version 5 file with a time vector, a vector and a matrix."""
-    from scipy.io import savemat
-
-    time = np.array([0.0, 0.1, 0.1, 0.3])
-    savemat(path, {"t": time, "y": np.array([1.0, 1.0, 1.5, 1.4]), "u": np.column_stack([time, time + 1.0])})
-
-
-def _waveforms(path: Path) -> Trajectory:
-    return guarded(waveforms_unguarded, path)
+    An instant with more than two rows keeps its first and last.
+    """
+    return chosen(guarded(waveforms_unguarded, path), signals, path)
 
 
 def waveforms_unguarded(path: Path) -> Trajectory:
@@ -138,7 +121,7 @@ def _from_hdf5(item: Any, file: Any, path: Path, depth: int) -> Any:
     kind = item.attrs.get("MATLAB_class", b"").decode("ascii", "replace")
     if kind == "char":
         check_size(1, item.size, path)
-        return "".join(map(chr, np.asarray(item).ravel().astype(int))) if item.size > 2 or not _empty(item) else ""
+        return "" if _empty(item) else "".join(map(chr, np.asarray(item).ravel().astype(int)))
     if item.dtype.kind == "O":  # references: the elements of a structure array
         return [_from_hdf5(file[r], file, path, depth + 1) for r in np.asarray(item).ravel()]
     values = np.asarray(item) if item.dtype.kind in "fiub" or item.dtype.names == ("real", "imag") else None

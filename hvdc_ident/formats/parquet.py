@@ -20,10 +20,9 @@ SUFFIXES = (".parquet", ".pq")
 _MAGIC = b"PAR1"
 
 
-def recognises(path: Path) -> bool:
+def recognises(path: Path, top: bytes) -> bool:
     """True for a file that starts as Parquet does."""
-    with open(path, "rb") as file:
-        return file.read(4) == _MAGIC
+    return top.startswith(_MAGIC)
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -53,12 +52,6 @@ def write(trajectory: Trajectory, path: Path) -> None:
         fields.append(arrow.field(name, arrow.float64(), metadata={"unit": unit}))
     columns = [trajectory.time, *trajectory.values.T]
     parquet.write_table(arrow.table([arrow.array(c) for c in columns], schema=arrow.schema(fields)), path)
-
-
-def sample(path: Path) -> None:
-    """Write a small table with a unit and a jump."""
-    values = np.array([[1.0, 0.5], [1.0, 0.5], [1.5, 0.5], [1.4, 0.25]])
-    write(Trajectory(np.array([0.0, 0.1, 0.1, 0.3]), values, ("u", "y"), ("pu", "")), path)
 
 
 def _opened(path: Path) -> tuple[Any, str, list[str], list[str]]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import pick
+from hvdc_ident.formats import TOP, pick
 from hvdc_ident.formats._columns import check_size, checked, damaged, own_names
 from hvdc_ident.formats._text import decoded
 
@@ -39,12 +39,13 @@ class _Channel:
     unit: str
 
 
-def recognises(path: Path) -> bool:
+def recognises(path: Path, top: bytes) -> bool:
     """Return whether it is an .inf with a channel line, or an .out of such a run."""
-    if path.suffix.lower() not in SUFFIXES or not _inf(path).is_file():
+    inf = _inf(path)
+    if path.suffix.lower() not in SUFFIXES or not inf.is_file():
         return False
-    with open(_inf(path), "rb") as file:
-        return _CHANNEL.search(file.read(65536).decode("latin-1")) is not None
+    start = top if inf == path else inf.read_bytes()[:TOP]
+    return _CHANNEL.search(start.decode("latin-1")) is not None
 
 
 def signals(path: Path) -> list[tuple[str, str]]:
@@ -95,20 +96,6 @@ def _inf(path: Path) -> Path:
     return next(
         (p for end in (".inf", ".INF") if (p := path.with_name(stem + end)).is_file()), path.with_name(f"{stem}.inf")
     )
-
-
-def sample(path: Path) -> None:
-    """Write twelve channels in an .inf and two .out files."""
-    lines = [
-        f'PGB({n}) Output Desc="S{n}" Group="Main" Max=2.0 Min=-2.0 Units="{"kV" if n % 2 else "MW"}"'
-        for n in range(1, 13)
-    ]
-    path.write_text("\n".join(lines) + "\n", "ascii")
-    time = np.array([0.0, 0.05, 0.1])
-    for number, columns in ((1, range(1, 11)), (2, range(11, 13))):
-        rows = [[t, *(n + t for n in columns)] for t in time]
-        text = "\n".join("  ".join(f"{x:.10E}" for x in row) for row in rows) + "\n"
-        path.with_name(f"{path.stem}_{number:02d}.out").write_text(text, "ascii")
 
 
 def _channels(path: Path) -> list[_Channel]:

@@ -33,6 +33,7 @@ from hvdc_ident.app.study_folder import (
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.formats import formats
 from hvdc_ident.study.parse import parse_study
+from tests.formats.samples import SAMPLES
 
 LINK = hi.load_model("vsc-hvdc-link")
 
@@ -215,7 +216,7 @@ def test_a_broken_file_gives_the_readers_message_and_is_not_kept(tmp_path: Path)
 def test_every_format_is_kept_whole(name: str, tmp_path: Path) -> None:
     module = formats()[name]
     place = arrived(tmp_path / "in")
-    module.sample(place / f"sample{module.SUFFIXES[0]}")
+    SAMPLES[module.NAME](place / f"sample{module.SUFFIXES[0]}")
     expected = hi.read_waveforms(place / f"sample{module.SUFFIXES[0]}")
     (kept,), record = keep_recordings(tmp_path / "study", place)
     again = hi.read_waveforms(tmp_path / "study" / kept)

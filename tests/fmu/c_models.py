@@ -221,7 +221,7 @@ BEGUN_CODE = (
     + """
 #include <time.h>
 #define NR 8
-static int runs, frozen;
+static int runs, frozen, ended;
 #ifndef SPOILT
 #define SPOILT 0
 #endif

@@ -1,9 +1,9 @@
 /* The calls of FMI 2.0 or 3.0 around a small model. The model defines, before this file is included:
    NR values r; start(r); equations(r, t); and may define INDICATORS(r, t, z), EVENT(r, t, next), DIRECTIONAL and the
-   faults AT_INSTANTIATE, AT_SETUP, AT_ENTER(r) into the initialization mode, AT_STEP, AT_SLOPES, AT_RESET, AT_GET(r),
+   faults AT_INSTANTIATE, AT_SETUP, AT_ENTER(r) into the initialization mode, AT_STEP, AT_SLOPES, AT_TERMINATE, AT_RESET, AT_GET(r),
    AT_SET(r, reference, value), BEGIN(t, has_end, end). Of co-simulation: INTERNAL, the length of the FMU's own steps, s;
    STOPS_AT(t, h), the instant that a step reaches; SAYS(reached), what FMI 3.0 says of it; SLOPE(r, reference, slope); ENDS(r, t) asks for the end.
-   STEP_EVENT(r): whether an event is wanted after a completed step. States are r[0 .. NX-1], their derivatives
+   STRICT: calls of model exchange in the wrong mode are errors. STEP_EVENT(r): whether an event is wanted after a completed step. States are r[0 .. NX-1], their derivatives
    r[NX .. 2NX-1]. */
 #include <math.h>
 #include <stdio.h>
@@ -12,11 +12,20 @@
 #include <unistd.h>
 
 typedef void *Instance;
-typedef struct { double r[NR]; double t, next, point, inner; int timed; void (*log)(); void *env; } Model;
+typedef struct { double r[NR]; double t, next, point, inner; int timed, mode; void (*log)(); void *env; } Model;
+enum { EVENT_MODE, CONTINUOUS_TIME_MODE };
+#ifdef STRICT
+#define NEEDS(wanted) if (M->mode != wanted) return 3
+#else
+#define NEEDS(wanted)
+#endif
 #define M ((Model *)c)
 #define N (NX > 0 ? NX : 1)
 #ifndef AT_ENTER
 #define AT_ENTER(r)
+#endif
+#ifndef AT_TERMINATE
+#define AT_TERMINATE
 #endif
 #ifndef STEP_EVENT
 #define STEP_EVENT(r) 0
@@ -29,7 +38,7 @@ typedef struct { double r[NR]; double t, next, point, inner; int timed; void (*l
 #endif
 
 static void fresh(Model *m) {
-    m->t = 0; m->timed = 0; m->next = 0; m->point = 0; m->inner = 0;
+    m->t = 0; m->timed = 0; m->mode = EVENT_MODE; m->next = 0; m->point = 0; m->inner = 0;
     memset(m->r, 0, sizeof m->r);
     start(m->r);
 }
@@ -143,7 +152,7 @@ int fmi2SetupExperiment(Instance c, int d, double tol, double t, int e, double e
 }
 int fmi2EnterInitializationMode(Instance c) { AT_ENTER(M->r); return 0; }
 int fmi2ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
-int fmi2Terminate(Instance c) { return 0; }
+int fmi2Terminate(Instance c) { AT_TERMINATE; return 0; }
 int fmi2Reset(Instance c) {
 #ifdef AT_RESET
     AT_RESET;
@@ -156,8 +165,9 @@ int fmi2GetInteger(Instance c, const unsigned *v, size_t n, int *x) { for (size_
 int fmi2SetInteger(Instance c, const unsigned *v, size_t n, const int *x) { for (size_t i = 0; i < n; i++) M->r[v[i]] = x[i]; return 0; }
 int fmi2GetBoolean(Instance c, const unsigned *v, size_t n, int *x) { return fmi2GetInteger(c, v, n, x); }
 int fmi2SetBoolean(Instance c, const unsigned *v, size_t n, const int *x) { return fmi2SetInteger(c, v, n, x); }
-int fmi2EnterEventMode(Instance c) { return 0; }
+int fmi2EnterEventMode(Instance c) { NEEDS(CONTINUOUS_TIME_MODE); M->mode = EVENT_MODE; return 0; }
 int fmi2NewDiscreteStates(Instance c, Info *e) {
+    NEEDS(EVENT_MODE);
     memset(e, 0, sizeof *e);
     update(M, &e->values, &e->defined, &e->next);
 #ifdef AGAIN
@@ -166,10 +176,10 @@ int fmi2NewDiscreteStates(Instance c, Info *e) {
     e->end = ENDS(M->r, M->t);
     return 0;
 }
-int fmi2EnterContinuousTimeMode(Instance c) { return 0; }
-int fmi2CompletedIntegratorStep(Instance c, int n, int *e, int *end) { *e = STEP_EVENT(M->r); *end = ENDS(M->r, M->t); return 0; }
+int fmi2EnterContinuousTimeMode(Instance c) { NEEDS(EVENT_MODE); M->mode = CONTINUOUS_TIME_MODE; return 0; }
+int fmi2CompletedIntegratorStep(Instance c, int n, int *e, int *end) { NEEDS(CONTINUOUS_TIME_MODE); *e = STEP_EVENT(M->r); *end = ENDS(M->r, M->t); return 0; }
 int fmi2SetTime(Instance c, double t) { M->t = t; return 0; }
-int fmi2SetContinuousStates(Instance c, const double *x, size_t n) { memcpy(M->r, x, n * sizeof(double)); return 0; }
+int fmi2SetContinuousStates(Instance c, const double *x, size_t n) { NEEDS(CONTINUOUS_TIME_MODE); memcpy(M->r, x, n * sizeof(double)); return 0; }
 int fmi2GetContinuousStates(Instance c, double *x, size_t n) { memcpy(x, M->r, n * sizeof(double)); return 0; }
 int fmi2GetDerivatives(Instance c, double *x, size_t n) {
 #ifdef AT_SLOPES
@@ -219,9 +229,14 @@ Instance fmi3InstantiateCoSimulation(const char *n, const char *token, const cha
 void fmi3FreeInstance(Instance c) { free(c); }
 int fmi3EnterInitializationMode(Instance c, bool d, double tol, double t, bool e, double end) { AT_ENTER(M->r); return begin(M, t, e, end); }
 int fmi3ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
-int fmi3EnterEventMode(Instance c) { return 0; }
-int fmi3Terminate(Instance c) { return 0; }
-int fmi3Reset(Instance c) { fresh(M); return 0; }
+int fmi3EnterEventMode(Instance c) { NEEDS(CONTINUOUS_TIME_MODE); M->mode = EVENT_MODE; return 0; }
+int fmi3Terminate(Instance c) { AT_TERMINATE; return 0; }
+int fmi3Reset(Instance c) {
+#ifdef AT_RESET
+    AT_RESET;
+#endif
+    fresh(M); return 0;
+}
 int fmi3GetFloat64(Instance c, const unsigned *v, size_t n, double *x, size_t m) { return get(M, v, n, x); }
 int fmi3SetFloat64(Instance c, const unsigned *v, size_t n, const double *x, size_t m) { return set(M, v, n, x); }
 int fmi3GetInt32(Instance c, const unsigned *v, size_t n, int *x, size_t m) { for (size_t i = 0; i < n; i++) x[i] = (int)M->r[v[i]]; return 0; }
@@ -229,13 +244,15 @@ int fmi3SetInt32(Instance c, const unsigned *v, size_t n, const int *x, size_t m
 int fmi3GetBoolean(Instance c, const unsigned *v, size_t n, bool *x, size_t m) { for (size_t i = 0; i < n; i++) x[i] = M->r[v[i]] != 0; return 0; }
 int fmi3SetBoolean(Instance c, const unsigned *v, size_t n, const bool *x, size_t m) { for (size_t i = 0; i < n; i++) M->r[v[i]] = x[i]; return 0; }
 int fmi3UpdateDiscreteStates(Instance c, bool *again, bool *end, bool *nominals, bool *values, bool *defined, double *next) {
-    int changed, timed; update(M, &changed, &timed, next);
+    int changed, timed;
+    NEEDS(EVENT_MODE);
+    update(M, &changed, &timed, next);
     *again = *nominals = false; *end = ENDS(M->r, M->t); *values = changed; *defined = timed; return 0;
 }
-int fmi3EnterContinuousTimeMode(Instance c) { return 0; }
-int fmi3CompletedIntegratorStep(Instance c, bool n, bool *e, bool *end) { *e = STEP_EVENT(M->r); *end = ENDS(M->r, M->t); return 0; }
+int fmi3EnterContinuousTimeMode(Instance c) { NEEDS(EVENT_MODE); M->mode = CONTINUOUS_TIME_MODE; return 0; }
+int fmi3CompletedIntegratorStep(Instance c, bool n, bool *e, bool *end) { NEEDS(CONTINUOUS_TIME_MODE); *e = STEP_EVENT(M->r); *end = ENDS(M->r, M->t); return 0; }
 int fmi3SetTime(Instance c, double t) { M->t = t; return 0; }
-int fmi3SetContinuousStates(Instance c, const double *x, size_t n) { memcpy(M->r, x, n * sizeof(double)); return 0; }
+int fmi3SetContinuousStates(Instance c, const double *x, size_t n) { NEEDS(CONTINUOUS_TIME_MODE); memcpy(M->r, x, n * sizeof(double)); return 0; }
 int fmi3GetContinuousStates(Instance c, double *x, size_t n) { memcpy(x, M->r, n * sizeof(double)); return 0; }
 int fmi3GetContinuousStateDerivatives(Instance c, double *x, size_t n) {
 #ifdef AT_SLOPES

@@ -11,7 +11,7 @@ from hvdc_ident import find_operating_point, linearize, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError
-from hvdc_ident.fmu.derivatives import SUFFICIENT, difference, first_difference, noise_of
+from hvdc_ident.fmu.differences import SUFFICIENT, Line, difference, first_difference, noise_of, together
 from hvdc_ident.linearize import continuation, jacobian_error, point_at
 
 TIME = np.linspace(0.0, 5.0, 251)
@@ -132,6 +132,11 @@ def test_there_is_no_derivative_by_a_whole_number(fmu):
         simulate(model, STEP, {}, ["fault"])
 
 
+def done(rule, run):
+    """What a rule returns, from runs that are made one by one."""
+    return together([rule], lambda values: [run(v) for v in values])[0]
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-10, 1e-7])
 @pytest.mark.parametrize(("low", "high"), [(-np.inf, np.inf), (2.0, np.inf), (-np.inf, 2.0)])
 def test_a_step_is_chosen_against_the_noise(noise, low, high):
@@ -145,13 +150,14 @@ def test_a_step_is_chosen_against_the_noise(noise, low, high):
 
     away = -1.0 if high == 2.0 else 1.0
     middle = runs(2.0)
-    level = noise_of(lambda k: runs(2.0 + away * k * 2e-3), middle)
+    level = done(noise_of(lambda k: 2.0 + away * k * 2e-3, middle), runs)
     assert level[0] == pytest.approx(noise, rel=0.3) if noise else level[0] < 1e-12
     wanted = t * np.exp(2.0 * t)
-    begun, step = first_difference(runs, 2.0, 2.0, low, high, middle, level)
+    line = Line(float, 2.0, 2.0, low, high, middle)
+    begun, step = done(first_difference(line, level), runs)
     assert len(counted) <= 1 + 6 + 2 and step.sides == 1 and step.error <= SUFFICIENT
     counted.clear()
-    later = difference(runs, 2.0, step, low, high, middle)
+    later = done(difference(line, step), runs)
     assert len(counted) == 1
     for found in (begun, later):
         error = np.sqrt(np.mean((found[:, 0] - wanted) ** 2)) / np.sqrt(np.mean(wanted**2))
@@ -168,9 +174,8 @@ def test_noise_asks_for_both_sides():
 
     middle = runs(2.0)
     wanted = t * np.exp(2.0 * t)
-    begun, step = first_difference(
-        runs, 2.0, 2.0, -np.inf, np.inf, middle, noise_of(lambda k: runs(2.0 + k * 2e-3), middle)
-    )
+    line = Line(float, 2.0, 2.0, -np.inf, np.inf, middle)
+    begun, step = done(first_difference(line, done(noise_of(lambda k: 2.0 + k * 2e-3, middle), runs)), runs)
     assert step.sides == 2 and step.error < 1e-2
-    for found in (begun, difference(runs, 2.0, step, -np.inf, np.inf, middle)):
+    for found in (begun, done(difference(line, step), runs)):
         assert np.sqrt(np.mean((found[:, 0] - wanted) ** 2) / np.mean(wanted**2)) < 2.0 * step.error

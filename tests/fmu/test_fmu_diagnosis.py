@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
-from c_fmu import needs_compiler
-from c_models import DECAY, RELEASED, spring
+from c_fmu import CModel, Var, needs_compiler
+from c_models import DECAY, PLAIN, RELEASED, spring
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, Trajectory, experiment
@@ -69,3 +70,44 @@ def test_a_hidden_effect_at_an_end_of_a_co_simulation_is_named(fmu, subject, dri
     for name, value in size.items():
         assert named.parameters[name].value == pytest.approx(value, rel=0.05)
     assert taken < MOST
+
+
+# The armature of a small machine at a given speed: L I' = U - R I - k w.
+ARMATURE = CModel(
+    "armature",
+    PLAIN
+    + """
+#define NR 5
+static void start(double *r) { r[2] = 1; }
+static void equations(double *r, double t) { r[1] = (r[3] - r[2] * r[0] - 0.01 * r[4]) / 1e-3; }
+""",
+    (
+        Var("i", 0),
+        Var("der(i)", 1, more=(("derivative", "i"),)),
+        Var("R", 2, "parameter", "tunable", (("start", "1"), ("min", "0"))),
+        Var("U", 3, "input", "continuous", (("start", "0"),)),
+        Var("w", 4, "input", "continuous", (("start", "0"),)),
+        Var("I", 0, "output"),
+    ),
+    1,
+)
+
+
+def staircase(*values):
+    """A signal that has the values one after the other, with jumps at 0.125, 0.33, 0.5 and 0.75 s."""
+    at = (0.0, 0.125, 0.33, 0.5, 0.75, 1.0)
+    return InputSignal.corners([(t, v) for v, ends in zip(values, pairwise(at), strict=True) for t in ends])
+
+
+def test_a_gain_that_a_free_parameter_nearly_absorbs_is_among_what_is_told(fmu):
+    """The voltage is 0.8 of what the record says and R is right: R = 1.25 and 1.25 times k w explain all but a thousandth."""
+    model, instants = fmu(ARMATURE, 2, "co-simulation", ONE), np.linspace(0.0, 1.0, 201)
+    drive = {"U": staircase(0.0, 0.1, 0.03, -0.04, 0.06), "w": staircase(0.0, 0.06, 0.1, 0.03, -0.04)}
+    hidden = apply_effects(model, [{"effect": "gain", "at": "U", "parameters": {"k": 0.8}}])
+    current = simulate(hidden, experiment("e", instants, drive))["I"]
+    noise = 1e-3 * float(np.ptp(current))
+    rows = (current + noise * np.random.default_rng(7).standard_normal(instants.size))[:, None]
+    record = experiment("e", instants, drive, measured=Trajectory(instants, rows, ("I",), ("",)), noise={"I": noise})
+    found = diagnose(model, [record], [FitParameter("R", 1.0, 0.6, 1.6)], effects=["gain", "lag", "delay", "offset"])
+    told = {(e.effect, e.at) for e in (*found.effects, *(rival for group in found.ambiguity for rival in group))}
+    assert found.verdict in ("named", "ambiguous") and ("gain", ("U",)) in told

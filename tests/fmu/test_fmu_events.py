@@ -12,7 +12,7 @@ from c_models import BALL, COUNTER, PLAIN, response, spring
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
-from hvdc_ident.fmu import read_fmu
+from hvdc_ident.fmu import at_point, read_fmu
 
 pytestmark = needs_compiler
 
@@ -235,3 +235,23 @@ def test_the_step_that_an_event_ends_is_completed_too(fmu, tmp_path, version):
     model.pool.close()
     assert found.statistics.events == expected.statistics.events >= 4
     assert np.abs(found["height"] - expected["height"]).max() < 1e-9
+
+
+# The spring whose input changes at events alone, and which refuses what belongs into another mode.
+STRICT = replace(
+    spring("modes", own=False),
+    code="#define STRICT\n#define AT_SET(r, v, x) if (v == 8 && m->mode == CONTINUOUS_TIME_MODE) return 3\n" + spring().code,
+    variables=tuple(replace(v, variability="discrete") if v.name == "u" else v for v in spring().variables),
+)
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_every_call_is_made_in_the_mode_it_belongs_into(tmp_path, version):
+    """A run with a jump of the input, and the derivatives at a point beside the start."""
+    model = stepping(STRICT, tmp_path, version)
+    time = np.linspace(0.0, 5.0, 251)
+    found = simulate(model, experiment("step", time, {"u": InputSignal.step(1.0, 0.0, 1.0)}))
+    assert np.abs(found["y"] - response(time)).max() < 2e-7
+    point = at_point(model, {"u": 0.5, "k": 6.0}, np.array([0.4, 0.0]), ["twice"])
+    assert point.derivatives == pytest.approx([0.0, 0.3]) and point.outputs == pytest.approx([0.25])
+    model.pool.close()

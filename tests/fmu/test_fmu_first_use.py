@@ -32,10 +32,12 @@ FROZEN = ("AT_RESET frozen = 1", "AT_INSTANTIATE frozen = 0")
     [
         ("reset", begun("plain"), None),
         ("reset", begun("timed", more=(CLOCK,)), None),  # an output that no two runs repeat judges nothing
+        ("reset", begun("ended", "AT_TERMINATE ended = 1", "AT_RESET if (!ended--) return 3"), None),
         ("instance", begun("frozen", *FROZEN), "each run has a new instance"),
         ("instance", begun("refusing", "AT_RESET return 3"), "each run has a new instance"),
         ("instance", begun("fatal", "AT_RESET abort()"), "each run has a new instance"),
         ("process", begun("spoilt", "SPOILT 0.1"), "each run has a new process"),
+        ("process", begun("slight", "SPOILT 1e-5"), "each run has a new process"),
         ("process", begun("both", *FROZEN, "SPOILT 0.1", more=(CLOCK,)), "each run has a new process"),
     ],
     ids=lambda x: getattr(x, "name", None),

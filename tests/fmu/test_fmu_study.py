@@ -6,11 +6,14 @@ import json
 
 import numpy as np
 import pytest
-from c_fmu import build, needs_compiler
-from c_models import TWIN, spring
+from c_fmu import CModel, Var, build, needs_compiler
+from c_models import PLAIN, TWIN, spring
 from typer.testing import CliRunner
 
+from hvdc_ident import simulate
 from hvdc_ident.cli import app
+from hvdc_ident.data import experiment
+from hvdc_ident.fmu import read_fmu
 from hvdc_ident.model import save_card
 
 pytestmark = needs_compiler
@@ -177,3 +180,46 @@ def test_a_flipped_column_is_told_before_anything_is_fitted(tmp_path):
     }
     assert all(line["suggestion"] == "sign" and line["factor"] == -1.0 for line in found)
     assert all(abs(line["model"] - 0.25) < 1e-6 for line in found if line["output"] == "twice")
+
+
+# T x' = 2 s - x, where s is switched off above 1 and on below 0.5, at the ends of the FMU's own steps only.
+STEPPED_THERMOSTAT = CModel(
+    "thermostat",
+    PLAIN
+    + """
+#define NR 4
+static void start(double *r) { r[2] = 0.5; r[3] = 1; }
+static void equations(double *r, double t) { r[1] = (2 * r[3] - r[0]) / r[2]; }
+static int switched(double *r) { if (r[0] > 1) r[3] = 0; if (r[0] < 0.5) r[3] = 1; return 0; }
+#define EVENT(r, t, next, timed) switched(r)
+""",
+    (
+        Var("x", 0),
+        Var("der(x)", 1, more=(("derivative", "x"),)),
+        Var("T", 2, "parameter", "tunable", (("start", "0.5"),)),
+        Var("y", 0, "output"),
+    ),
+    1,
+    kinds=("CoSimulation",),
+)
+
+
+def test_a_fit_of_runs_that_jump_with_the_parameter_holds_its_value_and_is_plausible(tmp_path):
+    """Its lag moves each switching from one own step to the next: chi-square jumps, and the trend of it is what counts."""
+    true, noise, instants = 0.5123, 0.02, np.linspace(0.0, 4.0, 161)
+    model = read_fmu(build(STEPPED_THERMOSTAT, tmp_path))
+    rows = simulate(model, experiment("run", instants), {"T": true})["y"]
+    rows = rows + noise * np.random.default_rng(3).standard_normal(instants.size)
+    np.savetxt(tmp_path / "run.csv", np.column_stack([instants, rows]), delimiter=",", header="time,y", comments="")
+    path = tmp_path / "study.toml"
+    path.write_text(
+        f'schema = 1\n[model]\nsource = "{model.fmu.path.name}"\n[parameters]\nT = {{given = 0.5, min = 0.3, max = 0.8}}\n'
+        f'[[experiment]]\nname = "run"\ndata = "run.csv"\noutputs = ["y"]\nnoise = {{y = {noise}}}\n[fit]\n'
+    )
+    model.pool.close()
+    result = CliRunner().invoke(app, ["fit", str(path), "--json"])
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)
+    low, high = found["estimates"]["T"]["ci95"]
+    assert low <= true <= high and high - low < 0.01
+    assert found["roughness"]["delta_chi2"] > 0.0 and "implausible" not in found

@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 
 from hvdc_ident.cli import app
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import formats, list_signals, read_waveforms
+from hvdc_ident.formats import list_signals, read_waveforms
 from hvdc_ident.study import Summary, load_study
+from tests.formats.samples import SAMPLES
 
 DATES = "07/11/2024,06:30:00.250000\n07/11/2024,06:30:00.300000\n"
 
@@ -91,7 +92,7 @@ def test_stamps_that_begin_again_at_the_end_of_two_bytes(tmp_path: Path) -> None
 
 
 def test_one_file_whose_marks_of_sections_have_no_colon(tmp_path: Path) -> None:
-    formats()["comtrade"].sample(tmp_path / "r.cff")
+    SAMPLES["comtrade"](tmp_path / "r.cff")
     whole = read_waveforms(tmp_path / "r.cff")
     text = (tmp_path / "r.cff").read_text("ascii")
     for standard, other in (("--- file type: CFG", "--- file type  CFG"), ("--- file type: DAT", "-- file type  DAT")):

@@ -137,6 +137,7 @@ MISTAKES = {
     "header only": ("time,a\n", "", "too few rows"),
     "one row": ("time,a\n0,1\n", "", "too few rows"),
     "one column": ("time\n0\n1\n", "line 1", "only one column"),
+    "blanks below commas": ("time,u\n0 1\n1 2\n", "line 2", "another number of cells"),
     "comments only": ("# a\n# b\n", "", "nothing but"),
     "time in a unit that is none": ("time [kV],a\n0,1\n1,2\n", "line 1, column 1", "none of time"),
     "two decimal signs": ("time;a\n0;1,5\n1;2.5\n", "line 3", "decimal"),

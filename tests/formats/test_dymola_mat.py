@@ -163,7 +163,7 @@ def test_descriptions_may_be_missing(tmp_path: Path) -> None:
         ({"data_2": [[0, 1, 1], [2, 1, 1], [1, 1, 1]]}, "goes back in row 3"),
         ({"data_2": [[0, 1, 1], [np.nan, 1, 1]]}, "time in row 2"),
         ({"data_2": [[0, 1, 1], [1, 1, np.inf]]}, "'n' is infinite at 1 s"),
-        ({"data_2": [[0, 1, 1]]}, "too few times"),
+        ({"data_2": [[0, 1, 1]]}, "too few rows.*at least 2, got 1"),
         ({"layout": "binOther"}, "unknown layout"),
         ({"kind": "Alinear"}, "not a trajectory"),
     ],

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import csv_text, formats, list_signals, read_waveforms
+from hvdc_ident.formats import csv_text, list_signals, read_waveforms
 from hvdc_ident.formats._clock import Clock
 from hvdc_ident.formats._text import decoded, encoding_of
+from tests.formats.samples import SAMPLES
 
 TEXTS = {
     "cp1252": ("Größe;Öl [°C]", "Tension réseau créée;déjà", "MEDIÇÕES;TENSÕES", "µ", "Señal nº 1", "Årsdøgn"),
@@ -36,7 +37,7 @@ def test_names_in_every_code_page_can_be_asked_for(tmp_path: Path, encoding: str
     (tmp_path / "x.csv").write_bytes(f"t [s];{voltage} [kV];{current}\n0;1,5;2\n1;2,5;3\n".encode(encoding))
     assert list_signals(tmp_path / "x.csv") == [(voltage, "kV"), (current, "")]
     assert read_waveforms(tmp_path / "x.csv", [current, voltage]).values.tolist() == [[2.0, 1.5], [3.0, 2.5]]
-    formats()["comtrade"].sample(tmp_path / "r.cfg")
+    SAMPLES["comtrade"](tmp_path / "r.cfg")
     header = (tmp_path / "r.cfg").read_text("ascii").replace("Vdc", voltage).replace(",P,", f",{current},")
     (tmp_path / "r.cfg").write_bytes(header.encode(encoding))
     assert read_waveforms(tmp_path / "r.cfg").names[:2] == (voltage, current)

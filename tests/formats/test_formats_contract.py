@@ -12,6 +12,7 @@ import pytest
 
 from hvdc_ident.errors import UnknownNameError, WaveformError
 from hvdc_ident.formats import Format, convert, formats, list_signals, read_waveforms
+from tests.formats.samples import SAMPLES
 
 FORMATS = list(formats().items())
 
@@ -24,7 +25,7 @@ def module(request: pytest.FixtureRequest) -> Format:
 @pytest.fixture
 def sample(module: Format, tmp_path: Path) -> Path:
     path = tmp_path / f"sample{module.SUFFIXES[0]}"
-    module.sample(path)
+    SAMPLES[module.NAME](path)
     return path
 
 
@@ -56,7 +57,8 @@ def test_describes_itself(module: Format) -> None:
 
 
 def test_only_this_format_recognises_its_sample(module: Format, sample: Path) -> None:
-    assert [name for name, other in FORMATS if other.recognises(sample)] == [module.NAME]
+    top = sample.read_bytes()
+    assert [name for name, other in FORMATS if other.recognises(sample, top)] == [module.NAME]
 
 
 def test_reads_its_sample(module: Format, sample: Path) -> None:
@@ -120,6 +122,6 @@ def test_a_spreadsheet_is_called_one_and_not_searched_for_columns(tmp_path: Path
 def test_recognises_nothing_in_noise(module: Format, tmp_path: Path) -> None:
     path = tmp_path / f"noise{module.SUFFIXES[0]}"
     path.write_bytes(np.random.default_rng(0).integers(0, 256, 4000, dtype=np.uint8).tobytes())
-    assert not module.recognises(path)
+    assert not module.recognises(path, path.read_bytes())
     with pytest.raises(WaveformError):
         read_waveforms(path)

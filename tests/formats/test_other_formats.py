@@ -11,6 +11,8 @@ import pytest
 
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import convert, list_signals, read_waveforms
+from hvdc_ident.formats._columns import own_names
+from tests.formats.samples import SAMPLES
 
 TIME = np.array([0.0, 0.1, 0.2, 0.3])
 Y = np.array([1.0, 1.0, 1.5, 1.25])
@@ -105,9 +107,7 @@ def test_version_7_3(tmp_path: Path) -> None:
 
 
 def test_pscad_channels_beyond_ten_stand_in_the_second_file(tmp_path: Path) -> None:
-    from hvdc_ident.formats import pscad
-
-    pscad.sample(tmp_path / "run.inf")
+    SAMPLES["pscad"](tmp_path / "run.inf")
     found = read_waveforms(tmp_path / "run.inf", ["S12", "S3"])
     np.testing.assert_allclose(found.values, np.column_stack([12 + found.time, 3 + found.time]))
     assert found.units == ("MW", "kV")
@@ -115,6 +115,20 @@ def test_pscad_channels_beyond_ten_stand_in_the_second_file(tmp_path: Path) -> N
     assert read_waveforms(tmp_path / "run.inf", ["S3"]).names == ("S3",)
     with pytest.raises(WaveformError, match=r"run_02\.out"):
         read_waveforms(tmp_path / "run.inf")
+
+
+def test_pscad_channels_up_to_ten_may_stand_in_one_file_without_a_number(tmp_path: Path) -> None:
+    """Those beyond ten do not stand there."""
+    SAMPLES["pscad"](tmp_path / "run.inf")
+    (tmp_path / "run_01.out").rename(tmp_path / "run.out")
+    assert read_waveforms(tmp_path / "run.inf", ["S3"])["S3"].tolist() == [3.0, 3.05, 3.1]
+    (tmp_path / "run_02.out").unlink()
+    with pytest.raises(WaveformError, match=r"channels 11 to 20 is missing.*run_02\.out"):
+        read_waveforms(tmp_path / "run.inf", ["S12"])
+
+
+def test_names_that_stand_twice_are_numbered_past_those_that_are_there() -> None:
+    assert own_names(["a", "a", "b", "a (2)", "a"]) == ("a", "a (3)", "b", "a (2)", "a (4)")
 
 
 ALL = ("a.parquet", "a.inf", "a.h5", "a.mat")
@@ -125,7 +139,7 @@ ALL = ("a.parquet", "a.inf", "a.h5", "a.mat")
     [
         *(([0.0], "too few rows; expected at least 2, got 1", n) for n in ("a.parquet", "a.h5")),
         *(([0.0, np.nan, 0.2], "the time in row 2 is not finite; expected a time in s, got nan", n) for n in ALL),
-        *(([0.0, 0.2, 0.1], "the time goes back from 0.2 s to 0.1 s; expected increasing times", n) for n in ALL),
+        *(([0.0, 0.2, 0.1], "the time goes back in row 3, from 0.2 s to 0.1 s; expected increasing times", n) for n in ALL),
     ],
 )
 def test_times_that_are_none_are_refused_alike(tmp_path: Path, times: list[float], what: str, name: str) -> None:

@@ -179,6 +179,13 @@ def test_the_end_of_summer_time_is_bridged_and_told(tmp_path: Path) -> None:
     assert "goes back an hour at 2026-10-25 02:00:00" in note and "end of summer time" in note
 
 
+def test_summer_time_ends_within_half_a_step_of_the_row_that_was_due(tmp_path: Path) -> None:
+    """Rows a minute apart, and one 20 s late as the hour is turned back."""
+    rows = ("02:57:00", "02:58:00", "02:59:00", "02:00:20", "02:01:20")
+    found = at_local_times(tmp_path, *(f"2026-10-25 {row}" for row in rows))
+    assert found.time.tolist() == [0.0, 60.0, 120.0, 200.0, 260.0]
+
+
 def test_a_leap_of_an_hour_is_kept_and_told(tmp_path: Path) -> None:
     found = at_local_times(tmp_path, "29/03/2026 01:59:58", "29/03/2026 01:59:59", "29/03/2026 03:00:00")
     assert found.time.tolist() == [0.0, 1.0, 3602.0 - 0.0] and "where summer time began" in found.origin.notes[0]

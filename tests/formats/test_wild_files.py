@@ -11,8 +11,9 @@ import scipy.io
 
 from hvdc_ident.data import trajectory
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import convert, csv_text, files_of, formats, list_signals, read_waveforms, write_csv
+from hvdc_ident.formats import convert, csv_text, files_of, list_signals, read_waveforms, write_csv
 from hvdc_ident.formats._clock import Clock
+from tests.formats.samples import SAMPLES
 
 ROWS = ((0.0, 1.5, -2.0), (0.5, 1e-3, 4.0))
 """What every file of STYLES holds: time in s, U in kV, P in MW."""
@@ -105,7 +106,7 @@ def test_gaps_stay_gaps_in_what_is_written(tmp_path: Path) -> None:
 
 
 def test_a_comtrade_mark_for_a_missing_sample_is_a_gap(tmp_path: Path) -> None:
-    formats()["comtrade"].sample(tmp_path / "r.cfg")
+    SAMPLES["comtrade"](tmp_path / "r.cfg")
     data = tmp_path / "r.dat"
     data.write_text(data.read_text().replace("2,1000,101,-21,0", "2,1000,99999,-21,0"))
     assert np.isnan(read_waveforms(tmp_path / "r.cfg")["Vdc"]).tolist() == [False, True, False, False]
@@ -128,7 +129,7 @@ def test_every_file_behind_a_recording_is_listed(tmp_path: Path) -> None:
     for name, first, others in (
         ("comtrade", "r.cfg", ["r.dat"]), ("pscad", "run.inf", ["run_01.out", "run_02.out"]), ("csv", "x.csv", []),
     ):  # fmt: skip
-        formats()[name].sample(tmp_path / first)
+        SAMPLES[name](tmp_path / first)
         assert [f.name for f in files_of(tmp_path / first)] == [first, *others]
 
 
@@ -234,7 +235,7 @@ def test_times_since_1970_count_from_the_first_row(tmp_path: Path) -> None:
 
 
 def test_an_out_file_finds_its_run(tmp_path: Path) -> None:
-    formats()["pscad"].sample(tmp_path / "run.inf")
+    SAMPLES["pscad"](tmp_path / "run.inf")
     whole, part = read_waveforms(tmp_path / "run.inf"), read_waveforms(tmp_path / "run_01.out")
     assert part.names == whole.names and np.array_equal(part.values, whole.values)
     assert {f.name for f in files_of(tmp_path / "run_02.out")} == {"run.inf", "run_01.out", "run_02.out"}

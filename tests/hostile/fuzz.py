@@ -24,10 +24,11 @@ import numpy as np
 
 from hvdc_ident.errors import InputError
 from hvdc_ident.expression import parse
-from hvdc_ident.formats import formats, read_waveforms
+from hvdc_ident.formats import read_waveforms
 from hvdc_ident.model import read_card, write_card
 from hvdc_ident.models import load_model
 from hvdc_ident.study.study import load_study
+from tests.formats.samples import SAMPLES
 
 Rng = np.random.Generator
 LONGEST = 5.0  # s a case may take
@@ -92,7 +93,7 @@ def _file_of(name: str, suffix: str) -> Kind:
 
     def good(folder: Path) -> list[bytes]:
         path = folder / f"sample{suffix}"
-        formats()[name].sample(path)
+        SAMPLES[name](path)
         return [path.read_bytes()]
 
     def use(content: bytes, folder: Path) -> object:
@@ -107,7 +108,7 @@ def _companion(name: str, suffix: str, companion: str) -> Kind:
     """A format of two files, of which the second is spoilt."""
 
     def good(folder: Path) -> list[bytes]:
-        formats()[name].sample(folder / f"sample{suffix}")
+        SAMPLES[name](folder / f"sample{suffix}")
         return [(folder / companion).read_bytes()]
 
     def use(content: bytes, folder: Path) -> object:

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import csv_text, dymola_mat, list_signals, read_waveforms
+from hvdc_ident.formats import list_signals, read_waveforms
 from tests.effort import calls
+from tests.formats.samples import SAMPLES
 
 CSV = "time,a,b\n" + "".join(f"{i / 1000!r},{i % 7},{i * 0.5!r}\n" for i in range(1000))
 LINES = CSV.splitlines()
@@ -76,7 +77,7 @@ def test_bad_csv(tmp_path: Path, content: bytes) -> None:
 
 
 def good_mat(folder: Path) -> bytes:
-    dymola_mat.sample(folder / "good.mat")
+    SAMPLES["dymola-mat"](folder / "good.mat")
     return (folder / "good.mat").read_bytes()
 
 
@@ -150,7 +151,7 @@ def test_bad_mat(tmp_path: Path, damage: Callable[[bytes], bytes]) -> None:
 @pytest.mark.parametrize("seed", range(200))
 def test_flipped_bytes_never_end_in_another_error(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    csv_text.sample(tmp_path / "good.csv")
+    SAMPLES["csv"](tmp_path / "good.csv")
     for suffix, content in ((".mat", good_mat(tmp_path)), (".csv", (tmp_path / "good.csv").read_bytes())):
         damaged = bytearray(content)
         for place in rng.integers(0, len(damaged), 1 + seed % 4):

@@ -1,0 +1,161 @@
+"""An experiment as a worker runs it, after trials of how its FMU has to be run. In worker processes only."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Mapping
+from dataclasses import astuple
+from typing import Any
+
+import numpy as np
+
+from hvdc_ident.data import Array
+from hvdc_ident.fmu import co_simulation, model_exchange
+from hvdc_ident.fmu.co_simulation import CallPattern
+from hvdc_ident.fmu.derivatives import SensitivityEquations
+from hvdc_ident.fmu.description import Message
+from hvdc_ident.fmu.fmi import VariableGroup
+from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
+from hvdc_ident.fmu.piecewise_linear import PackedInputs
+from hvdc_ident.fmu.runner import Runner, moving
+
+PERTURBATION = 0.1  # step of an input that shows whether a run is repeated, in sizes of the input
+
+
+class ExperimentRun:
+    """A request of a run: the trials that it can make of an FMU that is not known yet, and the run itself."""
+
+    def __init__(self, runner: Runner, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+        self.runner, self.description, self.learned = runner, runner.description, runner.learned
+        self.heading, self.arrays = heading, arrays
+        self.values: dict[str, float] = heading["values"]
+        self.names = tuple(heading["outputs"])
+        self.tolerance: float = heading["tolerance"]
+        self.partial = bool(heading.get("partial"))  # whether a run that the FMU ends is accepted, with its rows
+        self.time = arrays["time"]
+        self.signals = PackedInputs(arrays["sizes"], arrays["times"], arrays["points"], arrays["breaks"])
+
+    def answer(self) -> Message:
+        """Return outputs and, where they are asked for, their sensitivities.
+
+        "end" in the heading: the instant at which the FMU asked for the end, s, or None. "lost": why there are no
+        sensitivities, "" where there are.
+        """
+        if "restart" not in self.learned:
+            self._find_reuse()
+        if self.description.interface == "model-exchange":
+            return self.runner.perform(self._integrated)
+        co_simulation.find_calls(
+            self.learned, self.description, self.signals, self.time, self.tolerance, self._co_simulated
+        )
+        answer, arrays = self.runner.perform(self._stepped)
+        if answer["end"] is None and self.description.variable_step and moving(arrays["outputs"]).any():
+            calls = CallPattern.learned(self.learned)
+            with contextlib.suppress(RunFailed):
+                co_simulation.find_held(self.learned, self.time, lambda time: self._co_simulated(calls, time))
+        return answer, arrays
+
+    def _stepped(self, instance: Instance) -> Message:
+        try:
+            rows = co_simulation.run(instance, self.values, self.signals, self.time, self.names, self.tolerance)
+            return self._checked(rows, model_exchange.Counts(segments=1))
+        except RunEnded as e:
+            return self._checked(self._until(e), model_exchange.Counts(segments=1), e.t)
+
+    def _integrated(self, instance: Instance) -> Message:
+        names, start = self.heading.get("sensitivities", ()), self.arrays.get("start")
+        equations = SensitivityEquations(instance, names, self.heading["sizes"], self.names) if names else None
+        run = model_exchange.ModelExchangeRun(
+            instance, self.signals, self.time, self.names, self.tolerance, equations, start
+        )
+        run.max_steps = self.heading.get("max_steps") or run.max_steps
+        try:
+            run.begin(self.values)
+            if names:
+                return self._with_sensitivities(instance, run, names)
+            run.go()
+            return self._checked(run.outputs, run.counts)
+        except RunEnded as e:
+            return self._checked(self._until(e), run.counts, e.t)
+
+    def _with_sensitivities(
+        self, instance: Instance, run: model_exchange.ModelExchangeRun, names: tuple[str, ...]
+    ) -> Message:
+        """Return the run with its sensitivities, which are lost where the FMU moves a parameter as it gives a derivative."""
+        parameters = VariableGroup(instance.library, tuple(self.description.parameters.values()))
+        before, lost = parameters.get().copy(), ""
+        try:
+            run.go()
+            if not np.array_equal(before, parameters.get(), equal_nan=True):
+                lost = "the FMU moves a parameter"
+        except model_exchange.SensitivitiesLost as e:
+            lost = str(e)
+        instance.renew(names)
+        if lost:
+            return {"lost": lost}, {}
+        if not np.isfinite(run.gradients).all():
+            raise RunFailed("a sensitivity of an output is not finite", hint="check parameter values and limits")
+        answer, arrays = self._checked(run.outputs, run.counts)
+        return {**answer, "lost": ""}, {**arrays, "gradients": run.gradients}
+
+    def _checked(self, rows: Array, counts: model_exchange.Counts, end: float | None = None) -> Message:
+        """Return the answer. Raises RunFailed where a row is not finite."""
+        finite = np.isfinite(rows)
+        if not finite.all():
+            row, column = np.argmin(finite.all(axis=1)), np.argmin(finite.all(axis=0))
+            what = f"output '{self.names[column]}' is not finite"
+            raise RunFailed(what, float(self.time[row]), "check parameter values and limits")
+        return {"counts": list(astuple(counts)), "end": end}, {"outputs": rows}
+
+    def _until(self, ended: RunEnded) -> Array:
+        """(rows, names) of a run that the FMU ended. Raises the end where such a run is not accepted."""
+        if not self.partial or ended.rows is None or not ended.rows.size:
+            raise ended
+        return ended.rows
+
+    # --- trials ---
+
+    def _find_reuse(self) -> None:
+        """Learn how the FMU is brought back to its start, from runs of this experiment in separate processes."""
+        d = self.description
+        names = tuple(dict.fromkeys([*self.names, *d.outputs, *d.states]))
+
+        def run_on(signals: PackedInputs) -> Callable[[Instance], Array]:
+            return lambda instance: self._trial(instance, signals, self.time, names)
+
+        reuse, rows = self.runner.find_reuse(run_on(self.signals))
+        steps = [PERTURBATION * max(abs(v.start or 0.0), v.nominal) * v.continuous for v in d.inputs.values()]
+        if any(steps) and not moving(rows).any():  # at rest throughout: the start of a run is its end
+            third = float(self.time[0] + (self.time[-1] - self.time[0]) / 3.0)
+            with contextlib.suppress(RunFailed):
+                reuse, _ = self.runner.find_reuse(run_on(self.signals.stepped(steps, third)))
+        self.learned["restart"] = reuse
+
+    def _co_simulated(self, calls: CallPattern, time: Array) -> Array:
+        """(n, outputs) of a run that calls the FMU in some way, of the outputs asked for and all others."""
+        names = tuple(dict.fromkeys([*self.names, *self.description.outputs]))
+
+        def work(instance: Instance) -> Message:
+            return {}, {"rows": self._trial(instance, self.signals, time, names, calls)}
+
+        return self.runner.perform(work)[1]["rows"]
+
+    def _trial(
+        self,
+        instance: Instance,
+        signals: PackedInputs,
+        time: Array,
+        names: tuple[str, ...],
+        calls: CallPattern | None = None,
+    ) -> Array:
+        """(n, names) of a run; NaN after an end that the FMU asked for, where such a run is accepted."""
+        try:
+            if instance.library.exchange:
+                run = model_exchange.ModelExchangeRun(instance, signals, time, names, self.tolerance)
+                run.begin(self.values)
+                run.go()
+                return run.outputs
+            return co_simulation.run(instance, self.values, signals, time, names, self.tolerance, calls)
+        except RunEnded as e:
+            rows = self._until(e)
+            return np.vstack([rows, np.full((time.size - rows.shape[0], rows.shape[1]), np.nan)])
