@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.delays import Blocks, DelayFreePart, SchurComplement, channels, eliminate
+from hvdc_ident.linearize.delays import Blocks, SchurComplement, channels, eliminate
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array, CompiledSystem
@@ -67,7 +67,7 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
     _refuse_flat_roots(s, y, w, p, modes, model.name)
     found = channels(model, s, p)
     closed = [k for k, c in enumerate(found) if c.total == 0.0]
-    return Characteristic.of(DelayFreePart.of(s.layout, jac, list(range(s.layout.nu)), found, closed))
+    return Characteristic.of(s.layout, jac, list(range(s.layout.nu)), found, closed)
 
 
 def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:

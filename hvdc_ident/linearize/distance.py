@@ -145,7 +145,7 @@ def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Pea
             got=f"{len(controller.input_names)} inputs and {len(controller.output_names)} outputs",
         )
     closed = _four_blocks(plant, controller)
-    if plant.delay_free is None and controller.delay_free is None:
+    if plant.exact is None and controller.exact is None:
         poles = closed.poles()
         if (poles.real >= 0).any():
             return Peak(0.0, float(abs(poles[np.argmax(poles.real)].imag)))
@@ -200,7 +200,7 @@ def _closed_with_delays(plant: LinearModel, controller: LinearModel) -> Stabilit
 
 
 def _equation(model: LinearModel) -> Characteristic:
-    if model.delay_free is not None:
+    if model.exact is not None:
         return model.characteristic.visible()
     a, b, c, d = visible(model)
     return Characteristic(a, a.shape[0], (), b, c, d)

@@ -146,18 +146,14 @@ def transfer(model: LinearModel, s: Array) -> Array:
     Raises LinearizationError exactly on a pole.
     """
     s = np.atleast_1d(np.asarray(s, dtype=complex))
-    if model.delay_free is not None:
-        return model.delay_free.response(s)
-    if model.A.shape[0] == 0:
-        return np.broadcast_to(model.D.astype(complex), (s.size, *model.D.shape)).copy()
-    pencil = s[:, None, None] * model.E - model.A
     try:
-        inner = np.linalg.solve(pencil, np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape)))
+        if model.exact is not None:
+            return model.exact.response(s)
+        return np.asarray(model.C @ np.linalg.solve(*_pencil(model, s)) + model.D)
     except np.linalg.LinAlgError:
         raise LinearizationError(
             "a frequency lies exactly on a pole", where=f"linear model '{model.name}'", hint="leave this frequency out"
         ) from None
-    return np.asarray(model.C @ inner + model.D)
 
 
 def response(model: LinearModel, omega: Array | Sequence[float]) -> Array:
@@ -165,15 +161,46 @@ def response(model: LinearModel, omega: Array | Sequence[float]) -> Array:
     return transfer(model, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
 
 
-def transfer_slope(model: LinearModel, s: Array) -> Array:
-    """Return (points, outputs, inputs) derivative of the transfer matrix by s; delays exact."""
-    if model.delay_free is not None:
-        return model.delay_free.response_by_s(s)
-    if model.A.shape[0] == 0:
-        return np.zeros((s.size, *model.D.shape), dtype=complex)
-    pencil = s[:, None, None] * model.E - model.A
-    inner = np.linalg.solve(pencil, np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape)))
-    return np.asarray(-model.C @ np.linalg.solve(pencil, model.E @ inner))
+def _pencil(model: LinearModel, s: Array) -> tuple[Array, Array]:
+    """Return P(s), (points, rows, rows), and F(s), (points, rows, inputs), of G = C P^-1 F + D."""
+    if model.exact is not None:
+        return model.exact.pencil(s)
+    drive = np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape))
+    return s[:, None, None] * model.E - model.A, drive
+
+
+@dataclass(frozen=True, eq=False)
+class _Resolved:
+    """G = C P^-1 F + D at some points, with right = P^-1 F and left = C P^-1: what its derivatives are made of.
+
+    rounding: the size of G's rounding errors. The solutions are refined once, after which they are those of a matrix within a
+    few eps of P in every entry (Skeel 1980), however its rows and columns are scaled.
+    """
+
+    values: Array
+    left: Array
+    right: Array
+    rounding: Array
+
+    @classmethod
+    def of(cls, model: LinearModel, s: Array) -> _Resolved:
+        pencil, drive = _pencil(model, s)
+        read, through = (model.C, model.D) if model.exact is None else (model.exact.read, model.exact.through)
+        right = _refined(pencil, drive)
+        seen = np.broadcast_to(read.T.astype(complex), (s.size, *read.T.shape))
+        left = np.swapaxes(_refined(np.swapaxes(pencil, 1, 2), seen), 1, 2)
+        terms = np.abs(left) @ np.abs(pencil) @ np.abs(right) + np.abs(read) @ np.abs(right) + np.abs(through)
+        return cls(read @ right + through, left, right, np.finfo(float).eps * terms)
+
+    def along(self, pencil: Array, drive: Array | float, read: Array | None = None, through: Array | float = 0.0) -> Array:
+        """Return the derivative of G for derivatives of P, F, C and D."""
+        inner = self.left @ (drive - pencil @ self.right) + through
+        return np.asarray(inner if read is None else inner + read @ self.right)
+
+
+def _refined(matrix: Array, given: Array) -> Array:
+    found = np.linalg.solve(matrix, given)
+    return np.asarray(found + np.linalg.solve(matrix, given - matrix @ found))
 
 
 VISIBLE = 0.01
@@ -231,58 +258,61 @@ def _visible(model: LinearModel, poles: Array) -> Array:
 
 
 TURN = 0.5
-"""Largest difference in rad between what a phase's slopes at both ends of a step give for it: far below half a turn."""
-ROUNDS = 60
-"""Times that steps are parted where slopes differ: enough for any two numbers to be neighbours."""
-
-PER_DECADE = 60
-"""Frequencies that are looked at beside the given ones: two resonances that turn by 180 degrees each hide between two others."""
+"""Largest difference of two estimates of the change of ln G over a step: with one root r near, G'/G = 1/(s - r), and the slopes at
+the ends of a step of length h differ by h^2/|(s1 - r)(s2 - r)|. Below 0.5 a root beside the middle is 1.3 h away or more, where it
+turns the phase by 0.73 rad, far below the half turn at which an angle could be taken the wrong way round."""
+NARROWEST = 1e-9
+"""Share of its frequency to which a step is halved: a root nearer to the axis lies on either side of it, as rounding has it."""
+MOST = 200_000
+"""Frequencies after which steps are halved no more: what is left then has more turns than anyone looks at, or is rounding noise."""
 
 
 def followed_phase(model: LinearModel, omega: Array) -> Array:
     """Return (n, outputs, inputs) degrees at rising omega, rad/s, turns between the frequencies counted.
 
-    The angles alone leave whole turns open, of which a delay makes many in one step. The phase's slopes Re(G'/G) at both
-    ends tell how many; where they do not agree to `TURN`, the step is parted. A channel that is 0 has 0.
+    The angles alone leave whole turns open, of which a delay makes many in one step, and a damped root hides one. The
+    slopes G'/G of ln G at both ends of a step tell how many, and by the modulus whether a root lies between: where what they
+    give for the step's change of ln G differs by `TURN` among them, or from the change itself, the step is halved.
+    A channel that is 0 has 0; one that is not above its rounding errors somewhere is not followed there.
     """
+    angle = np.angle(transfer(model, 1j * omega))
     if omega.size < 2:
-        return np.degrees(np.angle(transfer(model, 1j * omega)))
-    between = _resonances(approximate_poles(model), omega[0], omega[-1])
-    first = omega[omega > 0.0][0]
-    fill = np.geomspace(first, omega[-1], 2 + round(PER_DECADE * np.log10(omega[-1] / first)))
-    w = np.unique(np.concatenate([omega, between, fill[1:-1]]))
-    values, slopes = _with_slopes(model, w)
-    for _ in range(ROUNDS):
-        change, apart = _turned(w, values, slopes)
-        wide = (apart > TURN).any(axis=(1, 2)) & (np.diff(w) > 1e-9 * w[1:])
-        if not wide.any():
+        return np.degrees(angle)
+    w = np.unique(np.concatenate([omega, _resonances(approximate_poles(model), omega[0], omega[-1])]))
+    values, slopes = _logarithmic(model, w)
+    while True:
+        step = np.diff(w)[:, None, None]
+        expected = 0.5j * (slopes[1:] + slopes[:-1]) * step
+        change = np.log(values[1:] / values[:-1])
+        change += 2j * np.pi * np.round((expected - change).imag / (2 * np.pi))
+        apart = np.maximum(np.abs(change - expected), np.abs(slopes[1:] - slopes[:-1]) * step)
+        followed = (values[1:] != 1.0) & (values[:-1] != 1.0)
+        wide = ((apart > TURN) & followed).any(axis=(1, 2)) & (np.diff(w) > NARROWEST * w[1:])
+        if not wide.any() or w.size > MOST:
             break
         low, high = w[:-1][wide], w[1:][wide]
         middle = np.where(high > 4.0 * low, np.sqrt(np.maximum(low, 1e-3 * high) * high), 0.5 * (low + high))
         order = np.argsort(np.concatenate([w, middle]), kind="stable")
-        more, more_slopes = _with_slopes(model, middle)
+        more, more_slopes = _logarithmic(model, middle)
         w, values, slopes = (
             np.concatenate(pair)[order] for pair in ((w, middle), (values, more), (slopes, more_slopes))
         )
-    change, _ = _turned(w, values, slopes)
-    phase = np.concatenate([np.angle(values[:1]), np.angle(values[:1]) + np.cumsum(change, axis=0)])
-    return np.asarray(np.degrees(phase[np.searchsorted(w, omega)]))
+    turned = np.concatenate([angle[:1], angle[:1] + np.cumsum(change.imag, axis=0)])[np.searchsorted(w, omega)]
+    return np.asarray(np.degrees(angle + 2 * np.pi * np.round((turned - angle) / (2 * np.pi))))
 
 
-def _with_slopes(model: LinearModel, w: Array) -> tuple[Array, Array]:
-    """Return the response, 1 where it is 0, and the slopes of its phase, rad per rad/s."""
-    values = transfer(model, 1j * w)
-    values = np.where(values == 0.0, 1.0, values)
-    return values, (transfer_slope(model, 1j * w) / values).real
-
-
-def _turned(w: Array, values: Array, slopes: Array) -> tuple[Array, Array]:
-    """Return by how much the phase changes over each step, rad, and how far apart are that and what the slopes at its ends give."""
-    step = np.diff(w)[:, None, None]
-    expected = 0.5 * (slopes[1:] + slopes[:-1]) * step
-    change = np.angle(values[1:] / values[:-1])
-    change += 2 * np.pi * np.round((expected - change) / (2 * np.pi))
-    return change, np.maximum(np.abs(change - expected), np.abs(slopes[1:] - slopes[:-1]) * step)
+def _logarithmic(model: LinearModel, w: Array) -> tuple[Array, Array]:
+    """Return the response and the derivative of its logarithm by s; 1 and 0 where it is not above its rounding errors."""
+    found = []
+    for part in np.array_split(w, 1 + w.size * model.A.size // 2_000_000):
+        s = 1j * part
+        at = _Resolved.of(model, s)
+        slope = at.along(model.E, 0.0) if model.exact is None else at.along(*model.exact.pencil_by_s(s))
+        known = np.abs(at.values) > model.A.shape[0] * at.rounding
+        values = np.where(known, at.values, 1.0)
+        found.append((values, np.where(known, slope / values, 0.0)))
+    values, slopes = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return values, slopes
 
 
 def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> FrequencyResponse:
@@ -316,22 +346,14 @@ def sensitivity(
     w = _checked(omega)
     s = 1j * w
     names = list(model.gradients) if parameters is None else list(parameters)
+    at = _Resolved.of(model, s)
     found = {}
     for name in names:
         g = gradient_of(model, name)
-        if model.delay_free is not None and g.delay_free is not None:
-            found[name] = model.delay_free.response_along(s, g.delay_free, g.times)
-            continue
-        pencil = s[:, None, None] * model.E - model.A
-        right = np.linalg.solve(pencil, np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape)))
-        left = np.swapaxes(
-            np.linalg.solve(
-                np.swapaxes(pencil, 1, 2), np.broadcast_to(model.C.T.astype(complex), (s.size, *model.C.T.shape))
-            ),
-            1,
-            2,
-        )
-        found[name] = np.asarray(g.C @ right + left @ (g.A @ right) + left @ g.B + g.D)
+        if model.exact is not None and g.exact is not None:
+            found[name] = at.along(*model.exact.pencil_along(s, g.exact), g.exact.read, g.exact.through)
+        else:
+            found[name] = at.along(-g.A, g.B, g.C, g.D)
     return found
 
 

@@ -8,10 +8,11 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, require_known
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.delays import Blocks, DelayFreePart, SchurComplement
+from hvdc_ident.linearize.delays import Blocks, SchurComplement, without_unknowns_along
 from hvdc_ident.linearize.derivatives import WELL_POSED, Side, eliminated
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.stability import Change, Characteristic, quartered
 from hvdc_ident.linearize.system import Array, CompiledSystem, system
 from hvdc_ident.model import AnyModel, Model
 
@@ -80,12 +81,15 @@ def _gradient(
     r, c = parts.rows, parts.columns
     changes = reduced.derivative(along[:, :r, :c], along[:, :r, c:], along[:, r:, :c], along[:, r:, c:])
     kept = [ch for k, ch in enumerate(parts.channels) if k not in closed]
-    core = DelayFreePart.derivative(s.layout, jac, djac, chosen, closed) if kept else None
+    exact = without_unknowns_along(s.layout, jac, djac, chosen, closed) if kept else None
     found = {}
     for k, name in enumerate(names):
         a, b, c_, d = parts.split(changes[k], chosen)
-        free = None if core is None else core[k]
-        found[name] = Gradient(a, b, c_, d, free, tuple(by_p[list(ch.places), k] for ch in kept))
+        change = None
+        if exact is not None:
+            times = tuple(by_p[list(ch.places), k] for ch in kept)
+            change = Change(*quartered(exact[k], s.layout.nx + len(kept)), times)
+        found[name] = Gradient(a, b, c_, d, change)
     return found
 
 
@@ -172,7 +176,7 @@ def _model(
         name=model.name,
         provenance=FrozenMap(notes),
         gradients=FrozenMap(gradient),
-        delay_free=DelayFreePart.of(s.layout, jac, chosen, parts.channels, closed)
+        exact=Characteristic.of(s.layout, jac, chosen, parts.channels, closed)
         if len(parts.channels) > len(closed)
         else None,
     )  # fmt: skip

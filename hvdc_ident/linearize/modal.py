@@ -38,14 +38,14 @@ def poles(model: LinearModel) -> Array:
 
     Of a model with delays the rightmost roots of its exact characteristic equation, by falling real part.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         return model.characteristic.roots.values
     return approximate_poles(model)
 
 
 def stability_of(model: LinearModel) -> Stability:
     """Return whether a model is stable: with delays by its characteristic equation, else by its eigenvalues."""
-    if model.delay_free is not None:
+    if model.exact is not None:
         return stability(model.characteristic)
     values = approximate_poles(model)
     if not values.size:
@@ -78,7 +78,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
 
     A model with delays has infinitely many; these are the rightmost ones, at least as many as it has states.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         return delayed_modes.modes(model)
     names = model.state_names
     if model.is_descriptor:

@@ -247,7 +247,7 @@ class PointTask:
         linear = linearize(self.model, at, inputs=self.inputs or None, outputs=self.outputs or None)
         if self.poles:
             poles = np.asarray(linear.poles(), dtype=complex)
-            if linear.delay_free is not None:  # infinitely many: the rightmost ones
+            if linear.exact is not None:  # infinitely many: the rightmost ones
                 poles = poles[: self.poles]
             if poles.size != self.poles:
                 raise SimulationError(
@@ -350,7 +350,7 @@ def task_of(
             ) from None
         at = linearize(model, point, inputs=quantities.inputs, outputs=quantities.outputs)
         if "poles" in want:
-            poles = int(np.size(at.poles())) if at.delay_free is None else at.delay_free.nx
+            poles = int(np.size(at.poles())) if at.exact is None else at.exact.nx
         channels = tuple(at.input_names), tuple(at.output_names)
         if "bode" in want:
             frequencies = np.asarray(omega if omega is not None else at.bode().omega, dtype=float)
