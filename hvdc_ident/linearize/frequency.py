@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -173,7 +173,7 @@ def _pencil(model: LinearModel, s: Array) -> tuple[Array, Array]:
 class _Resolved:
     """G = C P^-1 F + D at some points, with right = P^-1 F and left = C P^-1: what its derivatives are made of.
 
-    rounding: the size of G's rounding errors. The solutions are refined once, after which they are those of a matrix within a
+    rounding: a bound on G's rounding errors. The solutions are refined once, after which they are those of a matrix within a
     few eps of P in every entry (Skeel 1980), however its rows and columns are scaled.
     """
 
@@ -190,7 +190,7 @@ class _Resolved:
         seen = np.broadcast_to(read.T.astype(complex), (s.size, *read.T.shape))
         left = np.swapaxes(_refined(np.swapaxes(pencil, 1, 2), seen), 1, 2)
         terms = np.abs(left) @ np.abs(pencil) @ np.abs(right) + np.abs(read) @ np.abs(right) + np.abs(through)
-        return cls(read @ right + through, left, right, np.finfo(float).eps * terms)
+        return cls(read @ right + through, left, right, pencil.shape[1] * np.finfo(float).eps * terms)
 
     def along(self, pencil: Array, drive: Array | float, read: Array | None = None, through: Array | float = 0.0) -> Array:
         """Return the derivative of G for derivatives of P, F, C and D."""
@@ -267,62 +267,75 @@ MOST = 200_000
 """Frequencies after which steps are halved no more: what is left then has more turns than anyone looks at, or is rounding noise."""
 
 
-def followed_phase(model: LinearModel, omega: Array) -> Array:
-    """Return (n, outputs, inputs) degrees at rising omega, rad/s, turns between the frequencies counted.
+Sloped = Callable[[Array], tuple[Array, Array, Array]]
+"""A response, its derivative by s and a bound on its rounding errors at frequencies, rad/s; each (n, outputs, inputs)."""
 
-    The angles alone leave whole turns open, of which a delay makes many in one step, and a damped root hides one. The
-    slopes G'/G of ln G at both ends of a step tell how many, and by the modulus whether a root lies between: where what they
-    give for the step's change of ln G differs by `TURN` among them, or from the change itself, the step is halved.
-    A channel that is 0 has 0; one that is not above its rounding errors somewhere is not followed there.
+
+def by_s(model: LinearModel, w: Array) -> tuple[Array, Array, Array]:
+    """Return the response at frequencies, rad/s, its derivative by s and a bound on its rounding errors; delays exact."""
+    found = []
+    for part in np.array_split(w, 1 + w.size * model.A.size // 2_000_000):
+        at = _Resolved.of(model, 1j * part)
+        slope = at.along(model.E, 0.0) if model.exact is None else at.along(*model.exact.pencil_by_s(1j * part))
+        found.append((at.values, slope, at.rounding))
+    values, slopes, rounding = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return values, slopes, rounding
+
+
+def phase_of(model: LinearModel, omega: Array) -> Array:
+    """Return (n, outputs, inputs) degrees of a model's response at frequencies in rad/s, as `followed_phase`."""
+    return followed_phase(lambda w: by_s(model, w), model, omega)
+
+
+def followed_phase(at: Sloped, model: LinearModel, omega: Array) -> Array:
+    """Return (n, outputs, inputs) degrees of a response at frequencies in rad/s, turns between them counted.
+
+    model: the one it is made of, whose resonances are looked at. The angles alone leave whole turns open, of which a delay
+    makes many in one step, and a damped root hides one. The slopes G'/G of ln G at both ends of a step tell how many, and by
+    the modulus whether a root lies between: where what they give for the step's change of ln G differs by `TURN` among them,
+    or from the change itself, the step is halved. A channel that is 0 has 0; one that is not above its rounding errors
+    somewhere is not followed there.
     """
-    angle = np.angle(transfer(model, 1j * omega))
-    if omega.size < 2:
-        return np.degrees(angle)
-    w = np.unique(np.concatenate([omega, _resonances(approximate_poles(model), omega[0], omega[-1])]))
-    values, slopes = _logarithmic(model, w)
+    rising, place = np.unique(omega, return_inverse=True)
+    w = np.unique(np.concatenate([rising, _resonances(approximate_poles(model), rising[0], rising[-1])]))
+    values, slopes = _logarithmic(at, w)
     while True:
         step = np.diff(w)[:, None, None]
         expected = 0.5j * (slopes[1:] + slopes[:-1]) * step
         change = np.log(values[1:] / values[:-1])
         change += 2j * np.pi * np.round((expected - change).imag / (2 * np.pi))
         apart = np.maximum(np.abs(change - expected), np.abs(slopes[1:] - slopes[:-1]) * step)
-        followed = (values[1:] != 1.0) & (values[:-1] != 1.0)
-        wide = ((apart > TURN) & followed).any(axis=(1, 2)) & (np.diff(w) > NARROWEST * w[1:])
+        known = (values[1:] != 1.0) & (values[:-1] != 1.0)
+        wide = ((apart > TURN) & known).any(axis=(1, 2)) & (np.diff(w) > NARROWEST * w[1:])
         if not wide.any() or w.size > MOST:
             break
         low, high = w[:-1][wide], w[1:][wide]
         middle = np.where(high > 4.0 * low, np.sqrt(np.maximum(low, 1e-3 * high) * high), 0.5 * (low + high))
         order = np.argsort(np.concatenate([w, middle]), kind="stable")
-        more, more_slopes = _logarithmic(model, middle)
+        more, more_slopes = _logarithmic(at, middle)
         w, values, slopes = (
             np.concatenate(pair)[order] for pair in ((w, middle), (values, more), (slopes, more_slopes))
         )
-    turned = np.concatenate([angle[:1], angle[:1] + np.cumsum(change.imag, axis=0)])[np.searchsorted(w, omega)]
-    return np.asarray(np.degrees(angle + 2 * np.pi * np.round((turned - angle) / (2 * np.pi))))
+    angle = np.angle(at(rising)[0])
+    turned = np.concatenate([angle[:1], angle[:1] + np.cumsum(change.imag, axis=0)])[np.searchsorted(w, rising)]
+    return np.asarray(np.degrees(angle + 2 * np.pi * np.round((turned - angle) / (2 * np.pi))))[place]
 
 
-def _logarithmic(model: LinearModel, w: Array) -> tuple[Array, Array]:
-    """Return the response and the derivative of its logarithm by s; 1 and 0 where it is not above its rounding errors."""
-    found = []
-    for part in np.array_split(w, 1 + w.size * model.A.size // 2_000_000):
-        s = 1j * part
-        at = _Resolved.of(model, s)
-        slope = at.along(model.E, 0.0) if model.exact is None else at.along(*model.exact.pencil_by_s(s))
-        known = np.abs(at.values) > model.A.shape[0] * at.rounding
-        values = np.where(known, at.values, 1.0)
-        found.append((values, np.where(known, slope / values, 0.0)))
-    values, slopes = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return values, slopes
+def _logarithmic(at: Sloped, w: Array) -> tuple[Array, Array]:
+    """Return a response and the derivative of its logarithm by s; 1 and 0 where it is not above its rounding errors."""
+    values, slopes, rounding = at(w)
+    known = np.abs(values) > rounding
+    values = np.where(known, values, 1.0)
+    return values, np.where(known, slopes / values, 0.0)
 
 
 def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> FrequencyResponse:
     """Return the response of every channel at omega in rad/s (default: around the poles)."""
     w = default_omega(model) if omega is None else _checked(omega)
-    rising, place = np.unique(w, return_inverse=True)
     units = tuple((o, i) for o in model.output_units for i in model.input_units)
     return FrequencyResponse(
         w, transfer(model, 1j * w), model.output_names, model.input_names, units,
-        phase=followed_phase(model, rising)[place],
+        phase=phase_of(model, w),
     )  # fmt: skip
 
 

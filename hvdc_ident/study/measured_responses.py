@@ -186,6 +186,7 @@ def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[dict
     """Return every measured response beside the model's at some sets of values, with the errors of each, as plain numbers.
 
     sets: values of parameters by the set's name ("given", "fitted"). A set for which there is no response has the reason.
+    Phases are degrees; the measured one has, as every other, the whole turns that bring it nearest to the first model's.
     """
     found = []
     for r in study.responses:
@@ -193,10 +194,11 @@ def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[dict
             "name": r.name,
             **described(r),
             "omega": r.omega.tolist(),
-            "measured": _parts(r.values),
+            "measured": {},
             "std": None if r.std is None else r.std.tolist(),
             "models": {},
         }
+        first: Array | None = None
         for name, values in sets.items():
             try:
                 linear = r.linear(study.model, values)
@@ -205,13 +207,27 @@ def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[dict
                 line["models"][name] = {"reason": str(e)}
             else:
                 stable = linear.stability().verdict in ("stable", "on the limit of stability")
-                line["models"][name] = {**_parts(curve), "errors": r.errors(curve), "stable": stable}
+                phase = r.phase(linear)
+                first = phase if first is None else first
+                line["models"][name] = {
+                    **_parts(curve, phase + _turns(first[:1] - phase[:1])),
+                    "errors": r.errors(curve),
+                    "stable": stable,
+                }
+        angle = np.degrees(np.angle(r.values))
+        phase = np.degrees(np.unwrap(np.radians(angle), axis=0)) if first is None else angle + _turns(first - angle)
+        line["measured"] = _parts(r.values, phase)
         found.append(line)
     return found
 
 
-def _parts(values: Array) -> dict[str, Any]:
-    return {"real": values.real.tolist(), "imag": values.imag.tolist()}
+def _parts(values: Array, phase: Array) -> dict[str, Any]:
+    return {"real": values.real.tolist(), "imag": values.imag.tolist(), "phase_deg": phase.tolist()}
+
+
+def _turns(degrees: Array) -> Array:
+    """Return the whole turns next to some angles, degrees."""
+    return np.asarray(360.0 * np.round(degrees / 360.0))
 
 
 def response_lines(responses: Iterable[Mapping[str, Any]], of: str) -> list[str]:

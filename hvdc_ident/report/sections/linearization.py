@@ -133,14 +133,14 @@ def _bode(given: dict[str, Any], fitted: dict[str, Any] | None) -> str:
 def _curves(pair: Any, response: dict[str, Any], label: str, which: int | None) -> bool:
     """Draw one model's channels, each in a colour of its own; whether there is one. which: of several models, their line."""
     omega, values = np.array(response["omega"], dtype=float), complex_of(response["real"], response["imag"])
-    phase = np.array(response["phase_deg"], dtype=float) if "phase_deg" in response else None
+    phase = np.array(response["phase_deg"], dtype=float)
     channels = [(i, j) for i in range(len(response["outputs"])) for j in range(len(response["inputs"]))]
     seen = []
     for k, (i, j) in enumerate(channels):
         name = f"{response['inputs'][j]} to {response['outputs'][i]}{label}"
         line = LINES[(k if which is None else which) % len(LINES)]
-        turned = None if phase is None else phase[:, i, j]
-        seen.append(draw_response(pair, omega, values[:, i, j], name, turned, color=SERIES[k % len(SERIES)], linestyle=line))
+        style = {"color": SERIES[k % len(SERIES)], "linestyle": line}
+        seen.append(draw_response(pair, omega, values[:, i, j], phase[:, i, j], name, **style))
     return any(seen)
 
 

@@ -62,8 +62,8 @@ def _bode(r: dict[str, Any]) -> str:
             if name == "measured":
                 style = {"linestyle": "none", "marker": ".", "markersize": 4}
             label = f"{channel}, {name}" if k == 0 or name == "measured" else None
-            values = complex_of(parts["real"], parts["imag"])[:, k]
-            draw_response(pair, omega, values, label, color=SERIES[k % len(SERIES)], **style)
+            values, phase = complex_of(parts["real"], parts["imag"])[:, k], np.array(parts["phase_deg"], dtype=float)[:, k]
+            draw_response(pair, omega, values, phase, label, color=SERIES[k % len(SERIES)], **style)
     pair[0].legend(fontsize="small")
     drawn = svg(fig, "Bode diagram of the measured response " + r["name"])
     return captioned(drawn, f"{text(r['name'])}: dots measured, lines of the model.")
