@@ -268,65 +268,72 @@ MOST = 200_000
 
 
 Sloped = Callable[[Array], tuple[Array, Array, Array]]
-"""A response, its derivative by s and a bound on its rounding errors at frequencies, rad/s; each (n, outputs, inputs)."""
+"""A function of complex frequencies, its derivative by s and a bound on its rounding errors, each (points, outputs, inputs)."""
 
 
-def by_s(model: LinearModel, w: Array) -> tuple[Array, Array, Array]:
-    """Return the response at frequencies, rad/s, its derivative by s and a bound on its rounding errors; delays exact."""
+def by_s(model: LinearModel, s: Array) -> tuple[Array, Array, Array]:
+    """Return the response at complex frequencies, its derivative by s and a bound on its rounding errors; delays exact."""
     found = []
-    for part in np.array_split(w, 1 + w.size * model.A.size // 2_000_000):
-        at = _Resolved.of(model, 1j * part)
-        slope = at.along(model.E, 0.0) if model.exact is None else at.along(*model.exact.pencil_by_s(1j * part))
+    for part in np.array_split(s, 1 + s.size * model.A.size // 2_000_000):
+        at = _Resolved.of(model, part)
+        slope = at.along(model.E, 0.0) if model.exact is None else at.along(*model.exact.pencil_by_s(part))
         found.append((at.values, slope, at.rounding))
     values, slopes, rounding = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return values, slopes, rounding
 
 
-def phase_of(model: LinearModel, omega: Array) -> Array:
-    """Return (n, outputs, inputs) degrees of a model's response at frequencies in rad/s, as `followed_phase`."""
-    return followed_phase(lambda w: by_s(model, w), model, omega)
+def followed(at: Sloped, s: Array) -> tuple[Array, Array]:
+    """Return complex frequencies from each of s straight to the next, and the changes of ln G over the steps between them.
+
+    The angles alone leave whole turns open, of which a delay makes many in one step, and a damped root hides one. The
+    slopes G'/G of ln G at both ends of a step tell how many, and by the modulus whether a root lies between: where what they
+    give for the step's change of ln G differs by `TURN` among them, or from the change itself, the step is halved. A
+    channel that is not above its rounding errors somewhere is not followed there.
+    """
+    values, slopes, known = _logarithmic(at, s)
+    while True:
+        step = np.diff(s)[:, None, None]
+        expected = 0.5 * (slopes[1:] + slopes[:-1]) * step
+        change = np.log(values[1:] / values[:-1])
+        change += 2j * np.pi * np.round((expected - change).imag / (2 * np.pi))
+        apart = np.maximum(np.abs(change - expected), np.abs((slopes[1:] - slopes[:-1]) * step))
+        wide = ((apart > TURN) & known[1:] & known[:-1]).any(axis=(1, 2)) & (np.abs(np.diff(s)) > NARROWEST * np.abs(s[1:]))
+        if not wide.any() or s.size > MOST:
+            return s, change
+        k = np.flatnonzero(wide)
+        low, high = s[k], s[k + 1]
+        share = np.sqrt(np.maximum(np.abs(low / high), 1e-3))
+        middle = np.where(share < 0.5, share * high, 0.5 * (low + high))
+        added = (middle, *_logarithmic(at, middle))
+        s, values, slopes, known = (
+            np.insert(old, k + 1, new, axis=0) for old, new in zip((s, values, slopes, known), added, strict=True)
+        )
+
+
+def _logarithmic(at: Sloped, s: Array) -> tuple[Array, Array, Array]:
+    """Return values, the derivative of their logarithm by s, and where they are above their rounding errors; elsewhere 1 and 0."""
+    values, slopes, rounding = at(s)
+    known = np.abs(values) > rounding
+    values = np.where(known, values, 1.0)
+    return values, np.where(known, slopes / values, 0.0), known
 
 
 def followed_phase(at: Sloped, model: LinearModel, omega: Array) -> Array:
     """Return (n, outputs, inputs) degrees of a response at frequencies in rad/s, turns between them counted.
 
-    model: the one it is made of, whose resonances are looked at. The angles alone leave whole turns open, of which a delay
-    makes many in one step, and a damped root hides one. The slopes G'/G of ln G at both ends of a step tell how many, and by
-    the modulus whether a root lies between: where what they give for the step's change of ln G differs by `TURN` among them,
-    or from the change itself, the step is halved. A channel that is 0 has 0; one that is not above its rounding errors
-    somewhere is not followed there.
+    model: the one it is made of, whose resonances are looked at. A channel that is 0 has 0.
     """
     rising, place = np.unique(omega, return_inverse=True)
     w = np.unique(np.concatenate([rising, _resonances(approximate_poles(model), rising[0], rising[-1])]))
-    values, slopes = _logarithmic(at, w)
-    while True:
-        step = np.diff(w)[:, None, None]
-        expected = 0.5j * (slopes[1:] + slopes[:-1]) * step
-        change = np.log(values[1:] / values[:-1])
-        change += 2j * np.pi * np.round((expected - change).imag / (2 * np.pi))
-        apart = np.maximum(np.abs(change - expected), np.abs(slopes[1:] - slopes[:-1]) * step)
-        known = (values[1:] != 1.0) & (values[:-1] != 1.0)
-        wide = ((apart > TURN) & known).any(axis=(1, 2)) & (np.diff(w) > NARROWEST * w[1:])
-        if not wide.any() or w.size > MOST:
-            break
-        low, high = w[:-1][wide], w[1:][wide]
-        middle = np.where(high > 4.0 * low, np.sqrt(np.maximum(low, 1e-3 * high) * high), 0.5 * (low + high))
-        order = np.argsort(np.concatenate([w, middle]), kind="stable")
-        more, more_slopes = _logarithmic(at, middle)
-        w, values, slopes = (
-            np.concatenate(pair)[order] for pair in ((w, middle), (values, more), (slopes, more_slopes))
-        )
-    angle = np.angle(at(rising)[0])
-    turned = np.concatenate([angle[:1], angle[:1] + np.cumsum(change.imag, axis=0)])[np.searchsorted(w, rising)]
+    s, change = followed(at, 1j * w)
+    angle = np.angle(at(1j * rising)[0])
+    turned = np.concatenate([angle[:1], angle[:1] + np.cumsum(change.imag, axis=0)])[np.searchsorted(s.imag, rising)]
     return np.asarray(np.degrees(angle + 2 * np.pi * np.round((turned - angle) / (2 * np.pi))))[place]
 
 
-def _logarithmic(at: Sloped, w: Array) -> tuple[Array, Array]:
-    """Return a response and the derivative of its logarithm by s; 1 and 0 where it is not above its rounding errors."""
-    values, slopes, rounding = at(w)
-    known = np.abs(values) > rounding
-    values = np.where(known, values, 1.0)
-    return values, np.where(known, slopes / values, 0.0)
+def phase_of(model: LinearModel, omega: Array) -> Array:
+    """Return (n, outputs, inputs) degrees of a model's response at frequencies in rad/s, as `followed_phase`."""
+    return followed_phase(lambda s: by_s(model, s), model, omega)
 
 
 def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> FrequencyResponse:

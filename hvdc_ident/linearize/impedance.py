@@ -104,8 +104,8 @@ def port_values(linear: LinearModel, port: Port, w: Array, kind: str) -> Array:
 def port_phase(linear: LinearModel, port: Port, w: Array, kind: str) -> Array:
     """Return (n, k, k) degrees of the same, turns between the frequencies counted."""
 
-    def sloped(w: Array) -> tuple[Array, Array, Array]:
-        (top, bottom), (d_top, d_bottom), (off_top, off_bottom) = (_parts(x, port, kind) for x in by_s(linear, w))
+    def sloped(s: Array) -> tuple[Array, Array, Array]:
+        (top, bottom), (d_top, d_bottom), (off_top, off_bottom) = (_parts(x, port, kind) for x in by_s(linear, s))
         inverse = np.linalg.inv(bottom)
         ratio = top @ inverse
         return ratio, (d_top - ratio @ d_bottom) @ inverse, (off_top + np.abs(ratio) @ off_bottom) @ np.abs(inverse)

@@ -170,6 +170,14 @@ class Characteristic:
             return np.where((s == 0)[:, None, None], beside.real, beside)
         return np.asarray(self.through + self.read @ np.linalg.solve(*self.pencil(s)))
 
+    def response_by_s(self, s: Array) -> tuple[Array, Array]:
+        """Return the transfer matrix at complex frequencies s, rad/s, and its derivative by s."""
+        pencil, drive = self.pencil(s)
+        d_pencil, d_drive = self.pencil_by_s(s)
+        right = np.linalg.solve(pencil, drive)
+        slope = self.read @ np.linalg.solve(pencil, d_drive - d_pencil @ right)
+        return np.asarray(self.through + self.read @ right), np.asarray(slope)
+
     def pencil(self, s: Array) -> tuple[Array, Array]:
         """Return the pencil and what the inputs add to its rows, (frequencies, rows, inputs)."""
         return self.whole.pencil(s), self.whole.factors(s)[:, :, None] * self.given
