@@ -192,7 +192,9 @@ class _Resolved:
         terms = np.abs(left) @ np.abs(pencil) @ np.abs(right) + np.abs(read) @ np.abs(right) + np.abs(through)
         return cls(read @ right + through, left, right, pencil.shape[1] * np.finfo(float).eps * terms)
 
-    def along(self, pencil: Array, drive: Array | float, read: Array | None = None, through: Array | float = 0.0) -> Array:
+    def along(
+        self, pencil: Array, drive: Array | float, read: Array | None = None, through: Array | float = 0.0
+    ) -> Array:
         """Return the derivative of G for derivatives of P, F, C and D."""
         inner = self.left @ (drive - pencil @ self.right) + through
         return np.asarray(inner if read is None else inner + read @ self.right)
@@ -297,7 +299,9 @@ def followed(at: Sloped, s: Array) -> tuple[Array, Array]:
         change = np.log(values[1:] / values[:-1])
         change += 2j * np.pi * np.round((expected - change).imag / (2 * np.pi))
         apart = np.maximum(np.abs(change - expected), np.abs((slopes[1:] - slopes[:-1]) * step))
-        wide = ((apart > TURN) & known[1:] & known[:-1]).any(axis=(1, 2)) & (np.abs(np.diff(s)) > NARROWEST * np.abs(s[1:]))
+        wide = ((apart > TURN) & known[1:] & known[:-1]).any(axis=(1, 2)) & (
+            np.abs(np.diff(s)) > NARROWEST * np.abs(s[1:])
+        )
         if not wide.any() or s.size > MOST:
             return s, change
         k = np.flatnonzero(wide)
