@@ -17,6 +17,8 @@ Side = Literal["refuse", "below", "above"]
 WELL_POSED = 1e12
 """Largest condition number of the algebraic part that is eliminated; beyond it the model stays a descriptor."""
 ON_KINK = 1e-9
+PADE_ORDER = 5
+"""Order of the approximants of delays where none is asked for."""
 
 
 def constants(model: Model) -> list[str]:
@@ -41,9 +43,9 @@ def eliminated(
     return modes, jac, parts, eliminate(parts.matrix(jac), parts.rows, parts.columns)
 
 
-def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, pade_order: int = 5) -> Array:
+def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Array:
     """Return A, (states, states), at a point given by its vectors, without states that never move. Raises as `linearize` does."""
-    _, _, parts, reduced = eliminated(model, s, y, w, p, "refuse", pade_order)
+    _, _, parts, reduced = eliminated(model, s, y, w, p, "refuse", PADE_ORDER)
     if reduced.condition > WELL_POSED:
         raise LinearizationError(
             "the algebraic part is ill-conditioned",

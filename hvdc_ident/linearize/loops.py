@@ -114,7 +114,7 @@ def loop(
     point: OperatingPoint | None = None,
     *,
     sensitivities: Sequence[str] = (),
-    pade_order: int = 5,
+    pade_order: int | None = None,
 ) -> Loop:
     """Return the loop opened at a named signal, unknown or state, or several opened together, at the operating point.
 

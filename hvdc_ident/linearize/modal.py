@@ -21,9 +21,9 @@ from hvdc_ident.linearize import delayed_modes
 from hvdc_ident.linearize.delayed_locus import crossings, followed
 from hvdc_ident.linearize.derivatives import characteristic, state_matrix
 from hvdc_ident.linearize.equilibrium import EquilibriumSearch
+from hvdc_ident.linearize.jacobian import steady
 from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles
 from hvdc_ident.linearize.mode import Mode
-from hvdc_ident.linearize.operating_point import steady
 from hvdc_ident.linearize.plot import locus
 from hvdc_ident.linearize.stability import ZERO, Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array, CompiledSystem

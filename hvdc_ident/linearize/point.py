@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,7 +14,7 @@ from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, SteadyStateError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.derivatives import characteristic
-from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch
+from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.stability import ZERO, Characteristic, stability
 from hvdc_ident.linearize.system import Array, CompiledSystem
@@ -51,6 +51,34 @@ class OperatingPoint(Shown):
     time: float = 0.0
     search: EquilibriumSearch | None = field(default=None, repr=False)
     branch: Branch = "own"
+
+    @classmethod
+    def of(cls, model: AnyModel, search: EquilibriumSearch, root: Root, branch: Branch) -> OperatingPoint:
+        """Return the point of a solved search."""
+        y, w, p = search.vectors(root.v)
+        s, size = search.system, search.system.layout
+        values, _ = s.evaluate(y, w, p)
+        shown = values[size.n + size.ne : size.main]
+        wanted = {n: float(v) for n, v in zip(s.outputs, shown, strict=True) if n in model.outputs}
+        n_extra = 1 + size.nu
+        method = root.method + (", least norm" if len(search.rows) < len(search.variables) else "")
+        return cls(
+            model,
+            _named(s.states, y[: size.nx]),
+            _named(s.unknowns, y[size.nx :]),
+            _named(s.extras, w[n_extra:]),
+            _named(s.inputs, w[1:n_extra]),
+            FrozenMap(wanted),
+            _named(s.parameters, p),
+            float(root.shares.max(initial=0.0)),
+            s.limits(y, w, p),
+            root.iterations,
+            method,
+            search.at,
+            search.time,
+            search,
+            branch,
+        )
 
     def _screen(self) -> Iterator[str | Table]:
         yield f"Operating point of {self.model.name} ({self.at}, {self.method}), residual {self.residual:.2g}"
@@ -111,6 +139,10 @@ class OperatingPoint(Shown):
             "stable": self.stable,
             "notes": list(self.notes),
         }
+
+
+def _named(names: Sequence[str], values: Array) -> FrozenMap[float]:
+    return FrozenMap(zip(names, (float(v) for v in values), strict=True))
 
 
 def _notes(point: OperatingPoint) -> tuple[str, ...]:
