@@ -115,7 +115,7 @@ def loop(
     point: OperatingPoint | None = None,
     *,
     sensitivities: Sequence[str] = (),
-    pade_order: int = 5,
+    pade_order: int | None = None,
 ) -> Loop:
     """Return the loop opened at a named signal, unknown or state, or several opened together, at the operating point.
 
@@ -398,7 +398,7 @@ def open_equation(model: LinearModel) -> Characteristic:
 
     Raises LinearizationError where the direct part is -1.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         found = model.characteristic
     else:
         a, b, c, d = without_sliding_means(model)
@@ -445,7 +445,7 @@ def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMa
 def _sensitivity(model: LinearModel) -> Curves:
     """S = (1 + L)^-1 over rad/s; from the closed loops' state space where there is one, which poles of L do not disturb."""
     eye = np.eye(len(model.input_names))
-    if model.delay_free is not None:
+    if model.exact is not None:
         return lambda w: np.linalg.inv(eye + transfer(model, 1j * w))
     a, b, c, d = model.standard()
     direct = np.linalg.inv(eye + d)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,7 +15,7 @@ from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, SteadyStateError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.derivatives import characteristic
-from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch
+from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.stability import ZERO, Characteristic, stability
 from hvdc_ident.linearize.system import Array, CompiledSystem
@@ -76,6 +76,35 @@ class OperatingPoint(Shown, Coded):
         vars(point).update(stable=judged.stable, notes=judged.notes)  # the cached properties, which need the model
         return point
 
+    @classmethod
+    def of(cls, model: AnyModel, search: EquilibriumSearch, root: Root, branch: Branch) -> OperatingPoint:
+        """Return the point of a solved search."""
+        y, w, p = search.vectors(root.v)
+        s, size = search.system, search.system.layout
+        values, _ = s.evaluate(y, w, p)
+        shown = values[size.n + size.ne : size.main]
+        wanted = {n: float(v) for n, v in zip(s.outputs, shown, strict=True) if n in model.outputs}
+        n_extra = 1 + size.nu
+        method = root.method + (", least norm" if len(search.rows) < len(search.variables) else "")
+        return cls(
+            model.name,
+            _named(s.states, y[: size.nx]),
+            _named(s.unknowns, y[size.nx :]),
+            _named(s.extras, w[n_extra:]),
+            _named(s.inputs, w[1:n_extra]),
+            FrozenMap(wanted),
+            _named(s.parameters, p),
+            float(root.shares.max(initial=0.0)),
+            root.iterations,
+            method,
+            search.at,
+            search.time,
+            branch,
+            s.limits(y, w, p),
+            model,
+            search,
+        )
+
     def _screen(self) -> Iterator[str | Table]:
         yield f"Operating point of {self.name} ({self.at}, {self.method}), residual {self.residual:.2g}"
         parts = (("state", self.states), ("input", self.inputs), ("output", self.outputs))
@@ -121,6 +150,10 @@ class OperatingPoint(Shown, Coded):
     def p(self) -> Array:
         """(parameters,) as the machine code takes them."""
         return np.array([*self.parameters.values()], dtype=float)
+
+
+def _named(names: Sequence[str], values: Array) -> FrozenMap[float]:
+    return FrozenMap(zip(names, (float(v) for v in values), strict=True))
 
 
 def _notes(point: OperatingPoint) -> tuple[str, ...]:

@@ -248,7 +248,7 @@ def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     Steinbuch 1990), which needs no stability; a model with delays is searched on its exact response instead. Raises
     LinearizationError where a pole that the inputs reach and the outputs see lies on the imaginary axis: the norm is infinite.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         return _linf_of_delays(model)
     a, b, c, d = _clear_of_axis(model)
 
@@ -309,7 +309,7 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
 
     Raises LinearizationError where a pole that inputs reach and outputs see is not stable.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         _refuse_unstable(model, "an unstable model has no H-infinity norm")
         return linf_norm(model, tolerance)
     a = visible(model)[0]
@@ -326,7 +326,7 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
 
 def _refuse_unstable(model: LinearModel, what: str) -> None:
     """Raise LinearizationError where a model with delays is not stable, or cannot be told to be, between inputs and outputs."""
-    assert model.delay_free is not None
+    assert model.exact is not None
     found = stability(model.characteristic.visible())
     if found.verdict != "stable":
         raise LinearizationError(
@@ -336,7 +336,7 @@ def _refuse_unstable(model: LinearModel, what: str) -> None:
 
 def _linf_of_delays(model: LinearModel) -> Peak:
     """Return the L-infinity norm of a model with delays, on a grid of its exact response and beside the largest value."""
-    assert model.delay_free is not None
+    assert model.exact is not None
     equation = model.characteristic.visible()
     if equation.roots.axis > sliding_means(equation):
         raise LinearizationError(
@@ -351,7 +351,7 @@ def h2_norm(model: LinearModel) -> float:
 
     Delays stand as their Pade approximants in the value, not in the verdict on stability.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         _refuse_unstable(model, "the H2 norm is infinite: the model is not stable")
     a, b, c, d = visible(model)
     if np.any(d):
@@ -362,7 +362,7 @@ def h2_norm(model: LinearModel) -> float:
     if ((poles.real >= 0) | on_axis(poles, a)).any():
         raise LinearizationError(
             "the H2 norm is infinite: the model is not stable"
-            if model.delay_free is None
+            if model.exact is None
             else "the H2 norm is not known: the model is stable, and its delays' Pade approximants are not",
             where=f"linear model '{model.name}'",
         )

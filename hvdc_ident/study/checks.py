@@ -126,14 +126,14 @@ def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str
 
 def _check_kind_of_model(asked: schema.LinearizeTable, model: AnyModel, place: str) -> None:
     """Raise StudyError where [linearize] asks for what only equations tell."""
-    of_equations = (asked.break_at, asked.plant, asked.port, asked.formula, asked.locus)
+    of_equations = (asked.break_at, asked.plant, asked.port, asked.formula, asked.locus, asked.side != "refuse")
     if not isinstance(model, Model) and any(of_equations):
         raise StudyError(
-            "loops, ports, loci and formulas need the model's equations",
+            "loops, ports, loci, formulas and a side of a limit need the model's equations",
             where=place,
             expected="a model card or a shipped model",
             got="an FMU",
-            hint="leave break_at, plant, port, locus and formula out",
+            hint="leave break_at, plant, port, locus, formula and side out",
         )
 
 

@@ -192,25 +192,36 @@ def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[Comp
     """Return every measured response beside the model's at some sets of values, with the errors of each.
 
     sets: values of parameters by the set's name ("given", "fitted"). A set for which there is no response has the reason.
+    Phases are degrees; the measured one has, as every other, the whole turns that bring it nearest to the first model's.
     """
-    return [
-        ComparedResponse(
-            r.name, described(r), r.omega, Curves(r.values.real, r.values.imag), r.std,
-            {name: _of_model(study, r, values) for name, values in sets.items()},
-        )
-        for r in study.responses
-    ]  # fmt: skip
+    return [_compared(study, r, sets) for r in study.responses]
 
 
-def _of_model(study: Study, r: MeasuredResponse, values: Mapping[str, float]) -> ModelResponse:
-    try:
-        linear = r.linear(study.model, values)
-        curve = r.seen(linear)[0]
-    except (SteadyStateError, LinearizationError) as e:
-        return ModelResponse(reason=str(e))
-    errors = tuple(read_fields(ChannelError, e) for e in r.errors(curve))
-    stable = linear.stability().verdict in ("stable", "on the limit of stability")
-    return ModelResponse(curve.real, curve.imag, errors, stable)
+def _compared(study: Study, r: MeasuredResponse, sets: Mapping[str, Mapping[str, float]]) -> ComparedResponse:
+    models: dict[str, ModelResponse] = {}
+    first: Array | None = None
+    for name, values in sets.items():
+        try:
+            linear = r.linear(study.model, values)
+            curve = r.seen(linear)[0]
+        except (SteadyStateError, LinearizationError) as e:
+            models[name] = ModelResponse(reason=str(e))
+            continue
+        phase = r.phase(linear)
+        first = phase if first is None else first
+        phase = phase + _turns(first[:1] - phase[:1])
+        errors = tuple(read_fields(ChannelError, e) for e in r.errors(curve))
+        stable = linear.stability().verdict in ("stable", "on the limit of stability")
+        models[name] = ModelResponse(curve.real, curve.imag, phase, errors, stable)
+    angle = np.degrees(np.angle(r.values))
+    phase = np.degrees(np.unwrap(np.radians(angle), axis=0)) if first is None else angle + _turns(first - angle)
+    measured = Curves(r.values.real, r.values.imag, phase)
+    return ComparedResponse(r.name, described(r), r.omega, measured, r.std, models)
+
+
+def _turns(degrees: Array) -> Array:
+    """Return the whole turns next to some angles, degrees."""
+    return np.asarray(360.0 * np.round(degrees / 360.0))
 
 
 def described(response: MeasuredResponse) -> DescribedResponse:

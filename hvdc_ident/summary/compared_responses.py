@@ -71,15 +71,18 @@ class ChannelError:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """Complex values by frequency and channel, (n, channels), in their parts; None where there are none."""
+    """Complex values by frequency and channel, (n, channels), in their parts, with their phases; None where there are none."""
 
     real: Array | None = field(default=None, metadata=stored_as("real", optional=True))
     imag: Array | None = field(default=None, metadata=stored_as("imag", optional=True))
+    phase_deg: Array | None = field(default=None, metadata=stored_as("phase_deg", optional=True))
 
     @property
-    def values(self) -> NDArray[np.complex128] | None:
-        """The values as one array."""
-        return None if self.real is None or self.imag is None else np.asarray(self.real + 1j * self.imag)
+    def curves(self) -> tuple[NDArray[np.complex128], Array] | None:
+        """The values and their phases, degrees."""
+        if self.real is None or self.imag is None or self.phase_deg is None:
+            return None
+        return np.asarray(self.real + 1j * self.imag), self.phase_deg
 
 
 @dataclass(frozen=True, eq=False)

@@ -145,7 +145,7 @@ def _curves(pair: Any, response: FrequencyResponse, label: str, which: int | Non
         line = LINES[(k if which is None else which) % len(LINES)]
         values, phase = response.values[:, i, j], response.phase_deg[:, i, j]
         style = {"color": SERIES[k % len(SERIES)], "linestyle": line}
-        seen.append(draw_response(pair, response.omega, values, name, phase, **style))
+        seen.append(draw_response(pair, response.omega, values, phase, name, **style))
     return any(seen)
 
 

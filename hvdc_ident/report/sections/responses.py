@@ -51,16 +51,17 @@ def _remarks(r: ComparedResponse) -> str:
 def _bode(r: ComparedResponse) -> str:
     fig = figure(7.5, 4.8, {"left": 0.1, "right": 0.99, "bottom": 0.11, "top": 0.98, "hspace": 0.1})
     (pair,) = bode_axes(fig)
-    curves = {"measured": r.measured.values, **{n: m.values for n, m in r.models.items()}}
+    curves = {"measured": r.measured.curves, **{n: m.curves for n, m in r.models.items()}}
     for k, channel in enumerate(r.about.channels):
-        for name, values in curves.items():
-            if values is None:
+        for name, curve in curves.items():
+            if curve is None:
                 continue
+            values, phase = curve
             style: dict[str, Any] = {"linestyle": STYLES.get(name, "-."), "linewidth": 1.2}
             if name == "measured":
                 style = {"linestyle": "none", "marker": ".", "markersize": 4}
             label = f"{channel}, {name}" if k == 0 or name == "measured" else None
-            draw_response(pair, r.omega, values[:, k], label, color=SERIES[k % len(SERIES)], **style)
+            draw_response(pair, r.omega, values[:, k], phase[:, k], label, color=SERIES[k % len(SERIES)], **style)
     pair[0].legend(fontsize="small")
     drawn = svg(fig, "Bode diagram of the measured response " + r.name)
     return captioned(drawn, f"{text(r.name)}: dots measured, lines of the model.")
