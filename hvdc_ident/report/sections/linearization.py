@@ -6,13 +6,15 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from hvdc_ident.colours import SERIES
 from hvdc_ident.linearize import FrequencyResponse, Mode, OperatingPoint, RootLocus
 from hvdc_ident.linearize.gain_limits import Crossing
 from hvdc_ident.linearize.modal import NamedMode
+from hvdc_ident.linearize.plot import locus
 from hvdc_ident.report.drawing import bode_axes, draw_response, figure, svg
-from hvdc_ident.report.html import Section, captioned, number, table, text
+from hvdc_ident.report.html import Section, captioned, number, rows_of, shown, text
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.linear import (
     Linearisation,
@@ -23,7 +25,7 @@ from hvdc_ident.summary.linear import (
     other_lines,
     port_line,
 )
-from hvdc_ident.text import capital
+from hvdc_ident.text import capital, figures
 
 NEAREST = 5
 LINES = ("-", "--", "-.", ":")
@@ -82,8 +84,7 @@ def _modes(given: Sequence[NamedMode], fitted: LinearResult | None) -> str:
     head = ["eigenvalue, rad/s", "frequency, Hz", "damping"]
     rest = ["mode of", "states that take part", "kind"]
     if fitted is None:
-        rows = [[*_numbers(m.mode), *_words(m)] for m in given if m.mode.eigenvalue.imag >= 0]
-        return table([*head, *rest], rows, words=(3, 4, 5))
+        return rows_of([*head, *rest], ((*_numbers(m.mode), *_words(m)) for m in given if m.mode.eigenvalue.imag >= 0))
     if len(fitted.modes) != len(given):  # the fitted model has an effect with states
         return "".join(
             f"<h3>Modes at the {name} values</h3>{_modes(modes, None)}"
@@ -91,33 +92,32 @@ def _modes(given: Sequence[NamedMode], fitted: LinearResult | None) -> str:
         )
     pairs = [p for p in zip(given, fitted.modes, strict=True) if max(m.mode.eigenvalue.imag for m in p) >= 0]
     rows = [
-        [name, *_numbers(m.mode), *_words(m)]
+        (name, *_numbers(m.mode), *_words(m))
         for pair in pairs
         for name, m in zip(("given", "fitted"), pair, strict=True)
     ]
-    return table(["values", *head, *rest], rows, words=(0, 4, 5, 6))
+    return rows_of(["values", *head, *rest], rows)
 
 
-def _numbers(m: Mode) -> list[str]:
+def _numbers(m: Mode) -> tuple[Any, ...]:
     re, im = m.eigenvalue.real, m.eigenvalue.imag
     value = number(re) if im == 0 else f"{number(re)} ± {number(abs(im))}j"
-    return [value, number(m.frequency_hz), number(m.damping, 3)]
+    return Markup(value), m.frequency_hz, figures(m.damping, 3)
 
 
-def _words(m: NamedMode) -> list[str]:
+def _words(m: NamedMode) -> tuple[str, str, str]:
     part = m.mode.participation
     shares = sorted(part.items(), key=lambda item: -item[1])[:3]
     states = ", ".join(f"{n} {v:.2f}" for n, v in shares if v >= 0.05)
     name = "" if all(n in part for n in (m.name, *m.name.split(" + ")[1:])) else m.name
-    return [text(name), text(states), text(m.mode.kind)]
+    return name, states, m.mode.kind
 
 
 def _limits(point: OperatingPoint) -> str:
     near = sorted(point.margins, key=lambda x: abs(x.margin))[:NEAREST]
     held = ", ".join(f"{x.signal} at {x.level}" for x in point.active_limits) or "none"
-    rows = [[text(x.signal), text(x.kind), text(x.level), number(x.margin)] for x in near]
-    listed = table(["signal", "limit", "level", "margin"], rows, words=(0, 1, 2)) if rows else ""
-    return f"<p>Active limits: {text(held)}.{' The nearest others:' if rows else ''}</p>{listed}"
+    listed = rows_of(["signal", "limit", "level", "margin"], ((x.signal, x.kind, x.level, x.margin) for x in near))
+    return f"<p>Active limits: {text(held)}.{' The nearest others:' if near else ''}</p>{listed}"
 
 
 def _bode(found: Linearisation) -> str:
@@ -153,7 +153,7 @@ def _limit(margin: Crossing, factor: float = 1.0) -> tuple[str, str]:
     """A margin and its frequency as text; infinite is no limit."""
     if np.isinf(margin.value):
         return "unlimited", ""
-    return number(factor * margin.value), "infinite" if np.isinf(margin.omega) else number(margin.omega / (2 * np.pi))
+    return shown(factor * margin.value), "infinite" if np.isinf(margin.omega) else shown(margin.omega / (2 * np.pi))
 
 
 def _margins(found: StudyMargins | None) -> str:
@@ -161,20 +161,19 @@ def _margins(found: StudyMargins | None) -> str:
     if found is None:
         return ""
     rows = [
-        [
-            text(name),
+        (
+            name,
             *_limit(m.gain_margin),
             *(("unlimited", "") if m.lower_gain_margin.value == 0 else _limit(m.lower_gain_margin)),
             *_limit(m.phase_margin),
             _limit(m.delay, 1e3)[0],
-            number(m.modulus.value, 3),
-            number(m.disk.value, 3),
-        ]
+            shown(m.modulus.value, 3),
+            shown(m.disk.value, 3),
+        )
         for name, m in found.each.items()
     ]
     header = ["loop opened at", "gain", "at, Hz", "lower gain", "at, Hz", "phase, degrees", "at, Hz", "delay, ms"]
-    shown = table([*header, "modulus", "disk"], rows) if rows else ""
-    return f"<h3>Margins</h3>{shown}{_said(found.common_lines())}"
+    return f"<h3>Margins</h3>{rows_of([*header, 'modulus', 'disk'], rows)}{_said(found.common_lines())}"
 
 
 def _ports(ports: Sequence[PortImpedance]) -> str:
@@ -207,20 +206,13 @@ def _locus(found: RootLocus | None) -> str:
         return ""
     fig = figure(7.5, 3.6, {"left": 0.1, "right": 0.99, "bottom": 0.14, "top": 0.97})
     axes = fig.subplots()
-    for k, mode in enumerate(found.eigenvalues.T):
-        colour = SERIES[k % len(SERIES)]
-        axes.plot(mode.real, mode.imag, color=colour, linewidth=1.2)
-        axes.plot(mode.real[:1], mode.imag[:1], "o", color=colour, markersize=4)
-        axes.plot(mode.real[-1:], mode.imag[-1:], "s", color=colour, markersize=4)
+    locus(found, ax=axes)
+    axes.set_title("")  # the caption says it
     # Linear about the origin and logarithmic outside: eigenvalues lie decades apart.
     slowest = np.abs(found.eigenvalues)
     near = float(slowest[slowest > 0].min(initial=1.0))
     for scale in (axes.set_xscale, axes.set_yscale):
         scale("symlog", linthresh=near)
-    axes.axvline(0.0, color="#999999", linewidth=0.8)
-    axes.set_xlabel("real part, rad/s")
-    axes.set_ylabel("imaginary part, rad/s")
-    axes.grid(True, color="#dddddd", linewidth=0.5)
     unit = f" {text(found.unit)}" if found.unit else ""
     span = f"{text(found.parameter)} from {number(found.values[0])} (dots) to {number(found.values[-1])}{unit} (squares)"
     picture = captioned(svg(fig, f"Eigenvalues along {found.parameter}"), f"Eigenvalues along {span}.")

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from markupsafe import Markup
+
 from hvdc_ident.fit import FitResult
-from hvdc_ident.report.html import Section, folded, number, table, table_of, text
+from hvdc_ident.report.html import Section, folded, number, rows_of, shown, table_of, text
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.tables import signals_table
+from hvdc_ident.text import figures
 
 
 def _render(results: Results) -> str:
@@ -29,19 +32,19 @@ def _windows(results: Results) -> str:
     """Largest, mean and mean absolute error before, during and after the event, beside the profile's limits."""
     s = results.summary
     profile, units = s.profile, results.units
-    over: list[list[str]] = []
-    rows: list[list[str]] = []
-    unjudged: list[list[str]] = []
+    over: list[tuple[str, ...]] = []
+    rows: list[tuple[str, ...]] = []
+    unjudged: list[tuple[str, ...]] = []
     why: list[str] = []
     ends = set()
     for output, name, about in results.windows(s.about):
         ends.add(about.end_from)
         for window, w in about.by_name.items():
-            span = f"{number(w.begin, 3)} … {number(w.end, 3)}" if w.n else "–"
+            span = f"{figures(w.begin, 3)} … {figures(w.end, 3)}" if w.n else "–"
             limits = w.limits or {}
             kinds = {"max": w.max, "mean": w.mean, "mean_absolute": w.mean_absolute}
             errors = [_error(value, limits.get(kind)) for kind, value in kinds.items()]
-            row = [text(output), text(name), window, span, *errors, text(units.get(output, ""))]
+            row = (output, name, window, span, *errors, units.get(output, ""))
             {True: rows, False: over, None: unjudged}[w.within].append(row)
             if w.within is None:
                 why.append(f"{output}: {about.reason or 'no row in this window'}")
@@ -57,25 +60,18 @@ def _windows(results: Results) -> str:
     counted = (
         f"{len(rows)} windows within the limits, {len(over)} with an error above its limit, {len(unjudged)} not judged"
     )
-    above = table(head, over, words=(0, 1, 2, 7)) if over else ""
-    within = folded(f"{len(rows)} windows within the limits", table(head, rows, words=(0, 1, 2, 7))) if rows else ""
-    reasons = f"<p class='small'>{text('; '.join(dict.fromkeys(why)))}.</p>"
-    within += (
-        folded(f"{len(unjudged)} windows not judged", table(head, unjudged, words=(0, 1, 2, 7)) + reasons)
-        if unjudged
-        else ""
-    )
-    within += told
+    above = rows_of(head, over)
+    within = folded(f"{len(rows)} windows within the limits", rows_of(head, rows))
+    reasons = f"<p class='small'>{text('; '.join(dict.fromkeys(why)))}.</p>" if unjudged else ""
+    within += folded(f"{len(unjudged)} windows not judged", rows_of(head, unjudged) + reasons) + told
     if profile.get("named"):
         return f"<h3>Before, during and after the event: {counted}</h3>{above}{within}"
     return folded(f"Before, during and after the event: {counted}", above + within)
 
 
 def _error(value: float | None, limit: float | None) -> str:
-    if value is None:
-        return "–"
-    over = limit is not None and abs(value) > limit
-    return f"<strong>{number(value, 2)} &gt; {number(limit, 2)}</strong>" if over else number(value, 2)
+    over = value is not None and limit is not None and abs(value) > limit
+    return Markup(f"<strong>{number(value, 2)} &gt; {number(limit, 2)}</strong>") if over else shown(value, 2)
 
 
 def _held_out(fit: FitResult | None) -> str:
@@ -83,16 +79,13 @@ def _held_out(fit: FitResult | None) -> str:
     rows = []
     for name, line in ({} if fit is None else fit.validation).items():
         if line.status != "done":
-            rows.append([text(name), "–", "–", "–", "–", "could not be simulated at the estimates"])
-        note = "; ".join(f"{n} {number(v)} from this record itself" for n, v in line.nuisance.items())
+            rows.append((name, "–", "–", "–", "–", "could not be simulated at the estimates"))
+        note = "; ".join(f"{n} {figures(v)} from this record itself" for n, v in line.nuisance.items())
         for output, q in line.outputs.items():
-            band = q.quality.in_band
-            cells = [text(name), text(output), number(q.quality.rmse, 3), number(q.of_fit, 3)]
-            rows.append([*cells, f"{number(100.0 * band, 3)} %" if band is not None else "–", text(note)])
-    if not rows:
-        return ""
+            band = f"{figures(100.0 * q.quality.in_band, 3)} %" if q.quality.in_band is not None else "–"
+            rows.append((name, output, shown(q.quality.rmse, 3), shown(q.of_fit, 3), band, note))
     head = ["held-out experiment", "output", "RMSE", "of the fit's", "samples in the 95 % band", "note"]
-    return "<h3>Held-out experiments</h3>" + table(head, rows, words=(0, 1, 5))
+    return f"<h3>Held-out experiments</h3>{rows_of(head, rows)}" if rows else ""
 
 
 SECTION = Section(

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from markupsafe import Markup
+
 from hvdc_ident.fit.adequacy import ResidualTest, ResidualTests
 from hvdc_ident.fit.result import Goodness
-from hvdc_ident.report.html import Section, number, table, text
+from hvdc_ident.report.html import Section, number, rows_of, typeset
 from hvdc_ident.summary import Results
+from hvdc_ident.text import figures
 
 LOW = 0.01
 """A p below this is marked."""
@@ -31,8 +36,7 @@ def _render(results: Results) -> str:
     )
 
     def tested(by_output: ResidualTests, of: Goodness) -> str:
-        rows = [_row(o, e, line, of) for o, by_name in by_output.items() for e, line in by_name.items()]
-        return table(head, rows, words=(0, 1, 7))
+        return rows_of(head, (_row(o, e, line, of) for o, by_name in by_output.items() for e, line in by_name.items()))
 
     diagnosis = results.objects.diagnosis
     with_effect = {} if diagnosis is None else diagnosis.residual_tests_after
@@ -44,28 +48,19 @@ def _render(results: Results) -> str:
     )
 
 
-def _row(output: str, experiment: str, line: ResidualTest, of: Goodness) -> list[str]:
+def _row(output: str, experiment: str, line: ResidualTest, of: Goodness) -> tuple[Any, ...]:
     quality = of.outputs.get(output, {}).get(experiment)
     inputs = {n: i.p for n, i in line.inputs.items() if i.p is not None}
     least = min(inputs, key=lambda n: inputs[n], default=None)
     share = None if quality is None else quality.r2
-    return [
-        text(output),
-        text(experiment),
-        number(line.n),
-        f"{number(100.0 * share, 5 if share > 0.9 else 3)} %" if share is not None else "–",
-        _p(line.ljung_box.p),
-        _p(line.runs.p),
-        _p(inputs[least]) if least is not None else "–",
-        text(least or ""),
-    ]
+    explained = f"{figures(100.0 * share, 5 if share > 0.9 else 3)} %" if share is not None else "–"
+    tests = (line.ljung_box.p, line.runs.p, None if least is None else inputs[least])
+    return output, experiment, line.n, explained, *map(_p, tests), least or ""
 
 
-def _p(value: float | None) -> str:
-    if value is None:
-        return "–"
-    shown = number(value, 2) if value > 0 else "&lt;10<sup>−300</sup>"
-    return f"<strong>{shown}</strong>" if value < LOW else shown
+def _p(value: float | None) -> Markup:
+    p = Markup(typeset("<1e-300") if value == 0.0 else number(value, 2))
+    return Markup(f"<strong>{p}</strong>") if value is not None and value < LOW else p
 
 
 SECTION = Section(

@@ -10,10 +10,10 @@ import numpy as np
 from hvdc_ident.colours import MARK, SERIES
 from hvdc_ident.data import Array
 from hvdc_ident.report.drawing import bode_axes, draw_response, figure, svg
-from hvdc_ident.report.html import Section, captioned, number, table, text
+from hvdc_ident.report.html import Section, captioned, rows_of, text
 from hvdc_ident.sensitivity import SweepResult
 from hvdc_ident.summary import Results
-from hvdc_ident.text import with_unit
+from hvdc_ident.text import figures, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,12 +46,12 @@ def _render(results: Results) -> str:
 def _best(found: SweepResult) -> str:
     rows = []
     for line in found.bests:
-        extremes = [number(line.smallest, 3), number(line.largest, 3)]
+        extremes = [figures(line.smallest, 3), figures(line.largest, 3)]
         flat = extremes[0] == extremes[1]  # of a flat line none is the best
-        at = ["–" if flat else number(v, 5) for v in line.at.values()]
-        rows.append([text(line.output), text(line.experiment), *at, *extremes, text(line.unit)])
-    header = ["output", "experiment", *(f"best {text(n)}" for n in found.parameters), "smallest RMSE", "largest", "unit"]
-    return table(header, rows, words=(0, 1, len(header) - 1)) if rows else ""
+        at = ["–" if flat else figures(v, 5) for v in line.at.values()]
+        rows.append((line.output, line.experiment, *at, *extremes, line.unit))
+    header = ["output", "experiment", *(f"best {n}" for n in found.parameters), "smallest RMSE", "largest", "unit"]
+    return rows_of(header, rows)
 
 
 def _figures(found: SweepResult, name: str, rows: Array) -> str:
