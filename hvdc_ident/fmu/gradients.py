@@ -16,7 +16,6 @@ from hvdc_ident.fmu.differences import (
     SHORT_STEP,
     SUFFICIENT,
     Differences,
-    DifferenceStep,
     Line,
     difference,
     difference_pair,
@@ -28,7 +27,6 @@ from hvdc_ident.fmu.differences import (
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.fmu.worker_pool import WorkerPool
 
-STEPS_KEPT = 1000  # of differences, and noise levels, that a pool remembers
 LOST_IN_NOISE = 0.5  # relative error from which a derivative is not distinguished from noise
 START_STEP = 1e-3  # of differences of the initial state by a parameter, in its sizes
 CONFIRMING_STEP = 1e-3  # of the differences that confirm directional derivatives, in sizes of the parameter
@@ -206,7 +204,7 @@ class Differentiation:
             if (step := steps.get(key)) is not None:
                 return (yield from difference(line, step)), step.error
             rows, step = yield from first_difference(line, noise)
-            _keep(steps, key, step)
+            steps[key] = step
             return rows, step.error
 
         return together([column(v) for v in varied], self._rows)
@@ -227,11 +225,10 @@ class Differentiation:
                 run = v.moved(run, v.value + side * steps * SHORT_STEP * v.size)
             return run
 
-        known = self.pool.noise.get(self.noise_key)
-        if known is None:
-            (known,) = together([noise_of(displaced, outputs)], self._rows)
-            _keep(self.pool.noise, self.noise_key, known)
-        return known
+        known = self.pool.noise
+        if self.noise_key not in known:
+            (known[self.noise_key],) = together([noise_of(displaced, outputs)], self._rows)
+        return known[self.noise_key]
 
     # --- by sensitivity equations ---
 
@@ -319,8 +316,3 @@ class Differentiation:
         inputs = np.array([run.signals.at(run.time[:1], "left")[0] for run in runs])
         heading = {"do": "initial", "values": [run.values for run in runs], "time": float(self.run.time[0])}
         return list(self.pool.ask({**heading, "tolerance": self.run.tolerance}, {"u": inputs})[1]["states"])
-
-
-def _keep(known: dict[bytes, DifferenceStep] | dict[bytes, Array], key: bytes, value: DifferenceStep | Array) -> None:
-    if len(known) < STEPS_KEPT:
-        known[key] = value  # type: ignore[assignment]

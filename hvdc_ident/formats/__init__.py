@@ -112,8 +112,9 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
     file = _usable_file(path)
     wanted = [signals] if isinstance(signals, str) else None if signals is None else list(signals)
     found = _format_of(file).read(file, wanted)
+    check_times(found.time, file)
+    found = once(found)
     _check(found, file)
-    found = found if found.origin.rows else replace(found, origin=replace(found.origin, rows=len(found)))
     units = _units(list(zip(found.names, found.units, strict=True)))
     return _from_first_row(replace(found, units=tuple(unit for _, unit in units)))
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from hvdc_ident.data import Array, Origin, Trajectory, scaled, seconds_of
 from hvdc_ident.errors import WaveformError
-from hvdc_ident.formats import LONGEST, TOP, event_rows, once, pick, unit_since_1970
+from hvdc_ident.formats import LONGEST, TOP, event_rows, pick, unit_since_1970
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
 from hvdc_ident.formats._labels import is_date_name, merged, names_and_units, time_column, unit_in_name
 from hvdc_ident.formats._text import WIDE, encoding_of
@@ -132,7 +132,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "", notes=notes)
     time = table[:, 0] - table[0, 0] if dated else table[:, 0]
     time = scaled(time, layout.scale)
-    return once(Trajectory(time, table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]), origin))
+    return Trajectory(time, table[:, 1:], names, tuple(layout.units[i] for i in columns[1:]), origin)
 
 
 def _layout(path: Path) -> _Layout:

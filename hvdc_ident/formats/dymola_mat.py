@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Origin, Trajectory
-from hvdc_ident.formats import check_times, once, pick
+from hvdc_ident.formats import check_times, pick
 from hvdc_ident.formats._columns import check_size, damaged
 from hvdc_ident.formats._text import decoded
 
@@ -101,7 +101,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         columns = _resampled(result, int(number), np.abs(signed) - 1, time, path)
         values[:, places] = columns * np.sign(signed)
     names, units = tuple(result.names[i] for i in wanted), tuple(result.units[i] for i in wanted)
-    return once(Trajectory(time, values, names, units, Origin(time_unit="s")))
+    return Trajectory(time, values, names, units, Origin(time_unit="s"))
 
 
 def _open(path: Path) -> _Result:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.formats import pick
-from hvdc_ident.formats._columns import check_size, checked, damaged, instants, package, time_name
+from hvdc_ident.formats._columns import check_size, damaged, instants, package, time_name
 
 NAME = "parquet"
 SUMMARY = "Parquet tables with a column `time`"
@@ -41,7 +41,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     columns = [np.asarray(table.column(names[i]).to_numpy(), dtype=float) for i in wanted]
     values = np.column_stack(columns) if columns else np.empty((time.size, 0))
     found = tuple(names[i] for i in wanted), tuple(units[i] for i in wanted)
-    return checked(Trajectory(time, values, *found, origin), path)
+    return Trajectory(time, values, *found, origin)
 
 
 def write(trajectory: Trajectory, path: Path) -> None:

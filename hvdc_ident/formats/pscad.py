@@ -18,7 +18,7 @@ import numpy as np
 from hvdc_ident.data import Array, Origin, Trajectory
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import TOP, pick
-from hvdc_ident.formats._columns import check_size, checked, damaged, own_names
+from hvdc_ident.formats._columns import check_size, damaged, own_names
 from hvdc_ident.formats._text import decoded
 
 NAME = "pscad"
@@ -77,7 +77,7 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     check_size(len(first), len(wanted), path)
     values = np.column_stack([tables[(c.number - 1) // _PER_FILE][:, (c.number - 1) % _PER_FILE + 1] for c in wanted])
     names, units = tuple(c.name for c in wanted), tuple(c.unit for c in wanted)
-    return checked(Trajectory(first[:, 0], values, names, units, Origin(time_unit="s")), path)
+    return Trajectory(first[:, 0], values, names, units, Origin(time_unit="s"))
 
 
 def files(path: Path) -> list[Path]:

@@ -178,7 +178,8 @@ def test_an_fmu_that_can_be_made_once_is_checked_and_run_by_resets(tmp_path, ver
     found.pool.close()
 
 
-def test_a_reset_that_keeps_a_parameter_which_the_fmu_moved_itself_restores_its_value(tmp_path):
+@pytest.mark.parametrize("first", ["run", "point"])
+def test_a_reset_that_keeps_a_parameter_which_the_fmu_moved_itself_restores_its_value(tmp_path, first):
     """The mass moves with each question for its derivative, and a reset restores the states alone."""
     kept = "#define AT_RESET M->r[0] = M->r[1] = 0; return 0\n"
     found = read_fmu(
@@ -186,8 +187,9 @@ def test_a_reset_that_keeps_a_parameter_which_the_fmu_moved_itself_restores_its_
     )
     simulate(found, STEP)
     assert found.pool.learned["restart"] == "reset"
-    point = at_point(found, {"u": 0.5, "k": 6.0}, np.array([0.4, 0.0]), ["twice"], ["k", "m"])
-    assert point.jacobian[:, 3:] == pytest.approx(np.array([[0.0, 0.0], [0.05, -0.15], [0.0, 0.0]]), abs=1e-6)
+    if first == "point":
+        point = at_point(found, {"u": 0.5, "k": 6.0}, np.array([0.4, 0.0]), ["twice"], ["k", "m"])
+        assert point.jacobian[:, 3:] == pytest.approx(np.array([[0.0, 0.0], [0.05, -0.15], [0.0, 0.0]]), abs=1e-6)
     run = simulate(found, STEP, {}, ["m", "k"])
     assert run.notes["sensitivities"] == "differences of runs: m; directional derivatives: k"
     assert np.abs(run["y"] - response(STEP.time)).max() < 2e-7
