@@ -112,6 +112,7 @@ enum {
     INT(first)     /* the first segment */                                                                                     \
     INT(fresh)     /* the first stage holds the derivative at (t, y) */                                                        \
     INT(again)     /* the step before was rejected: what was computed at (t, y) stands */                                      \
+    INT(factored)  /* how the step's matrix is factored: 1 by the generated elimination, 2 by dense partial pivoting */         \
     INT(last)      /* this step ends at the segment's end */                                                                   \
     INT(echo_now) INT(disturbed) INT(published) /* what happened at the present break */
 

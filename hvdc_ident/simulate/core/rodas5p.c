@@ -49,31 +49,33 @@ static void rodas_prepare(run *r, integer stage)
 #undef STAGE
 }
 
-/* Factor M/(h gamma) - J: 1 by the generated elimination, 2 by dense partial pivoting, 0 if it is singular.
+/* Factor M/(h gamma) - J. Returns false if it is singular.
 
    The generated one takes its pivots as they come: it is trusted where none is small against its row. */
-static int rodas_factor(run *r)
+static bool rodas_factor(run *r)
 {
     integer n = r->n;
     double shift = 1.0 / (r->hs * RODAS_GAMMA);
     r->shift[0] = shift;
     if (r->factors) {
         r->do_lu(r->jac, r->yd, r->shift, r->yd, r->yd, r->m, r->factor);
-        if (r->factor[r->factors] < 1e7)
-            return 1;
+        r->factored = r->factor[r->factors] < 1e7 ? 1 : 0;
+        if (r->factored)
+            return true;
     }
     for (integer q = 0; q < n * n; q++)
         r->matrix[q] = -r->jac[q];
     for (integer i = 0; i < r->nx; i++)
         r->matrix[i * n + i] += shift;
-    return lu(r->matrix, r->pivots, n) ? 2 : 0;
+    r->factored = lu(r->matrix, r->pivots, n) ? 2 : 0;
+    return r->factored > 0;
 }
 
-/* From the right-hand side in k to the stage, with the factors of that kind; to the right-hand side comes r->add. */
-static void rodas_solve(run *r, int kind, double *k)
+/* From the right-hand side in k, to which comes r->add, to the stage. */
+static void rodas_solve(run *r, double *k)
 {
     integer n = r->n, width = r->width;
-    if (kind == 1) {
+    if (r->factored == 1) {
         r->do_solve(r->add, r->hessian, r->w, r->wd, r->factor, r->m, k);
         return;
     }
@@ -105,24 +107,21 @@ static void rodas_dense(run *r)
     }
 }
 
-/* The error of the step's quartic near its beginning, over the first `rows` unknowns.
+/* Write into r->e by how much the step's quartic is off at x in 0..1, as its defect tells; leaves its point there in r->u.
 
-   A step may be much longer than a fast mode, and right at its end, while the mode has still to begin: to go from rest to where it
-   stays while an input ramps. Once begun it is where the step takes it to be. Leaves the quartic in r->dense. */
-static double rodas_inside(run *r, int kind, integer rows)
+   What follows an input at once is right at the end of a step however long that is, and in between only as far as a quartic can be.
+   Needs r->dense and the step's factors. */
+static void rodas_defect(run *r, double x)
 {
-    double x = 0.1, inverse = 1.0 / r->hs;
-    rodas_dense(r);
-    interpolate(r, x, r->size, r->u);
     const double *restrict a = r->dense, *restrict b = a + r->stride, *restrict c = b + r->stride, *restrict d = c + r->stride;
     const double *restrict mass = r->mass;
-    double *restrict add = r->add;
+    double *restrict add = r->add, inverse = 1.0 / r->hs;
+    interpolate(r, x, r->size, r->u);
     EACH(i, r->stride)
         add[i] = -mass[i] * inverse * (a[i] + x * (2 * b[i] + x * (3 * c[i] + x * 4 * d[i])));
     outside(r, r->t + x * r->hs, r->t);
     evaluate(r, r->do_rhs, r->u, r->e);
-    rodas_solve(r, kind, r->e);
-    return error_norm(r, r->e, rows);
+    rodas_solve(r, r->e);
 }
 
 /* One step into r->yn. Returns the error over the first `rows` unknowns. */
@@ -136,8 +135,7 @@ static double rodas_step(run *r, integer rows)
         if (r->hessians)
             evaluate(r, r->do_hess, r->y, r->hessian);
     }
-    int kind = rodas_factor(r);
-    if (kind == 0)
+    if (!rodas_factor(r))
         return INFINITY;
     r->evaluations += 8;
     for (integer stage = 0; stage < 8; stage++) {
@@ -146,12 +144,19 @@ static double rodas_step(run *r, integer rows)
         rodas_prepare(r, stage);
         double *k = r->k + r->stride * stage;
         evaluate(r, r->do_rhs, stage ? r->u : r->y, k);
-        rodas_solve(r, kind, k);
+        rodas_solve(r, k);
     }
     const double *restrict error = r->k + r->stride * 7, *restrict u = r->u;
     double *restrict yn = r->yn;
     EACH(i, r->stride)
         yn[i] = u[i] + error[i];
     double size = error_norm(r, error, rows);
-    return r->fresh && size <= 1.0 ? fmax(size, rodas_inside(r, kind, rows)) : size;
+    if (r->fresh && size <= 1.0) {
+        /* A step from rest may be much longer than a fast mode, which has still to go where it stays while an input ramps: the
+           quartic begins beside that. Once there it stays there. */
+        rodas_dense(r);
+        rodas_defect(r, 0.1);
+        size = fmax(size, error_norm(r, r->e, rows));
+    }
+    return size;
 }
