@@ -5,7 +5,7 @@ import pytest
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
-from hvdc_ident.model import Delay, Model
+from hvdc_ident.model import Delay, Model, Sampled
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from tests.simulate.reference import Reference, sided
@@ -116,3 +116,29 @@ def test_a_first_step_over_many_time_constants_is_exact_within():
     run = simulate(model, case, {}, rtol=rtol, method="rosenbrock")
     behind = np.clip(time - 0.1, 0.0, None)
     np.testing.assert_allclose(run["x"], behind - T * (1 - np.exp(-behind / T)), rtol=0, atol=rtol * 0.1)
+
+
+@pytest.mark.parametrize("method", ["explicit", "rosenbrock"])
+def test_a_sample_that_a_delay_brings_back_moves_with_the_sampling_period(method):
+    """x' = q(t - 0.07), with q a ramp sampled every T: each step of it comes k T + 0.07 after the start."""
+    T, lag, slope = 0.13, 0.07, 1.7
+
+    def x(t, T):
+        edges = np.arange(20) * T + lag
+        return sum(slope * T * np.maximum(t - edge, 0.0) for edge in edges[1:])
+
+    model = Model(
+        "computer",
+        parameters={"T": T},
+        inputs={"u": 0.0},
+        states={"x": {"derivative": "late", "start": 0.0}},
+        sampled={"q": Sampled("u", "T")},
+        delays={"late": Delay("q", lag)},
+        outputs={"x": "x"},
+    )
+    time = np.linspace(0.0, 0.99, 34)
+    run = simulate(model, experiment("ramp", time, {"u": InputSignal.ramp(0.0, 0.0, 1.0, slope)}), {}, ["T"], method=method)
+    np.testing.assert_allclose(run["x"], x(time, T), rtol=0, atol=RTOL)
+    slopes = (x(time, T + 1e-6) - x(time, T - 1e-6)) / 2e-6
+    away = np.abs((time - lag) / T - np.round((time - lag) / T)) > 1e-4
+    np.testing.assert_allclose(run.gradient("x")[away, 0], slopes[away], rtol=0, atol=1e-7)

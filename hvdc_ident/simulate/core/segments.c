@@ -181,6 +181,8 @@ static bool publish_samples(run *r)
         if (width) {
             evaluate(r, r->do_f, r->y, r->f_after);
             shift_rows(r, r->f_before, r->f_after, r->publish_p + i * width);
+            for (integer c = 0; c < width; c++)
+                r->jump_p[c] = r->publish_p[i * width + c]; /* for what a delay brings back of it */
         }
         r->publish[i] = INFINITY;
         r->published = 1;
