@@ -86,6 +86,9 @@ class Modes:
             return 1 - sp.Mul(*(1 - self.condition(a) for a in c.args))
         if isinstance(c, sp.Not):
             return 1 - self.condition(c.args[0])
+        if isinstance(c, sp.logic.boolalg.ITE):
+            first, yes, no = map(self.condition, c.args)
+            return first * yes + (1 - first) * no
         a, b = (self.of(x) for x in c.args)
         return self.negative(a - b) if isinstance(c, (sp.StrictLessThan, sp.LessThan)) else self.negative(b - a)
 
