@@ -86,6 +86,9 @@ class Modes:
             return 1 - sp.Mul(*(1 - self.condition(a) for a in c.args))
         if isinstance(c, sp.Not):
             return 1 - self.condition(c.args[0])
+        if isinstance(c, sp.logic.boolalg.ITE):
+            first, yes, no = map(self.condition, c.args)
+            return first * yes + (1 - first) * no
         a, b = (self.of(x) for x in c.args)
         return self.negative(a - b) if isinstance(c, (sp.StrictLessThan, sp.LessThan)) else self.negative(b - a)
 
@@ -302,6 +305,16 @@ class Hybrid:
         self.before = w[first : first + self.nd].copy(), rows[n : n + self.nd]
         self.held = w[first + self.nd :].copy(), rows[n + self.nd :].copy()
         return np.concatenate([y[:nx], rows[:nx].ravel()])
+
+    def rests(self, y):
+        """Whether states, unknowns and held values solve the equations of the start, in the modes that they say."""
+        n, w = self.nx + self.nz, np.zeros(self.first + self.nd + self.nq)
+        w[1 : self.first], w[self.first :] = [points[0][1] for points in self.points], y[n:]
+        m = np.zeros(self.ns)
+        for _ in range(self.ns + 1):
+            m = (self.switch.value(y[:n], w, self.p, m) < 0).astype(float)
+        r, by_y, by_w, _ = self.rest.all(y[:n], w, self.p, m)
+        return np.abs(np.linalg.solve(np.hstack([by_y, by_w[:, self.first :]]), r)).max() < 1e-7
 
     def shifted(self, v, before, after, instant):
         """The states' rows after a jump of the rates at an instant with these derivatives by the parameters."""

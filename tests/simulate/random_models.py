@@ -17,12 +17,14 @@ from hvdc_ident.expression import clip, deadband, nonwindup, symbol, where
 from hvdc_ident.expression.blocks import table
 from hvdc_ident.model import Delay, Model, Sampled, Signal, State
 from hvdc_ident.simulate import simulate
-from tests.simulate.hybrid import Hybrid
+from tests.simulate.hybrid import Hybrid, Undecided
 
 END = 1.0
 ALLOWED = 100.0
 """Largest error allowed, of rtol and of the largest value (or derivative): each of some hundreds of steps may add an error of rtol,
 and most of it dies out; between the ends of steps what follows a ramp at once is less exact."""
+BY_DELAY = 30.0
+"""How much more the derivative by a parameter of a delay's time may be off: it has the slope of the delayed signal's dense output."""
 KINDS = ("plain", "plain", "delay", "sampled", "both", "stiff")
 FAST = 2e-4  # s; a shorter time constant makes a model stiff
 
@@ -191,7 +193,7 @@ def cases(draw, most=8, kinds=KINDS):
         outputs=outputs,
     )
     points = tuple(draw(corners()) for _ in inputs)
-    method = draw(st.sampled_from(("auto", "rosenbrock", "rosenbrock" if nz else "explicit")))
+    method = draw(st.sampled_from(("auto", "rosenbrock", "rosenbrock" if nz or fastest < FAST else "explicit")))
     return Case(
         model, points, tuple(values), draw(st.sampled_from((1e-8, 1e-6, 1e-10))), method,
         fastest < FAST,
@@ -213,20 +215,18 @@ def difference(case, rtol=None):
     rtol = case.rtol if rtol is None else rtol
     spread = np.random.default_rng(7).uniform(0.0, END, 60)
     time = np.concatenate([[0.0], np.sort(spread), [END]])
+    reference = Hybrid(case.model, case.names, fast=case.fast, rtol=min(1e-11, rtol * 1e-2))
     with np.errstate(all="ignore"):
-        theirs, rows, events = Hybrid(case.model, case.names, fast=case.fast, rtol=min(1e-11, rtol * 1e-2)).run(
-            case.points, time
-        )
-    return compared(case, rtol, time, theirs, rows, events)
-
-
-def compared(case, rtol, time, theirs, rows, events):
-    """The difference of a run of the engine from a known answer."""
+        theirs, rows, events = reference.run(case.points, time)
     inputs = {
         n: InputSignal.corners(p) if len(p) > 1 else InputSignal.constant(p[0][1])
         for n, p in zip(case.model.inputs, case.points, strict=True)
     }
     mine = simulate(case.model, experiment("random", time, inputs), {}, case.names, rtol=rtol, method=case.method)
+    inner = [f"y_{n}" for n in (*case.model.states, *case.model.algebraic, *case.model.delays, *case.model.sampled)]
+    begun = np.array([mine[n][0] for n in inner])
+    if np.abs(begun - theirs[0, : begun.size]).max() > 1e-4 and reference.rests(begun):
+        raise Undecided("there are several steady states")
     # Beside an event a value or a derivative may be that of its other side.
     away = np.ones(time.size, dtype=bool)
     for t in events:
@@ -239,6 +239,7 @@ def compared(case, rtol, time, theirs, rows, events):
         for j, parameter in enumerate(case.names):
             largest = max(np.abs(rows[:, k, j]).max(), 0.1 * size)
             error = np.abs(mine.gradients[:, k, j] - rows[:, k, j])[away] / largest
+            error /= BY_DELAY if any(d.time.has(symbol(parameter)) for d in case.model.delays.values()) else 1.0
             errors.append((error.max() / rtol, name, parameter, time[away][np.argmax(error)]))
     values = max((e for e in errors if not e[2]), key=lambda e: e[0])
     slopes = max((e for e in errors if e[2]), key=lambda e: e[0])

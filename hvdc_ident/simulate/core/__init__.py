@@ -10,6 +10,7 @@ import ctypes
 import re
 from collections.abc import Sequence
 from functools import cache
+from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -145,7 +146,7 @@ class SteadyEquations:
             p.size,
             switches,
         )
-        ends = np.cumsum(lengths).tolist()
+        ends = list(accumulate(lengths))
         block = np.zeros(ends[-1] + 1)  # never empty, so that it has an address
         self.y, self.w, self.wd, self.p, self.m = (block[e - k : e] for k, e in zip(lengths, ends, strict=True))
         self.w[:first], self.p[:] = values, p

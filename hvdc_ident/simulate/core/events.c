@@ -36,19 +36,19 @@ static void widen(run *r)
 
 /* The switch that is furthest beyond its mode at a share of the present step, or NONE.
 
-   Where a switch is near 0 the point of the dense output is made exact as far as its defect tells, or always, where `exact`: while a
-   play is pulled, the switch that lets it go is 1e-7 of a speed, and what is pulled is no quartic. */
+   Where a switch is near 0 the point of the dense output is corrected by its defect, and looked at again: while a play is pulled, the
+   switch that lets it go is 1e-7 of a speed, and what is pulled is no quartic. exact: the corrected point alone decides; else what
+   either says. */
 static integer violation_at(run *r, double share, bool exact)
 {
     interpolate(r, share, r->n, r->u);
     outside(r, r->t + share * r->hs, r->t);
     integer which = violation(r, r->u);
-    if (!r->rosenbrock)
-        return which;
+    bool near = exact;
     for (integer k = 0; k < r->ns; k++)
-        exact = exact || fabs(r->sv[k]) < 0.1 * r->top[k];
-    if (which == NONE && !exact)
-        return NONE;
+        near = near || fabs(r->sv[k]) < 0.1 * r->top[k];
+    if (!r->rosenbrock || !near || (which != NONE && !exact))
+        return which;
     rodas_defect(r, share);
     EACH(i, r->n)
         r->u[i] += r->e[i];
