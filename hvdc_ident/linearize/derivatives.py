@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.delays import Blocks, SchurComplement, channels, eliminate
+from hvdc_ident.linearize.delays import channels, without_unknowns
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array, CompiledSystem
@@ -27,10 +27,10 @@ def constants(model: Model) -> list[str]:
     return [n for n, s in model.states.items() if n in given and s.is_reference]
 
 
-def eliminated(
-    model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, side: Side, pade_order: int
-) -> tuple[Array, Array, Blocks, SchurComplement]:
-    """Return the switches' modes, the Jacobian, its blocks with delays, and these without the algebraic unknowns.
+def jacobian_at(
+    model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, side: Side = "refuse"
+) -> tuple[Array, Array]:
+    """Return the switches' modes and the Jacobian (main rows, columns) at a point given by its vectors.
 
     Raises LinearizationError on a kink, and where an entry of the Jacobian is not finite.
     """
@@ -39,13 +39,15 @@ def eliminated(
     if not np.isfinite(jac).all():
         raise _not_finite(s, jac, model.name)
     _refuse_flat_roots(s, y, w, p, modes, model.name)
-    parts = Blocks(s, channels(model, s, p), pade_order)
-    return modes, jac, parts, eliminate(parts.matrix(jac), parts.rows, parts.columns)
+    return modes, jac
 
 
 def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Array:
-    """Return A, (states, states), at a point given by its vectors, without states that never move. Raises as `linearize` does."""
-    _, _, parts, reduced = eliminated(model, s, y, w, p, "refuse", PADE_ORDER)
+    """Return A, (states, states), of a model without delays at a point given by its vectors, without states that never move.
+
+    Raises as `linearize` does.
+    """
+    reduced = without_unknowns(s.layout, jacobian_at(model, s, y, w, p)[1], [], ())
     if reduced.condition > WELL_POSED:
         raise LinearizationError(
             "the algebraic part is ill-conditioned",
@@ -53,8 +55,8 @@ def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) 
             got=f"condition number {reduced.condition:.2g}",
             hint="use linearize(), which keeps it as a descriptor",
         )
-    constant = [s.states.index(n) for n in constants(model)]
-    return np.delete(np.delete(reduced.result[: parts.n, : parts.n], constant, 0), constant, 1)
+    n, constant = s.layout.nx, [s.states.index(k) for k in constants(model)]
+    return np.delete(np.delete(reduced.result[:n, :n], constant, 0), constant, 1)
 
 
 def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Characteristic:
@@ -62,14 +64,10 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
 
     Raises as `linearize` does.
     """
-    modes = modes_at(s, y, w, p, "refuse")
-    jac = s.jacobian(y, w, p, modes)[: s.layout.main]
-    if not np.isfinite(jac).all():
-        raise _not_finite(s, jac, model.name)
-    _refuse_flat_roots(s, y, w, p, modes, model.name)
     found = channels(model, s, p)
     closed = [k for k, c in enumerate(found) if c.total == 0.0]
-    return Characteristic.of(s.layout, jac, list(range(s.layout.nu)), found, closed)
+    reduced = without_unknowns(s.layout, jacobian_at(model, s, y, w, p)[1], list(range(s.layout.nu)), closed)
+    return Characteristic.of(reduced, s.layout.nx, tuple(c for c in found if c.total > 0.0))
 
 
 def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:
