@@ -8,7 +8,7 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.delays import channels, without_unknowns
-from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
+from hvdc_ident.linearize.limits import in_use, structure_roots
 from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array, CompiledSystem
 from hvdc_ident.model import Model
@@ -76,7 +76,7 @@ def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: A
     if not flat:
         return
     g = s.structure.graph
-    used = nodes_in_use(s.structure, structure_roots(s.structure), modes > 0.5)
+    used, _ = in_use(s.structure, structure_roots(s.structure), modes > 0.5)
     for n in set(flat) & used:
         if _moves(s, g.nodes[n][1], modes):
             names = [name for name, k in s.structure.nodes.items() if k == n]
@@ -90,7 +90,7 @@ def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: A
 def _moves(s: CompiledSystem, node: int, modes: Array) -> bool:
     """Return whether a node's value comes from more than the parameters, which stay where they are."""
     nodes = s.structure.graph.nodes
-    inner = nodes_in_use(s.structure, [node], modes > 0.5)
+    inner, _ = in_use(s.structure, [node], modes > 0.5)
     return any(nodes[k][0] == "leaf" and nodes[k][1] != "p" for k in inner)
 
 
@@ -104,7 +104,7 @@ def modes_at(s: CompiledSystem, y: Array, w: Array, p: Array, side: Side) -> Arr
     near = np.flatnonzero(np.abs(values) <= ON_KINK)
     if near.size == 0:
         return modes
-    used = in_use(s.structure, structure_roots(s.structure), values < 0.0)
+    _, used = in_use(s.structure, structure_roots(s.structure), values < 0.0)
     switches = s.structure.graph.switches
     kinks = [k for k in near if k in used and _moves(s, switches[k], modes) and _matters(s, y, w, p, modes, int(k))]
     if kinks and side == "refuse":

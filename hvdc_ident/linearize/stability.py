@@ -95,6 +95,11 @@ class Characteristic:
         matrix, given, read, through = quartered(reduced.result, nx + len(channels))
         return cls(matrix, nx, channels, given, read, through)
 
+    @classmethod
+    def rational(cls, a: Array, b: Array, c: Array, d: Array) -> Characteristic:
+        """Return the equation of a state space without delays."""
+        return cls(a, a.shape[0], (), b, c, d)
+
     def without_zero_delays(self) -> Characteristic:
         """Return the equation in which what a delay of 0 s gives is what it gets. Raises LinearizationError for a loop of gain 1."""
         closed = [self.nx + k for k, c in enumerate(self.channels) if c.total == 0.0]
@@ -402,6 +407,11 @@ class Stability(Coded):
     rightmost: complex | None
     reason: str = ""
     method: str = EIGENVALUES
+
+    @property
+    def stable(self) -> bool | None:
+        """True where it is stable, None where that is not decided; on the limit it is not."""
+        return None if self.verdict == "not decided" else self.verdict == "stable"
 
     @property
     def count_text(self) -> str:
