@@ -11,8 +11,8 @@ from hvdc_ident.errors import LinearizationError, SteadyStateError, require_know
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.delays import Approximants, Channel, channels, without_unknowns, without_unknowns_along
 from hvdc_ident.linearize.derivatives import PADE_ORDER, WELL_POSED, Side, constants, jacobian_at
-from hvdc_ident.linearize.equilibrium import EquilibriumSearch, Root, solved, weights
-from hvdc_ident.linearize.kinds import LinearOptions, PointOptions
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions, Root, solved, weights
+from hvdc_ident.linearize.kinds import LinearOptions
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.point import Branch, OperatingPoint
 from hvdc_ident.linearize.stability import Change, Characteristic, quartered
@@ -30,9 +30,7 @@ class EquationModel:
     def point(self, asked: PointOptions) -> OperatingPoint:
         """Return an operating point: of inputs and parameters alone the steady state that a simulation starts from."""
         model = self.model
-        search = EquilibriumSearch.of_model(
-            model, asked.fixed, asked.free, asked.bounds, at=asked.at, moving=asked.moving, time=asked.time
-        )
+        search = EquilibriumSearch.of_model(model, asked)
         if search.is_plain and not asked.guess:
             return OperatingPoint.of(model, search, *steady(model, search))
         own = _own(model, search)

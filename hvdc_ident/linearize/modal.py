@@ -20,7 +20,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import delayed_modes
 from hvdc_ident.linearize.delayed_locus import crossings, followed
 from hvdc_ident.linearize.derivatives import characteristic, state_matrix
-from hvdc_ident.linearize.equilibrium import EquilibriumSearch
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions
 from hvdc_ident.linearize.jacobian import steady
 from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles
 from hvdc_ident.linearize.mode import Mode, kind_of_mode
@@ -273,7 +273,7 @@ class _Along:
         self.model, self.parameter = model, parameter
         own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
         start = {parameter: own.value}
-        self._search = EquilibriumSearch.of_model(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
+        self._search = EquilibriumSearch.of_model(model, PointOptions({**start, **fixed}))
         names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
         self._place = names.index(parameter)
 

@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from hvdc_ident.errors import SteadyStateError, require_known, unknown_name
-from hvdc_ident.linearize.equilibrium import At
+from hvdc_ident.linearize.equilibrium import At, PointOptions
 from hvdc_ident.linearize.jacobian import EquationModel
-from hvdc_ident.linearize.kinds import Kind, LinearOptions, PointOptions
+from hvdc_ident.linearize.kinds import Kind, LinearOptions
 from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.system import Array, system
 from hvdc_ident.model import AnyModel, Model
