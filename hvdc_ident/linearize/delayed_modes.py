@@ -10,7 +10,7 @@ from hvdc_ident.errors import LinearizationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.characteristic import Part
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.mode import Mode
+from hvdc_ident.linearize.mode import Mode, kind_of_mode
 from hvdc_ident.linearize.stability import ZERO, Change, Characteristic, sliding_means
 from hvdc_ident.linearize.system import Array
 
@@ -142,14 +142,6 @@ def _slope(
 
 def _kind(equation: Characteristic, root: complex, right: Array, left: Array, zero: float) -> str:
     """Return the kind of a mode that is not a sliding mean."""
-    if abs(root) > zero:
-        if root.imag:
-            return "oscillation" if root.real <= 0 else "growing oscillation"
-        return "decay" if root.real < 0 else "growth"
     driven = np.abs(left @ equation.given).max(initial=0.0) > 1e-9 * np.abs(equation.given).max(initial=1e-300)
     seen = np.abs(equation.read @ right).max(initial=0.0) > 1e-9 * np.abs(equation.read).max(initial=1e-300)
-    if driven and seen:
-        return "free integrator"
-    if driven:
-        return "angle reference or unobserved integrator"
-    return "undriven integrator" if seen else "hidden integrator"
+    return kind_of_mode(root, zero, bool(driven), bool(seen))

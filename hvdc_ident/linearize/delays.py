@@ -1,7 +1,7 @@
 """Elimination of algebraic unknowns, and delays and sampled blocks of a linear model: Pade approximants and exact responses.
 
-`without_unknowns` is a linear model before its delays are approximated, from which its exact characteristic equation is made;
-`Blocks` is the matrix over states, inputs and unknowns in which Pade states stand for the delays.
+`without_unknowns` gives a linear model before its delays are approximated, from which its exact characteristic equation is made;
+`Approximants` put Pade states in the place of the delays.
 """
 
 from __future__ import annotations
@@ -203,88 +203,70 @@ def without_unknowns_along(size: Layout, jac: Array, djac: Array, inputs: list[i
     return reduced.derivative(d[:, :r, :c], d[:, :r, c:], d[:, r:, :c], d[:, r:, c:])
 
 
-class Blocks:
-    """Matrix that is reduced to a linear model, and the places of its rows and columns.
+@dataclass(frozen=True, eq=False)
+class Approximants:
+    """Pade approximants of delays and sampled blocks: q' = a q + b w and v = c q + d w for their inputs w and outputs v.
 
-    Rows and columns: states, Pade states, inputs or outputs, unknowns, delayed values.
+    A delay of 0 s has no state: what it gives is what it gets.
     """
 
-    def __init__(self, s: CompiledSystem, found: tuple[Channel, ...], order: int) -> None:
-        self.size, self.channels, self.order = s.layout, found, order
-        self.pade = pade(order) if found else (np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0)
-        self.closed = tuple(k for k, c in enumerate(found) if c.total == 0.0)
-        self.approximated = tuple(k for k, c in enumerate(found) if c.total > 0.0)
-        self.n_pade = order * len(self.approximated)
-        self.n = self.size.nx + self.n_pade
-        self.rows, self.columns = self.n + self.size.no, self.n + self.size.nu
+    a: Array
+    b: Array
+    c: Array
+    d: Array
+    channels: tuple[Channel, ...]
+    order: int
 
-    def spread(self, jac: Array) -> Array:
-        """Return the Jacobian's rows f, outputs, g and columns [x, Pade, u, z, e] in place; Pade and delay rows are 0."""
-        z, k = self.size, self.n_pade
-        total = np.zeros((*jac.shape[:-2], z.nx + k + z.no + z.nz + z.ne, z.nx + k + z.nu + z.nz + z.ne))
-        rows = [*range(z.nx), *range(z.n + z.ne, z.main), *range(z.nx, z.n)]
-        to_rows = [*range(z.nx), *range(self.n, self.n + z.no + z.nz)]
-        columns = [*range(z.nx), *range(z.n, z.n + z.nu), *range(z.nx, z.n), *range(z.n + z.nu, z.columns)]
-        to_columns = [*range(z.nx), *range(self.n, self.n + z.nu + z.nz + z.ne)]
-        total[..., np.array(to_rows)[:, None], to_columns] = jac[..., np.array(rows)[:, None], columns]
-        return total
+    @classmethod
+    def of(cls, channels: tuple[Channel, ...], order: int) -> Approximants:
+        """Return the approximants of one order. Raises LinearizationError for an order that there is not."""
+        a, b, c, through = pade(order) if channels else (np.zeros((0, 0)), np.zeros(0), np.zeros(0), 0.0)
+        late = [k for k, ch in enumerate(channels) if ch.total > 0.0]
+        times = np.array([channels[k].total for k in late])
+        pick = np.eye(len(channels))[late]  # the delays with states, of all
+        return cls(
+            np.kron(np.diag(1.0 / times), a),
+            np.kron(pick / times[:, None], b[:, None]),
+            np.kron(pick, c[:, None]).T,
+            np.diag([through if ch.total > 0.0 else 1.0 for ch in channels]),
+            channels,
+            order,
+        )
 
-    def sources(self, jac: Array) -> Array:
-        """Return the rows of the delayed signals over the columns [x, Pade, u, z, e]."""
-        z = self.size
-        total = np.zeros((*jac.shape[:-2], z.ne, z.nx + self.n_pade + z.nu + z.nz + z.ne))
-        columns = [*range(z.nx), *range(z.n, z.n + z.nu), *range(z.nx, z.n), *range(z.n + z.nu, z.columns)]
-        to_columns = [*range(z.nx), *range(self.n, self.n + z.nu + z.nz + z.ne)]
-        total[..., to_columns] = jac[..., z.n : z.n + z.ne, columns]
-        return total
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the states q."""
+        late = (c.name for c in self.channels if c.total > 0.0)
+        return tuple(f"{name}.pade{k + 1}" for name in late for k in range(self.order))
 
-    def matrix(self, jac: Array) -> Array:
-        """Return the matrix to reduce: rows [x', Pade', outputs | g, delays], columns [x, Pade, u | z, e]."""
-        total = self.spread(jac)
-        if self.channels:
-            a, _, c, _ = self.pade
-            z = self.size
-            self._add_sources(total, self.sources(jac))
-            for i, block in self._blocks():
-                total[block, block] += a / self.channels[i].total
-                total[-z.ne + i, block] += c
-            for i in range(z.ne):
-                total[-z.ne + i, -z.ne + i] -= 1.0
-        return total
+    def closed(self, matrix: Array, nx: int) -> SchurComplement:
+        """Return a matrix over rows [x', w, outputs] and columns [x, v, inputs] over [x', q', outputs] and [x, q, inputs]."""
+        total = self._spread(matrix, nx)
+        q, ends = slice(nx, nx + len(self.a)), tuple(size - len(self.channels) for size in total.shape)
+        total[q, q] += self.a
+        total[q, ends[1] :] += self.b
+        total[ends[0] :, ends[1] :] -= np.eye(len(self.channels))
+        return eliminate(total, *ends)
 
-    def _blocks(self) -> list[tuple[int, slice]]:
-        """Return each approximated delay or sampled block by its place, and its Pade states."""
-        firsts = range(self.size.nx, self.n, self.order)
-        return [(i, slice(first, first + self.order)) for i, first in zip(self.approximated, firsts, strict=True)]
+    def closed_along(self, reduced: SchurComplement, change: Array, nx: int, times: Array) -> Array:
+        """Return (directions, ...) the derivative of the result of `closed`.
 
-    def _add_sources(self, total: Array, sources: Array) -> None:
-        ends = total.shape[-2] - self.size.ne
-        _, b, _, through = self.pade
-        for i in self.closed:
-            total[..., ends + i, :] += sources[..., i, :]
-        for i, block in self._blocks():
-            total[..., block, :] += b[:, None] / self.channels[i].total * sources[..., i : i + 1, :]
-            total[..., ends + i, :] += through * sources[..., i, :]
-
-    def matrix_along(self, djac: Array, jac: Array, dtime: Array) -> Array:
-        """Return the derivative of `matrix`, (directions, ...); djac: of the Jacobian; dtime: (channels, directions).
-
-        It is not a number along a delay of 0 s: -s of what is delayed is no derivative of A, B, C and D.
+        change: of the matrix, (directions, ...). times: (channels, directions) of the delays, s. It is not a number along a
+        delay of 0 s: -s of what is delayed is no derivative of A, B, C and D.
         """
-        total = self.spread(djac)
-        if self.channels:
-            a, b, _, _ = self.pade
-            self._add_sources(total, self.sources(djac))
-            sources = self.sources(jac)
-            for i, block in self._blocks():
-                change = -dtime[i] / self.channels[i].total ** 2
-                total[:, block, block] += change[:, None, None] * a
-                total[:, block, :] += change[:, None, None] * b[:, None] * sources[i]
-            total[(dtime[list(self.closed)] != 0.0).any(axis=0)] = np.nan
-        return total
+        total = self._spread(change, nx)
+        q, (r, c) = slice(nx, nx + len(self.a)), (size - len(self.channels) for size in total.shape[1:])
+        sizes = np.array([ch.total for ch in self.channels])
+        shares = np.repeat(-times[sizes > 0.0] / sizes[sizes > 0.0, None], self.order, axis=0).T[:, :, None]
+        total[:, q, q] += shares * self.a
+        total[:, q, c:] += shares * self.b
+        total[(times[sizes == 0.0] != 0.0).any(axis=0)] = np.nan
+        return reduced.derivative(total[:, :r, :c], total[:, :r, c:], total[:, r:, :c], total[:, r:, c:])
 
-    def split(self, total: Array, inputs: list[int]) -> tuple[Array, Array, Array, Array]:
-        """A, B, C, D of a reduced matrix for the chosen inputs."""
-        n = self.n
-        through = [n + k for k in inputs]
-        return total[..., :n, :n], total[..., :n, through], total[..., n:, :n], total[..., n:, through]
+    def _spread(self, matrix: Array, nx: int) -> Array:
+        """Return the matrix over rows [x', q', outputs, w] and columns [x, q, inputs, w] with v = c q + d w; rows q' are 0."""
+        end = nx + len(self.channels)
+        v = matrix[..., nx:end]
+        wide = np.concatenate([matrix[..., :nx], v @ self.c, matrix[..., end:], v @ self.d], axis=-1)
+        none = np.zeros((*wide.shape[:-2], len(self.a), wide.shape[-1]))
+        return np.concatenate([wide[..., :nx, :], none, wide[..., end:, :], wide[..., nx:end, :]], axis=-2)

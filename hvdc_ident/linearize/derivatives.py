@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.delays import Blocks, SchurComplement, channels, eliminate
-from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
+from hvdc_ident.linearize.delays import channels, without_unknowns
+from hvdc_ident.linearize.limits import in_use, structure_roots
 from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array, CompiledSystem
 from hvdc_ident.model import Model
@@ -27,10 +27,10 @@ def constants(model: Model) -> list[str]:
     return [n for n, s in model.states.items() if n in given and s.is_reference]
 
 
-def eliminated(
-    model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, side: Side, pade_order: int
-) -> tuple[Array, Array, Blocks, SchurComplement]:
-    """Return the switches' modes, the Jacobian, its blocks with delays, and these without the algebraic unknowns.
+def jacobian_at(
+    model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, side: Side = "refuse"
+) -> tuple[Array, Array]:
+    """Return the switches' modes and the Jacobian (main rows, columns) at a point given by its vectors.
 
     Raises LinearizationError on a kink, and where an entry of the Jacobian is not finite.
     """
@@ -39,13 +39,15 @@ def eliminated(
     if not np.isfinite(jac).all():
         raise _not_finite(s, jac, model.name)
     _refuse_flat_roots(s, y, w, p, modes, model.name)
-    parts = Blocks(s, channels(model, s, p), pade_order)
-    return modes, jac, parts, eliminate(parts.matrix(jac), parts.rows, parts.columns)
+    return modes, jac
 
 
 def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Array:
-    """Return A, (states, states), at a point given by its vectors, without states that never move. Raises as `linearize` does."""
-    _, _, parts, reduced = eliminated(model, s, y, w, p, "refuse", PADE_ORDER)
+    """Return A, (states, states), of a model without delays at a point given by its vectors, without states that never move.
+
+    Raises as `linearize` does.
+    """
+    reduced = without_unknowns(s.layout, jacobian_at(model, s, y, w, p)[1], [], ())
     if reduced.condition > WELL_POSED:
         raise LinearizationError(
             "the algebraic part is ill-conditioned",
@@ -53,8 +55,8 @@ def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) 
             got=f"condition number {reduced.condition:.2g}",
             hint="use linearize(), which keeps it as a descriptor",
         )
-    constant = [s.states.index(n) for n in constants(model)]
-    return np.delete(np.delete(reduced.result[: parts.n, : parts.n], constant, 0), constant, 1)
+    n, constant = s.layout.nx, [s.states.index(k) for k in constants(model)]
+    return np.delete(np.delete(reduced.result[:n, :n], constant, 0), constant, 1)
 
 
 def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Characteristic:
@@ -62,14 +64,10 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
 
     Raises as `linearize` does.
     """
-    modes = modes_at(s, y, w, p, "refuse")
-    jac = s.jacobian(y, w, p, modes)[: s.layout.main]
-    if not np.isfinite(jac).all():
-        raise _not_finite(s, jac, model.name)
-    _refuse_flat_roots(s, y, w, p, modes, model.name)
     found = channels(model, s, p)
     closed = [k for k, c in enumerate(found) if c.total == 0.0]
-    return Characteristic.of(s.layout, jac, list(range(s.layout.nu)), found, closed)
+    reduced = without_unknowns(s.layout, jacobian_at(model, s, y, w, p)[1], list(range(s.layout.nu)), closed)
+    return Characteristic.of(reduced, s.layout.nx, tuple(c for c in found if c.total > 0.0))
 
 
 def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:
@@ -78,7 +76,7 @@ def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: A
     if not flat:
         return
     g = s.structure.graph
-    used = nodes_in_use(s.structure, structure_roots(s.structure), modes > 0.5)
+    used, _ = in_use(s.structure, structure_roots(s.structure), modes > 0.5)
     for n in set(flat) & used:
         if _moves(s, g.nodes[n][1], modes):
             names = [name for name, k in s.structure.nodes.items() if k == n]
@@ -92,7 +90,7 @@ def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: A
 def _moves(s: CompiledSystem, node: int, modes: Array) -> bool:
     """Return whether a node's value comes from more than the parameters, which stay where they are."""
     nodes = s.structure.graph.nodes
-    inner = nodes_in_use(s.structure, [node], modes > 0.5)
+    inner, _ = in_use(s.structure, [node], modes > 0.5)
     return any(nodes[k][0] == "leaf" and nodes[k][1] != "p" for k in inner)
 
 
@@ -106,7 +104,7 @@ def modes_at(s: CompiledSystem, y: Array, w: Array, p: Array, side: Side) -> Arr
     near = np.flatnonzero(np.abs(values) <= ON_KINK)
     if near.size == 0:
         return modes
-    used = in_use(s.structure, structure_roots(s.structure), values < 0.0)
+    _, used = in_use(s.structure, structure_roots(s.structure), values < 0.0)
     switches = s.structure.graph.switches
     kinks = [k for k in near if k in used and _moves(s, switches[k], modes) and _matters(s, y, w, p, modes, int(k))]
     if kinks and side == "refuse":

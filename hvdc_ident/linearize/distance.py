@@ -267,8 +267,7 @@ def _closed_with_delays(plant: LinearModel, controller: LinearModel) -> Stabilit
 def _equation(model: LinearModel) -> Characteristic:
     if model.exact is not None:
         return model.characteristic.visible()
-    a, b, c, d = visible(model)
-    return Characteristic(a, a.shape[0], (), b, c, d)
+    return Characteristic.rational(*visible(model))
 
 
 def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:

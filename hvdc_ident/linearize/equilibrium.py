@@ -7,7 +7,7 @@ where simulation finds it, in `hvdc_ident.simulate.steady_state`.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, Protocol
 
@@ -144,6 +144,19 @@ def homotopy(equations: Equations, v: Array, low: Array, high: Array, accuracy: 
 At = Literal["steady", "start"]
 
 
+@dataclass(frozen=True)
+class PointOptions:
+    """What is asked of an operating point, as `find_operating_point` has it."""
+
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    free: Collection[str] = ()
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    guess: Mapping[str, float] = field(default_factory=dict)
+    at: At = "steady"
+    moving: Collection[str] = ()
+    time: float = 0.0
+
+
 class System(Protocol):
     """Protocol of a model whose points are searched for, be it a graph or an FMU: names, and values and derivatives at a point.
 
@@ -194,40 +207,19 @@ class EquilibriumSearch:
     start: Mapping[str, float]
 
     @classmethod
-    def of_model(
-        cls,
-        model: Model,
-        fixed: Mapping[str, float],
-        free: Collection[str],
-        bounds: Mapping[str, tuple[float, float]],
-        *,
-        at: At,
-        moving: Collection[str],
-        time: float,
-    ) -> EquilibriumSearch:
+    def of_model(cls, model: Model, asked: PointOptions) -> EquilibriumSearch:
         """Return the equations for a model. Raises UnknownNameError, and ModelError for a value or bounds that cannot be."""
         variables_of = (model.states, model.inputs, model.parameters, model.delays, model.sampled)
-        signals = [n for n in (*fixed, *bounds) if not any(n in group for group in variables_of)]
+        signals = [n for n in (*asked.fixed, *asked.bounds) if not any(n in group for group in variables_of)]
         s = system(model, tuple(dict.fromkeys((*model.outputs, *signals))))
-        p = np.array([fixed.get(n, q.value) for n, q in model.parameters.items()], dtype=float)
-        return cls.of(model, s, fixed, free, bounds, _starts(model, s, p), at=at, moving=moving, time=time)
+        p = np.array([asked.fixed.get(n, q.value) for n, q in model.parameters.items()], dtype=float)
+        return cls.of(model, s, asked, _starts(model, s, p))
 
     @classmethod
-    def of(
-        cls,
-        model: AnyModel,
-        s: System,
-        fixed: Mapping[str, float],
-        free: Collection[str],
-        bounds: Mapping[str, tuple[float, float]],
-        start: Mapping[str, float],
-        *,
-        at: At,
-        moving: Collection[str],
-        time: float,
-    ) -> EquilibriumSearch:
+    def of(cls, model: AnyModel, s: System, asked: PointOptions, start: Mapping[str, float]) -> EquilibriumSearch:
         """Return the equations of a system that a model has. start: where states and unknowns are sought first. Raises as above."""
-        _check(model, s, fixed, free, bounds, moving)
+        _check(model, s, asked)
+        fixed, free, bounds = asked.fixed, asked.free, asked.bounds
         size = s.layout
         inner = {n: k for k, n in enumerate((*s.states, *s.unknowns, *s.extras))}
         u = np.array([fixed.get(n, i.value) for n, i in model.inputs.items()], dtype=float)
@@ -243,13 +235,13 @@ class EquilibriumSearch:
         high = np.array([bounds.get(n, (-np.inf, np.inf))[1] for n in variables], dtype=float)
         return cls(
             s,
-            at,
-            time,
+            asked.at,
+            asked.time,
             u,
             p,
             freed_u,
             freed_p,
-            _equation_rows(s, at, moving),
+            _equation_rows(s, asked.at, asked.moving),
             tuple(inner[n] for n in fixed_inner),
             tuple(first + s.outputs.index(n) for n in fixed_signals),
             np.array([fixed[n] for n in (*fixed_inner, *fixed_signals)], dtype=float),
@@ -429,16 +421,10 @@ def _equation_rows(s: System, at: At, moving: Collection[str]) -> tuple[int, ...
     return (*states, *range(size.nx, size.n + size.ne))
 
 
-def _check(
-    model: AnyModel,
-    s: System,
-    fixed: Mapping[str, float],
-    free: Collection[str],
-    bounds: Mapping[str, tuple[float, float]],
-    moving: Collection[str],
-) -> None:
+def _check(model: AnyModel, s: System, asked: PointOptions) -> None:
+    fixed, free = asked.fixed, asked.free
     where = f"operating point of model '{model.name}'"
-    require_known("state", moving, model.states, where)
+    require_known("state", asked.moving, model.states, where)
     for n in free:
         if n in model.states or n in s.unknowns or n in model.outputs or n in model.signals:
             continue  # free by nature
@@ -449,7 +435,7 @@ def _check(
     for n, value in fixed.items():
         if not np.isfinite(value):
             raise ModelError(f"the fixed value of '{n}' is not finite", where=where, got=f"{value}")
-    for n, (low, high) in bounds.items():
+    for n, (low, high) in asked.bounds.items():
         if not low <= high:
             raise ModelError(
                 f"the bounds of '{n}' are the wrong way round",
@@ -460,7 +446,7 @@ def _check(
         if (n in model.inputs or n in model.parameters) and n not in free:
             raise ModelError(f"'{n}' has bounds but is not free", where=where, hint=f"name it in `free`: free=['{n}']")
     constraints = [n for n in fixed if n not in model.inputs and n not in model.parameters]
-    room = sum(n in model.inputs or n in model.parameters for n in free) + len(set(moving))
+    room = sum(n in model.inputs or n in model.parameters for n in free) + len(set(asked.moving))
     if len(constraints) > room:
         raise SteadyStateError(
             f"{len(constraints)} fixed values ({', '.join(constraints)}) for {room} that may move",

@@ -6,7 +6,7 @@ Effects at the FMU's ends are linearised by themselves and put in series with it
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,8 +20,8 @@ from hvdc_ident.errors import (
 )
 from hvdc_ident.fmu import FmuModel, FmuPoint, at_point, smooth_inputs
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.equilibrium import EquilibriumSearch, solved
-from hvdc_ident.linearize.kinds import LinearOptions, PointOptions
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions, solved
+from hvdc_ident.linearize.kinds import LinearOptions
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.point import OperatingPoint
@@ -145,7 +145,7 @@ class LinearFmu:
 
     def _search(self, asked: PointOptions) -> tuple[FmuModel, EquilibriumSearch]:
         """Return the FMU, with fixed variables recorded, and the search for its point."""
-        model, fixed, moving = self.model, asked.fixed, asked.moving
+        model, fixed = self.model, asked.fixed
         known = [*model.parameters, *model.inputs]
         model = model.recording(n for n in fixed if n not in known and model.records(n))
         everything = [*known, *model.states, *model.outputs]
@@ -160,11 +160,9 @@ class LinearFmu:
         begin = at_point(model, given, None, s.outputs, (), asked.time, check=False)
         start = dict(zip(s.states, begin.x.tolist(), strict=True))
         if asked.at == "start":
-            fixed, moving = {**start, **{n: v for n, v in asked.guess.items() if n in start}, **fixed}, s.states
-        search = EquilibriumSearch.of(
-            model, s, fixed, asked.free, asked.bounds, start, at=asked.at, moving=moving, time=asked.time
-        )
-        return model, search
+            held = {**start, **{n: v for n, v in asked.guess.items() if n in start}, **fixed}
+            asked = replace(asked, fixed=held, moving=s.states)
+        return model, EquilibriumSearch.of(model, s, asked, start)
 
     def _gradient(self, point: OperatingPoint, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> Gradient:
         """Return the total derivatives of A, B, C, D by a parameter, the shift of the operating point included."""

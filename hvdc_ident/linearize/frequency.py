@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -340,14 +340,34 @@ def phase_of(model: LinearModel, omega: Array) -> Array:
     return followed_phase(lambda s: by_s(model, s), model, omega)
 
 
-def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> FrequencyResponse:
-    """Return the response of every channel at omega in rad/s (default: around the poles)."""
+def frequency_response(
+    model: LinearModel,
+    omega: Array | Sequence[float] | None = None,
+    *,
+    covariance: Array | None = None,
+    parameters: Sequence[str] = (),
+) -> FrequencyResponse:
+    """Return the response of every channel at omega in rad/s (default: around the poles), with units; it draws itself.
+
+    covariance: (k, k) of parameters in their units, in the order of `parameters`, whose derivatives the model must
+    have (`linearize(..., sensitivities=...)`): the response then has, as std, the first-order standard deviation of its error.
+    """
     w = default_omega(model) if omega is None else _checked(omega)
     units = tuple((o, i) for o in model.output_units for i in model.input_units)
+    std = None if covariance is None else _std(model, w, np.asarray(covariance, dtype=float), parameters)
     return FrequencyResponse(
-        w, transfer(model, 1j * w), model.output_names, model.input_names, units,
-        phase=phase_of(model, w),
-    )  # fmt: skip
+        w, transfer(model, 1j * w), model.output_names, model.input_names, units, std, phase=phase_of(model, w)
+    )
+
+
+def _std(model: LinearModel, w: Array, covariance: Array, parameters: Sequence[str]) -> Array:
+    k = len(parameters)
+    if covariance.shape != (k, k) or not np.isfinite(covariance).all():
+        raise LinearizationError(
+            "the covariance does not fit", expected=f"a finite ({k}, {k}) matrix", got=f"{covariance.shape}"
+        )
+    slopes = np.array([*sensitivity(model, w, parameters).values()])
+    return np.sqrt(np.maximum(np.einsum("a...,ab,b...->...", slopes.conj(), covariance, slopes).real, 0.0))
 
 
 def _checked(omega: Array | Sequence[float]) -> Array:
@@ -379,40 +399,3 @@ def sensitivity(
         else:
             found[name] = at.along(-g.A, g.B, g.C, g.D)
     return found
-
-
-def bands(
-    model: LinearModel, omega: Array | Sequence[float], covariance: Array, parameters: Sequence[str]
-) -> FrequencyResponse:
-    """Return the response with, as std, the first-order standard deviation of its error from a parameter covariance.
-
-    covariance: (k, k) in the parameters' units, in the order of `parameters`, whose derivatives the model must have.
-    """
-    cov = np.asarray(covariance, dtype=float)
-    k = len(parameters)
-    if cov.shape != (k, k) or not np.isfinite(cov).all():
-        raise LinearizationError(
-            "the covariance does not fit", expected=f"a finite ({k}, {k}) matrix", got=f"{cov.shape}"
-        )
-    plain = frequency_response(model, omega)
-    slopes = sensitivity(model, plain.omega, parameters)
-    stacked = np.array([slopes[n] for n in parameters])
-    variance = np.einsum("a...,ab,b...->...", stacked.conj(), cov, stacked).real
-    return replace(plain, std=np.sqrt(np.maximum(variance, 0.0)))
-
-
-def bode(
-    model: LinearModel,
-    omega: Array | Sequence[float] | None = None,
-    *,
-    covariance: Array | None = None,
-    parameters: Sequence[str] = (),
-) -> FrequencyResponse:
-    """Return the frequency response at omega in rad/s (default: around the poles), with units; it draws itself.
-
-    covariance: (k, k) of parameters in their units, in the order of `parameters`, whose derivatives the model must
-    have (`linearize(..., sensitivities=...)`): the response then has the standard deviation that follows, as a band.
-    """
-    if covariance is None:
-        return frequency_response(model, omega)
-    return bands(model, default_omega(model) if omega is None else omega, covariance, parameters)

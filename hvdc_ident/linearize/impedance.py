@@ -458,7 +458,7 @@ def simulated_response(
 
     def multisine(m: Model, u: Any) -> tuple[Model, Any]:
         terms = [
-            parse(repr(float(amplitude))) * _sine(float(k * base), float(q))
+            sp.Float(amplitude, 17) * sp.sin(sp.Float(k * base, 17) * TIME + sp.Float(q, 17))
             for k, q in zip(harmonics, phases, strict=True)
         ]
         return m, sum(terms, start=u)
@@ -472,12 +472,6 @@ def simulated_response(
         found[:, i, 0] = spectrum[harmonics * periods] / drive
     units = tuple((model.outputs[o].unit if o in model.outputs else "", model.inputs[input].unit) for o in outputs)
     return FrequencyResponse(harmonics * base, found, tuple(outputs), (input,), units, source="simulation")
-
-
-def _sine(omega: float, phase: float) -> Any:
-    import sympy as sp
-
-    return sp.sin(sp.Float(omega, 17) * TIME + sp.Float(phase, 17))
 
 
 def _settling(model: Model, values: Mapping[str, float]) -> float:

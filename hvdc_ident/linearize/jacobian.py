@@ -9,10 +9,10 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError, require_known
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.delays import Blocks, SchurComplement, without_unknowns_along
-from hvdc_ident.linearize.derivatives import PADE_ORDER, WELL_POSED, Side, constants, eliminated
-from hvdc_ident.linearize.equilibrium import EquilibriumSearch, Root, solved, weights
-from hvdc_ident.linearize.kinds import LinearOptions, PointOptions
+from hvdc_ident.linearize.delays import Approximants, Channel, channels, without_unknowns, without_unknowns_along
+from hvdc_ident.linearize.derivatives import PADE_ORDER, WELL_POSED, Side, constants, jacobian_at
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions, Root, solved, weights
+from hvdc_ident.linearize.kinds import LinearOptions
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.point import Branch, OperatingPoint
 from hvdc_ident.linearize.stability import Change, Characteristic, quartered
@@ -30,9 +30,7 @@ class EquationModel:
     def point(self, asked: PointOptions) -> OperatingPoint:
         """Return an operating point: of inputs and parameters alone the steady state that a simulation starts from."""
         model = self.model
-        search = EquilibriumSearch.of_model(
-            model, asked.fixed, asked.free, asked.bounds, at=asked.at, moving=asked.moving, time=asked.time
-        )
+        search = EquilibriumSearch.of_model(model, asked)
         if search.is_plain and not asked.guess:
             return OperatingPoint.of(model, search, *steady(model, search))
         own = _own(model, search)
@@ -99,63 +97,91 @@ def _linear_at(model: Model, at: OperatingPoint, asked: LinearOptions) -> Linear
     s = system(model, asked.outputs)
     chosen = _chosen(s, asked.inputs, model.name)
     require_known("parameter", asked.sensitivities, s.parameters, f"model '{model.name}'")
-    order = PADE_ORDER if asked.pade_order is None else asked.pade_order
-    modes, jac, parts, reduced = eliminated(model, s, at.y, at.w, at.p, asked.side, order)
-    keep = asked.descriptor or reduced.condition > WELL_POSED
-    if keep and parts.channels:
+    modes, jac = jacobian_at(model, s, at.y, at.w, at.p, asked.side)
+    found = channels(model, s, at.p)
+    which = [s.parameters.index(n) for n in asked.sensitivities]
+    closed = _closed(s, at.p, found, which)
+    kept = tuple(c for k, c in enumerate(found) if k not in closed)
+    reduced = without_unknowns(s.layout, jac, chosen, closed)
+    approximants = Approximants.of(kept, PADE_ORDER if asked.pade_order is None else asked.pade_order)
+    whole = approximants.closed(reduced.result, s.layout.nx)
+    condition = max(reduced.condition, whole.condition)
+    descriptor = asked.descriptor or condition > WELL_POSED
+    if descriptor and found:
         raise LinearizationError(
             "the algebraic loop through a delay's direct part is ill-posed",
             where=f"model '{model.name}'",
-            got=f"condition number {reduced.condition:.2g}",
+            got=f"condition number {condition:.2g}",
             hint="choose another pade_order, or open the loop at a signal in it",
         )
-    names = asked.sensitivities if not keep else ()
-    closed = _closed(s, at.p, parts, names)
-    gradient = _gradient(s, at, parts, jac, modes, reduced, names, chosen, closed) if names else {}
-    return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, asked.side, closed)
+    gradients: dict[str, Gradient] = {}
+    if which and not descriptor:
+        directions = shift(s, at, which)
+        djac = s.jacobian_along(at.y, at.w, at.p, modes, directions)
+        change = without_unknowns_along(s.layout, jac, djac, chosen, closed)
+        by_p = s.timing_by_parameters(at.p)[:, which] if kept else np.zeros((0, len(which)))
+        total = np.array([c.weights @ by_p[list(c.places)] for c in kept]).reshape(len(kept), len(which))
+        along = approximants.closed_along(whole, change, s.layout.nx, total)
+        for k, name in enumerate(asked.sensitivities):
+            exact = None
+            if kept:
+                times = tuple(by_p[list(c.places), k] for c in kept)
+                exact = Change(*quartered(change[k], s.layout.nx + len(kept)), times)
+            a, b, c, d = quartered(along[k], s.layout.nx + len(approximants.names))
+            gradients[name] = Gradient(a, b, c, d, exact)
+    names = (*s.states, *(s.unknowns if descriptor else approximants.names))
+    if descriptor:
+        z = s.layout
+        through = [z.n + k for k in chosen]
+        a, b, c, d = jac[: z.n, : z.n], jac[: z.n, through], jac[z.n :, : z.n], jac[z.n :, through]
+        e = np.diag([1.0] * z.nx + [0.0] * z.nz)
+    else:
+        a, b, c, d = quartered(whole.result, len(names))
+        e = np.eye(len(names))
+    units = {n: x.unit for n, x in model.states.items()} | {n: x.unit for n, x in model.algebraic.items()}
+    shown = {n: x.unit for n, x in model.signals.items()} | {n: x.unit for n, x in model.outputs.items()}
+    return LinearModel(
+        a, b, c, d, e,
+        names,
+        tuple(s.inputs[k] for k in chosen),
+        s.outputs,
+        tuple(units.get(n, "") for n in names),
+        tuple(model.inputs[s.inputs[k]].unit for k in chosen),
+        tuple(shown.get(n, "") for n in s.outputs),
+        point=at,
+        name=model.name,
+        provenance=FrozenMap(_provenance(s, asked.side, condition, descriptor, approximants)),
+        gradients=FrozenMap(gradients),
+        exact=Characteristic.of(reduced, s.layout.nx, kept) if kept else None,
+    )  # fmt: skip
 
 
-def _closed(s: CompiledSystem, p: Array, parts: Blocks, names: Sequence[str]) -> tuple[int, ...]:
-    """Return the places of the delays of 0 s that none of the named parameters changes: they are no delays."""
-    if not parts.closed or not names:
-        return parts.closed
-    by_p = s.timing_by_parameters(p)[:, [s.parameters.index(n) for n in names]]
-    return tuple(k for k in parts.closed if not by_p[list(parts.channels[k].places)].any())
+def _provenance(
+    s: CompiledSystem, side: Side, condition: float, descriptor: bool, approximants: Approximants
+) -> dict[str, str]:
+    """Return how a linear model was made."""
+    notes = {
+        "method": "symbolic",
+        "condition of the algebraic part": f"{condition:.3g}",
+        "algebraic part": "kept, descriptor" if descriptor else "eliminated" if s.layout.nz else "none",
+        "limits": "held as at the point" if side == "refuse" else f"one-sided: {side} the limit",
+    }
+    if approximants.names:
+        notes["delays"] = f"Pade of order {approximants.order} in A, B, C, D; exact in the frequency response"
+        if any(c.kind == "sampled" for c in approximants.channels):
+            notes["sampled blocks"] = (
+                "a delay of half a period (the hold) plus the compute time: 1.5 periods when computing takes one"
+            )
+    return notes
 
 
-def _gradient(
-    s: CompiledSystem,
-    at: OperatingPoint,
-    parts: Blocks,
-    jac: Array,
-    modes: Array,
-    reduced: SchurComplement,
-    names: Sequence[str],
-    chosen: list[int],
-    closed: Sequence[int],
-) -> dict[str, Gradient]:
-    """Return the total derivatives of A, B, C, D by parameters. closed: delays of 0 s that none of them changes."""
-    which = [s.parameters.index(n) for n in names]
-    directions = shift(s, at, which)
-    djac = s.jacobian_along(at.y, at.w, at.p, modes, directions)
-    by_p = s.timing_by_parameters(at.p)[:, which] if parts.channels else np.zeros((0, len(which)))
-    dtime = np.array([c.weights @ by_p[list(c.places)] for c in parts.channels]).reshape(
-        len(parts.channels), len(which)
-    )
-    along = parts.matrix_along(djac, jac, dtime)
-    r, c = parts.rows, parts.columns
-    changes = reduced.derivative(along[:, :r, :c], along[:, :r, c:], along[:, r:, :c], along[:, r:, c:])
-    kept = [ch for k, ch in enumerate(parts.channels) if k not in closed]
-    exact = without_unknowns_along(s.layout, jac, djac, chosen, closed) if kept else None
-    found = {}
-    for k, name in enumerate(names):
-        a, b, c_, d = parts.split(changes[k], chosen)
-        change = None
-        if exact is not None:
-            times = tuple(by_p[list(ch.places), k] for ch in kept)
-            change = Change(*quartered(exact[k], s.layout.nx + len(kept)), times)
-        found[name] = Gradient(a, b, c_, d, change)
-    return found
+def _closed(s: CompiledSystem, p: Array, found: Sequence[Channel], which: list[int]) -> tuple[int, ...]:
+    """Return the places of the delays of 0 s that none of some parameters changes: they are no delays."""
+    zero = tuple(k for k, c in enumerate(found) if c.total == 0.0)
+    if not zero or not which:
+        return zero
+    by_p = s.timing_by_parameters(p)[:, which]
+    return tuple(k for k in zero if not by_p[list(found[k].places)].any())
 
 
 def shift(s: CompiledSystem, at: OperatingPoint, which: list[int]) -> Array:
@@ -184,67 +210,6 @@ def shift(s: CompiledSystem, at: OperatingPoint, which: list[int]) -> Array:
     for i, k in enumerate(search.freed_p):
         total[size.columns + k] += slope[inner + len(search.freed_u) + i]
     return total
-
-
-def _model(
-    model: Model,
-    s: CompiledSystem,
-    at: OperatingPoint,
-    parts: Blocks,
-    jac: Array,
-    reduced: SchurComplement,
-    chosen: list[int],
-    keep: bool,
-    gradient: dict[str, Gradient],
-    side: Side,
-    closed: Sequence[int],
-) -> LinearModel:
-    approximated = [parts.channels[k] for k in parts.approximated]
-    names = [*s.states, *(f"{c.name}.pade{k + 1}" for c in approximated for k in range(parts.order))]
-    units = [model.states[n].unit for n in s.states] + [""] * parts.n_pade
-    if keep:
-        z = s.layout
-        through = [z.n + k for k in chosen]
-        a, b = jac[: z.n, : z.n], jac[: z.n, through]
-        c, d = jac[z.n :, : z.n], jac[z.n :, through]
-        e = np.diag([1.0] * z.nx + [0.0] * z.nz)
-        names = [*s.states, *s.unknowns]
-        units = [*units, *(model.algebraic[n].unit for n in s.unknowns)]
-    else:
-        a, b, c, d = parts.split(reduced.result, chosen)
-        e = np.eye(a.shape[0])
-    notes = {
-        "method": "symbolic",
-        "condition of the algebraic part": f"{reduced.condition:.3g}",
-        "algebraic part": "kept, descriptor" if keep else "eliminated" if s.layout.nz else "none",
-        "limits": "held as at the point" if side == "refuse" else f"one-sided: {side} the limit",
-    }
-    if approximated:
-        kinds = {c.kind for c in approximated}
-        notes["delays"] = f"Pade of order {parts.order} in A, B, C, D; exact in the frequency response"
-        if "sampled" in kinds:
-            notes["sampled blocks"] = (
-                "a delay of half a period (the hold) plus the compute time: 1.5 periods when computing takes one"
-            )
-    outputs = {n: o.unit for n, o in model.outputs.items()} | {
-        n: x.unit for n, x in model.signals.items() if n not in model.outputs
-    }
-    return LinearModel(
-        a, b, c, d, e,
-        tuple(names),
-        tuple(s.inputs[k] for k in chosen),
-        s.outputs,
-        tuple(units),
-        tuple(model.inputs[s.inputs[k]].unit for k in chosen),
-        tuple(outputs.get(n, "") for n in s.outputs),
-        point=at,
-        name=model.name,
-        provenance=FrozenMap(notes),
-        gradients=FrozenMap(gradient),
-        exact=Characteristic.of(s.layout, jac, chosen, parts.channels, closed)
-        if len(parts.channels) > len(closed)
-        else None,
-    )  # fmt: skip
 
 
 def _chosen(s: CompiledSystem, inputs: Sequence[str] | None, model: str) -> list[int]:

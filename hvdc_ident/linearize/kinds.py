@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from hvdc_ident.linearize.derivatives import Side
-from hvdc_ident.linearize.equilibrium import At
+from hvdc_ident.linearize.equilibrium import PointOptions
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.point import OperatingPoint
-
-
-@dataclass(frozen=True)
-class PointOptions:
-    """What is asked of an operating point, as `find_operating_point` has it."""
-
-    fixed: Mapping[str, float] = field(default_factory=dict)
-    free: Collection[str] = ()
-    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    guess: Mapping[str, float] = field(default_factory=dict)
-    at: At = "steady"
-    moving: Collection[str] = ()
-    time: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ def limits(structure: ModelEquations, known: tuple[Condition, ...], values: NDAr
     A limiter inside a branch that another condition has switched off does not matter and is left out; conditions that
     are no limiters (kind "branch") are listed with their distance and are never active.
     """
-    used = in_use(structure, structure_roots(structure), values < 0.0)
+    _, used = in_use(structure, structure_roots(structure), values < 0.0)
     found = []
     for c in known:
         if c.index in used:
@@ -167,20 +167,13 @@ def structure_roots(structure: ModelEquations) -> list[int]:
     return [*structure.rhs, *structure.sources, *structure.observed]
 
 
-def in_use(structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
-    """Return the switches that decide a branch which the roots' values come from; negative: the switches' modes."""
-    return _walk(structure, roots, negative)[1]
-
-
-def nodes_in_use(structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]) -> frozenset[int]:
-    """Return the nodes which the roots' values come from, branches that are switched off left out."""
-    return _walk(structure, roots, negative)[0]
-
-
-def _walk(
+def in_use(
     structure: ModelEquations, roots: list[int], negative: NDArray[np.bool_]
 ) -> tuple[frozenset[int], frozenset[int]]:
-    """Return (nodes, switches) in use."""
+    """Return the nodes which the roots' values come from, and the switches that decide on the branches they come through.
+
+    negative: the switches' modes. Branches that are switched off are left out.
+    """
     nodes = structure.graph.nodes
     used: set[int] = set()
 

@@ -249,7 +249,7 @@ class LinearModel(Shown):
         modes = modal.modes
         transfer_function = transfer_function.transfer_function
         response = frequency.response
-        bode = frequency.bode
+        bode = frequency.frequency_response
         sigma = frequency.sigma
         margins = loops.margins_of
         norms = reduction.norms
@@ -263,7 +263,7 @@ class LinearModel(Shown):
         modes = method("hvdc_ident.linearize.modal.modes")
         transfer_function = method("hvdc_ident.linearize.transfer_function.transfer_function")
         response = method("hvdc_ident.linearize.frequency.response")
-        bode = method("hvdc_ident.linearize.frequency.bode")
+        bode = method("hvdc_ident.linearize.frequency.frequency_response")
         sigma = method("hvdc_ident.linearize.frequency.sigma")
         margins = method("hvdc_ident.linearize.loops.margins_of")
         norms = method("hvdc_ident.linearize.reduction.norms")

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from hvdc_ident.linearize.derivatives import Side
-from hvdc_ident.linearize.kinds import LinearOptions, PointOptions
+from hvdc_ident.linearize.equilibrium import PointOptions
+from hvdc_ident.linearize.kinds import LinearOptions
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.operating_point import kind_of
 from hvdc_ident.linearize.point import OperatingPoint

@@ -23,7 +23,7 @@ from hvdc_ident.linearize.frequency import FrequencyResponse, default_omega, tra
 from hvdc_ident.linearize.gain_limits import FLOOR, NONE, Closing, Crossing, crossing_frequencies, refined
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.linearisation import linearize
-from hvdc_ident.linearize.operating_point import find_operating_point, point_at, signal_value
+from hvdc_ident.linearize.operating_point import find_operating_point, point_at, signal_values
 from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.realisation import without_sliding_means
 from hvdc_ident.linearize.stability import Characteristic, Stability, sliding_means, stability
@@ -139,7 +139,7 @@ def loop(
             states[fresh(opened, f"{name}_returned")] = closed.states[name]
         opened, output = open_model(opened, name)
         outputs.append(output)
-    inputs = {**closed.inputs, **{n: signal_value(model, closed, n) for n in signals}}
+    inputs = {**closed.inputs, **signal_values(model, closed, signals)}
     parameters = {n: v for n, v in closed.parameters.items() if n in opened.parameters}
     at = point_at(opened, {n: states[n] for n in opened.states}, inputs, parameters, time=closed.time)
     if sensitivities:  # the derivatives need the shift of a point that is at rest
@@ -214,7 +214,7 @@ class Margins(Coded):
     @property
     def stable(self) -> bool | None:
         """True where the closed loop is stable, delays exact; None where it cannot be told."""
-        return _stable(self.stability)
+        return self.stability.stable
 
     @property
     def phase_margin(self) -> Crossing:
@@ -266,10 +266,6 @@ class Margins(Coded):
         return first
 
 
-def _stable(found: Stability) -> bool | None:
-    return None if found.verdict == "not decided" else found.verdict == "stable"
-
-
 def _without_margins(found: Stability, what: str) -> str:
     """Return the sentence on closed loops that are not stable, or of which it cannot be told."""
     if found.verdict == "not decided":
@@ -295,7 +291,7 @@ class LoopMargins(Coded):
     @property
     def stable(self) -> bool | None:
         """True where the closed loops are stable, delays exact; None where it cannot be told."""
-        return _stable(self.stability)
+        return self.stability.stable
 
     @property
     def disk_gain(self) -> float:
@@ -398,11 +394,8 @@ def open_equation(model: LinearModel) -> Characteristic:
 
     Raises LinearizationError where the direct part is -1.
     """
-    if model.exact is not None:
-        found = model.characteristic
-    else:
-        a, b, c, d = without_sliding_means(model)
-        found = Characteristic(a, a.shape[0], (), b, c, d)
+    exact = model.exact is not None
+    found = model.characteristic if exact else Characteristic.rational(*without_sliding_means(model))
     through = np.eye(found.through.shape[0]) + found.through
     if np.linalg.cond(through) > 1e12 or np.abs(np.linalg.det(through)) < 1e-12:
         raise LinearizationError(

@@ -20,10 +20,10 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import delayed_modes
 from hvdc_ident.linearize.delayed_locus import crossings, followed
 from hvdc_ident.linearize.derivatives import characteristic, state_matrix
-from hvdc_ident.linearize.equilibrium import EquilibriumSearch
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions
 from hvdc_ident.linearize.jacobian import steady
 from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles
-from hvdc_ident.linearize.mode import Mode
+from hvdc_ident.linearize.mode import Mode, kind_of_mode
 from hvdc_ident.linearize.plot import locus
 from hvdc_ident.linearize.stability import ZERO, Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array, CompiledSystem
@@ -113,31 +113,17 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
 
 
 def _kind(model: LinearModel, value: complex, right: Array, left: Array, zero: float) -> str:
-    if abs(value) <= zero:
-        driven = np.abs(left @ model.B).max(initial=0.0) > 1e-9 * np.abs(left).max() * np.abs(model.B).max(
-            initial=1e-300
-        )
-        seen = np.abs(model.C @ right).max(initial=0.0) > 1e-9 * np.abs(right).max() * np.abs(model.C).max(
-            initial=1e-300
-        )
-        if driven and seen:
-            return "free integrator"
-        return _hidden(model, right, bool(driven), bool(seen))
-    if value.imag:
-        return "oscillation" if value.real <= 0 else "growing oscillation"
-    return "decay" if value.real < 0 else "growth"
+    """Return the kind of a mode; a zero eigenvalue whose state is held by a limit is a saturated state."""
 
+    def reaches(product: Array, vector: Array, matrix: Array) -> bool:
+        return bool(np.abs(product).max(initial=0.0) > 1e-9 * np.abs(vector).max() * np.abs(matrix).max(initial=1e-300))
 
-def _hidden(model: LinearModel, right: Array, driven: bool, seen: bool) -> str:
-    """Return the kind of a zero eigenvalue that the chosen inputs and outputs do not both reach."""
-    if model.point is not None and model.point.active_limits:
-        state = model.state_names[int(np.argmax(np.abs(right)))]
-        row = model.A[model.state_names.index(state)]
-        if not row.any():
-            return "saturated state"
-    if not driven and not seen:
-        return "hidden integrator"
-    return "angle reference or unobserved integrator" if driven else "undriven integrator"
+    driven, seen = reaches(left @ model.B, left, model.B), reaches(model.C @ right, right, model.C)
+    hidden = abs(value) <= zero and not (driven and seen)
+    held = hidden and model.point is not None and model.point.active_limits
+    if held and not model.A[int(np.argmax(np.abs(right)))].any():
+        return "saturated state"
+    return kind_of_mode(value, zero, driven, seen)
 
 
 def sensitivities(values: Array, right: Array, left: Array, da: Array) -> Array:
@@ -287,7 +273,7 @@ class _Along:
         self.model, self.parameter = model, parameter
         own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
         start = {parameter: own.value}
-        self._search = EquilibriumSearch.of_model(model, {**start, **fixed}, (), {}, at="steady", moving=(), time=0.0)
+        self._search = EquilibriumSearch.of_model(model, PointOptions({**start, **fixed}))
         names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
         self._place = names.index(parameter)
 

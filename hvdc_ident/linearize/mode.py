@@ -36,3 +36,14 @@ class Mode(Coded):
     def dominant(self) -> str:
         """The state that takes part most."""
         return max(self.participation, key=lambda n: self.participation[n])
+
+
+def kind_of_mode(eigenvalue: complex, zero: float, driven: bool, seen: bool) -> str:
+    """Return the kind of a mode. zero: size below which it is at 0. driven, seen: whether inputs reach and outputs see it."""
+    if abs(eigenvalue) > zero:
+        if eigenvalue.imag:
+            return "oscillation" if eigenvalue.real <= 0 else "growing oscillation"
+        return "decay" if eigenvalue.real < 0 else "growth"
+    if driven:
+        return "free integrator" if seen else "angle reference or unobserved integrator"
+    return "undriven integrator" if seen else "hidden integrator"

@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from hvdc_ident.errors import SteadyStateError, require_known, unknown_name
-from hvdc_ident.linearize.equilibrium import At
+from hvdc_ident.linearize.equilibrium import At, PointOptions
 from hvdc_ident.linearize.jacobian import EquationModel
-from hvdc_ident.linearize.kinds import Kind, LinearOptions, PointOptions
+from hvdc_ident.linearize.kinds import Kind, LinearOptions
 from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.system import Array, system
 from hvdc_ident.model import AnyModel, Model
@@ -61,7 +61,8 @@ def find_operating_point(
     0.6
     """
     if inputs or outputs:
-        fixed = {**(fixed or {}), **known_inputs(model, inputs or {})}
+        require_known("input", inputs or {}, model.inputs, f"operating point of model '{model.name}'")
+        fixed = {**(fixed or {}), **(inputs or {})}
         if outputs and not free:
             base = find_operating_point(model, fixed, (), bounds, guess, at=at, moving=moving, time=time)
             free = freed_inputs(model, base, outputs, fixed)
@@ -131,11 +132,6 @@ def _step_to(
         )
 
 
-def signal_value(model: Model, point: OperatingPoint, name: str) -> float:
-    """Return the value of any name at an operating point."""
-    return signal_values(model, point, (name,))[name]
-
-
 def signal_values(model: Model, point: OperatingPoint, names: Sequence[str]) -> dict[str, float]:
     """Return the values of any names at an operating point."""
     known = {**point.states, **point.unknowns, **point.extras, **point.inputs, **point.parameters}
@@ -157,12 +153,6 @@ of products that rounding changes by 1e-16 of their terms, and these may be a hu
 NEGLIGIBLE = 1e-9
 """Share of the largest gain below which an input is taken for without effect: it would have to move a billion times as far
 as the other one, in their units, and rounding leaves about 1e-16."""
-
-
-def known_inputs(model: AnyModel, inputs: Mapping[str, float]) -> dict[str, float]:
-    """Return the inputs' values. Raises UnknownNameError for a name that is no input."""
-    require_known("input", inputs, model.inputs, f"operating point of model '{model.name}'")
-    return dict(inputs)
 
 
 def freed_inputs(model: AnyModel, point: OperatingPoint, outputs: Collection[str], held: Collection[str]) -> list[str]:

@@ -45,11 +45,6 @@ def kalman(
     return (a, b, c), (hidden[0], hidden[1])
 
 
-def uncontrollable_unobservable(a: Array, b: Array, c: Array) -> Array:
-    """Return the eigenvalues of the modes that no input reaches or no output sees, by orthogonal staircases."""
-    return np.concatenate(kalman(*scaled_states(a, b, c))[1]).astype(complex)
-
-
 def scaled_states(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
     """Return the system with states scaled by powers of two so that rows and columns of A are alike."""
     if a.shape[0] == 0:

@@ -17,9 +17,9 @@ from scipy.sparse.csgraph import connected_components
 from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.characteristic import NEUTRAL, Part, Undecided, spectral_radius
-from hvdc_ident.linearize.delays import Channel, eliminate, without_unknowns
+from hvdc_ident.linearize.delays import Channel, SchurComplement, eliminate
 from hvdc_ident.linearize.sampling import multipliers
-from hvdc_ident.linearize.system import Array, Layout
+from hvdc_ident.linearize.system import Array
 
 EIGENVALUES = "eigenvalues of A"
 COUNTED = "roots of the exact characteristic equation, counted by the argument principle"
@@ -85,19 +85,20 @@ class Characteristic:
     through: Array
 
     @classmethod
-    def of(
-        cls, size: Layout, jac: Array, inputs: list[int], found: tuple[Channel, ...], closed: Sequence[int]
-    ) -> Characteristic:
-        """Return the equation of a Jacobian (main rows, columns). closed: delays of 0 s by their place, which are none.
+    def of(cls, reduced: SchurComplement, nx: int, channels: tuple[Channel, ...]) -> Characteristic:
+        """Return the equation of a Jacobian without its unknowns (`without_unknowns`) and the delays that are in it.
 
-        Raises LinearizationError where its algebraic unknowns have no solution.
+        Raises LinearizationError where the unknowns have no solution.
         """
-        reduced = without_unknowns(size, jac, inputs, closed)
         if not np.isfinite(reduced.condition):
             raise LinearizationError("the algebraic part is singular", got="no solution for its unknowns")
-        kept = tuple(c for k, c in enumerate(found) if k not in closed)
-        matrix, given, read, through = quartered(reduced.result, size.nx + len(kept))
-        return cls(matrix, size.nx, kept, given, read, through)
+        matrix, given, read, through = quartered(reduced.result, nx + len(channels))
+        return cls(matrix, nx, channels, given, read, through)
+
+    @classmethod
+    def rational(cls, a: Array, b: Array, c: Array, d: Array) -> Characteristic:
+        """Return the equation of a state space without delays."""
+        return cls(a, a.shape[0], (), b, c, d)
 
     def without_zero_delays(self) -> Characteristic:
         """Return the equation in which what a delay of 0 s gives is what it gets. Raises LinearizationError for a loop of gain 1."""
@@ -406,6 +407,11 @@ class Stability(Coded):
     rightmost: complex | None
     reason: str = ""
     method: str = EIGENVALUES
+
+    @property
+    def stable(self) -> bool | None:
+        """True where it is stable, None where that is not decided; on the limit it is not."""
+        return None if self.verdict == "not decided" else self.verdict == "stable"
 
     @property
     def count_text(self) -> str:

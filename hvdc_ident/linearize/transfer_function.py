@@ -11,7 +11,7 @@ from hvdc_ident.codec import Coded
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.delays import eliminate
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.realisation import uncontrollable_unobservable, visible, without_sliding_means
+from hvdc_ident.linearize.realisation import kalman, scaled_states, visible, without_sliding_means
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.linearize.zeros import zeros
 
@@ -55,7 +55,7 @@ def transfer_function(model: LinearModel, input: str | None = None, output: str 
         none = np.zeros(0, dtype=complex)
         return TransferFunction(input, output, none, none, 0.0, 0.0)
     all_poles, all_zeros = np.linalg.eigvals(a).astype(complex), zeros(a, b, c, d)
-    hidden = uncontrollable_unobservable(a, b, c)
+    hidden = np.concatenate(kalman(*scaled_states(a, b, c))[1])
     kept_poles, kept_zeros, cancelled = _cancel(all_poles, all_zeros, hidden)
     gain = _gain(a, b, c, d, kept_zeros, kept_poles)
     return TransferFunction(

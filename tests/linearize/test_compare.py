@@ -116,6 +116,18 @@ def test_poles_on_the_axis_of_a_model_with_a_delay_are_passed_on_their_right():
         assert found.winding == 0 and found.value < 0.03
 
 
+def test_a_resonance_too_narrow_for_any_step_winds():
+    """-r s/(s^2 + 2 z s + 0.01) beside a late lag, 1e-5 of its frequency wide and 50 high: from eigenvalues it winds once each way."""
+    plant = Model(
+        name="narrow", parameters={"r": 1e-4, "z": 1e-6, "T": {"value": 0.1, "unit": "s"}}, inputs={"u": 0.0},
+        states={"x": "u - x", "a": "b", "b": "u - 0.01*a - 2*z*b"}, delays={"late": {"of": "x", "time": "T"}},
+        outputs={"y": "late - r*b"},
+    )  # fmt: skip
+    narrow, plain = linearize(plant), linearize(plant.with_values({"r": 0.0}))
+    rational = [replace(m, exact=None) for m in (narrow, plain)]
+    assert nu_gap(narrow, plain).winding == nu_gap(*rational).winding == -nu_gap(plain, narrow).winding != 0
+
+
 def test_a_winding_without_a_limit_is_refused():
     """u itself, late, beside u: the determinant turns for ever."""
     echo = Model(

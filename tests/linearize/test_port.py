@@ -9,7 +9,7 @@ from hvdc_ident.errors import LinearizationError, UnknownNameError
 from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import Port, find_operating_point, port_admittance, port_impedance
-from hvdc_ident.linearize.operating_point import signal_value
+from hvdc_ident.linearize.operating_point import signal_values
 from hvdc_ident.model import Delay, Model, Output, Signal, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter
@@ -54,8 +54,7 @@ def test_a_station_s_impedance_and_the_grid_s_are_the_whole():
     current = ("Ir1", "-Ii1")
     whole = port_impedance(model, Port(("Ed1", "Eq1"), ("Ed1", "Eq1"), current, "psi1"), W, point)
     station = port_impedance(model, Port(("Ed1", "Eq1"), ("vd1", "vq1"), current, "psi1"), W, point)
-    r, x = signal_value(model, point, "R"), signal_value(model, point, "X")
-    w0 = signal_value(model, point, "w0")
+    r, x, w0 = signal_values(model, point, ("R", "X", "w0")).values()
     np.testing.assert_allclose(whole.values - station.values, by_hand(r, x, w0, W), rtol=1e-6, atol=1e-7)
 
 
