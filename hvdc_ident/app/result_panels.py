@@ -159,7 +159,7 @@ def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = F
 
 def _diagnosed(found: FoundResults, page: Page) -> None:
     """Build what the diagnosis says, its findings, and the errors with each set of values."""
-    diagnosis, sizes = found.objects.diagnosis, found.of("diagnose").get("sizes") or {}
+    diagnosis, sizes = found.objects.diagnosis, found.objects.of_diagnosis.sizes
     ui.label("" if diagnosis is None else diagnosis.text or diagnosis.verdict)
     show_table(findings_table(found.summary))
     show_table(sets_table(found.summary))
@@ -170,7 +170,7 @@ def _diagnosed(found: FoundResults, page: Page) -> None:
         button.props("outline dense").classes("q-px-sm self-start")
         button.tooltip("Opens the model with what was found on the tab Explore; its rivals stand there under “model with”.")
     results = Results(found.folder)
-    told = str(sizes.get("experiment", "")) or next(iter(results.experiments), "")
+    told = sizes.experiment if sizes is not None else next(iter(results.experiments), "")
     ui.label(f"Recorded less simulated in {told}, without and with what was found").classes("small q-mt-sm")
     _overlay(results, told, ui.element("div").classes("w-full"), errors=True)
 

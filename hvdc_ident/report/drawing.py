@@ -101,8 +101,9 @@ def svg(fig: Figure, label: str) -> str:
 
     for axes in fig.axes:
         for axis, scale in ((axes.xaxis, axes.get_xscale()), (axes.yaxis, axes.get_yscale())):
-            if scale == "log":  # powers of ten as plain numbers: formulas are not typeset
+            if scale in ("log", "symlog"):  # powers of ten as plain numbers: formulas are not typeset
                 axis.set_major_formatter(lambda x, _: f"{x:g}")
+            if scale == "log":
                 axis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
     style = {"svg.fonttype": "none", "svg.hashsalt": label, "font.family": "sans-serif", "text.parse_math": False}
     stream = io.StringIO()

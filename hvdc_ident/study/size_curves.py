@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
-from hvdc_ident.data import Experiment
+import numpy as np
+
+from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
 from hvdc_ident.effects import apply_effects, effects
 from hvdc_ident.errors import HvdcIdentError
@@ -15,18 +16,18 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.augmented import use_of
+from hvdc_ident.summary.stage_results import SizeCurves
 from hvdc_ident.text import quantity
 
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 """Of the way from the neutral size to the one that was found; 0 is the model without the effect, gains as found with it."""
 
 
-def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosis) -> dict[str, Any] | None:
-    """The output the effect matters most for, recorded and simulated at several sizes; None without an effect.
+def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosis) -> SizeCurves | None:
+    """Return the output the effect matters most for, recorded and simulated at several sizes; None without an effect.
 
-    Keys: effect, at, parameter, unit, experiment, output, time (n) in s, measured (n), sizes [value or None for
-    absent], shares, labels, chosen (which of them was found), curves [(n)]. The other effects and the parameters stay
-    as found. A size that the effect cannot have, and one at which the model cannot be run, is left out.
+    The other effects and the parameters stay as found. A size that the effect cannot have, and one at which the model cannot be run,
+    is left out.
     """
     if not found.effects or found.augmented is None:
         return None
@@ -40,7 +41,7 @@ def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosi
     bounds = effects()[first.effect].parameters[name]
     neutral = _neutral(first, bounds.neutral)
     rows = chosen.compared
-    shown: dict[str, list[Any]] = {"sizes": [], "shares": [], "labels": [], "curves": []}
+    shown: list[tuple[float | None, float, str, Array]] = []
     for share in SHARES:
         value = _size(size.value, neutral, share)
         # On the other side of neutral, or far from it, an effect has no such size: a lead of less than 0 s.
@@ -50,24 +51,18 @@ def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosi
             run = simulate(_with(model, found, value), chosen, found.parameters_after, outputs=[place[0]])
         except HvdcIdentError:  # as where a smaller limit leaves no rest to begin at
             continue
-        shown["sizes"].append(value)
-        shown["shares"].append(share)
-        shown["labels"].append("without it" if value is None else f"{name} = {quantity(value, size.unit)}")
-        shown["curves"].append(run[place[0]][rows].tolist())
+        label = "without it" if value is None else f"{name} = {quantity(value, size.unit)}"
+        shown.append((value, share, label, run[place[0]][rows]))
+    if not shown:
+        return None
     assert chosen.measured is not None
-    return {
-        "effect": first.effect,
-        "at": list(first.at),
-        "parameter": name,
-        "unit": size.unit,
-        "experiment": chosen.name,
-        "output": place[0],
-        "output_unit": model.outputs[place[0]].unit if place[0] in model.outputs else "",
-        "time": chosen.time[rows].tolist(),
-        "measured": chosen.measured[place[0]][rows].tolist(),
-        "chosen": shown["shares"].index(1.0) if 1.0 in shown["shares"] else None,
-        **shown,
-    }
+    sizes, shares, labels, curves = zip(*shown, strict=True)
+    return SizeCurves(
+        first.effect, first.at, name, size.unit, chosen.name, place[0],
+        model.outputs[place[0]].unit if place[0] in model.outputs else "",
+        chosen.time[rows], chosen.measured[place[0]][rows], shares.index(1.0) if 1.0 in shares else None,
+        sizes, shares, labels, np.array(curves),
+    )  # fmt: skip
 
 
 def _where_it_matters(found: Diagnosis) -> tuple[str, str] | None:

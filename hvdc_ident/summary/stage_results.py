@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from hvdc_ident.codec import Coded, stored_as
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.errors import located
 from hvdc_ident.fit.judgement import Judgements
@@ -64,11 +65,40 @@ class Context(Coded):
     responses: tuple[ComparedResponse, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class SizeCurves:
+    """The output that an effect matters most for, recorded and simulated at several sizes of the effect.
+
+    at: its places. parameter: that has the sizes, in `unit`; sizes: None where the effect is absent; shares: of the way from there to
+    the size that was found; labels: in words; chosen: the place of the size found, None where it is not among them. time: (n,) s;
+    measured: (n,), curves: (sizes, n), in `output_unit`.
+    """
+
+    effect: str
+    at: tuple[str, ...]
+    parameter: str
+    unit: str
+    experiment: str
+    output: str
+    output_unit: str
+    time: Array
+    measured: Array
+    chosen: int | None
+    sizes: tuple[float | None, ...]
+    shares: tuple[float, ...]
+    labels: tuple[str, ...]
+    curves: Array
+
+
 @dataclass(frozen=True)
 class DiagnosisContext(Coded):
-    """Fields of the JSON of a diagnosis beside its own. units: of the outputs. judgement: of the model with each set of values."""
+    """Fields of the JSON of a diagnosis beside its own. units: of the outputs. sizes: the model with other sizes of its first effect.
+
+    judgement: of the model with each set of values.
+    """
 
     units: Mapping[str, str] = field(default_factory=dict)
+    sizes: SizeCurves | None = None
     judgement: Judgements = field(default_factory=Judgements)
 
 

@@ -38,24 +38,24 @@ def first_order(rate: float, lag: float) -> np.ndarray:
 
 def test_the_curves_of_a_lag_are_those_of_its_time_constants() -> None:
     found = size_curves(PLANT, [experiment("e")], diagnosis("lag", {"T": 0.1}, HERE))
-    assert found is not None and found["sizes"] == [None, *(pytest.approx(0.1 * s) for s in SHARES[1:])]
-    assert found["labels"][0] == "without it" and found["labels"][found["chosen"]] == "T = 0.1 s"
-    for size, curve in zip(found["sizes"], found["curves"], strict=True):
+    assert found is not None and [*found.sizes] == [None, *(pytest.approx(0.1 * s) for s in SHARES[1:])]
+    assert found.labels[0] == "without it" and found.labels[found.chosen] == "T = 0.1 s"
+    for size, curve in zip(found.sizes, found.curves, strict=True):
         np.testing.assert_allclose(curve, first_order(4.0, size or 0.0), atol=2e-5)
 
 
 def test_the_sizes_of_a_gain_lie_about_1_where_it_is_none() -> None:
     found = size_curves(PLANT, [experiment("e")], diagnosis("gain", {"k": 1.4}, HERE))
-    assert found is not None and found["sizes"] == [None, *(pytest.approx(1.0 + 0.4 * s) for s in SHARES[1:])]
-    half = found["curves"][found["shares"].index(0.5)]
+    assert found is not None and [*found.sizes] == [None, *(pytest.approx(1.0 + 0.4 * s) for s in SHARES[1:])]
+    half = found.curves[found.shares.index(0.5)]
     np.testing.assert_allclose(half, 1.2 * first_order(4.0, 0.0), atol=2e-5)
 
 
 def test_a_limit_is_none_at_infinity() -> None:
     found = size_curves(PLANT, [experiment("e")], diagnosis("saturation", {"level": 0.8}, HERE))
-    assert found is not None and found["sizes"] == [None, *(pytest.approx(0.8 / s) for s in SHARES[1:])]
-    np.testing.assert_allclose(found["curves"][0], first_order(4.0, 0.0), atol=2e-5)
-    ends = [curve[-1] for curve in found["curves"]]
+    assert found is not None and [*found.sizes] == [None, *(pytest.approx(0.8 / s) for s in SHARES[1:])]
+    np.testing.assert_allclose(found.curves[0], first_order(4.0, 0.0), atol=2e-5)
+    ends = [curve[-1] for curve in found.curves]
     assert ends == sorted(ends, reverse=True) and ends[-1] < 0.5  # the lower the limit, the less comes through
 
 
@@ -67,7 +67,7 @@ def test_the_held_out_signal_whose_error_falls_most_in_noise_units_is_shown() ->
     )
     records = [experiment("a"), *(experiment(n, "holdout") for n in "bcd")]
     found = size_curves(PLANT, records, diagnosis("lag", {"T": 0.1}, gap))
-    assert found is not None and (found["experiment"], found["output"]) == ("b", "y")
+    assert found is not None and (found.experiment, found.output) == ("b", "y")
 
 
 def test_without_an_effect_or_a_recording_there_are_no_curves() -> None:

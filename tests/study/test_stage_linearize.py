@@ -333,6 +333,7 @@ def test_a_late_loop_is_unstable_on_the_screen_in_the_json_and_in_the_report(tmp
     assert "phase margin" not in shown
     assert "operating point <strong>unstable" in page and f"({roots}, delays exact)" in page
     assert f"The closed loops are not stable: they have no margins ({roots})" in page
+    assert "mathdefault" not in page  # ticks of the locus are plain numbers
 
 
 def test_a_lower_gain_margin_is_shown(tmp_path):

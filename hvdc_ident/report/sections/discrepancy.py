@@ -15,6 +15,7 @@ from hvdc_ident.report.html import Section, captioned, folded, number, rows_of, 
 from hvdc_ident.report.overlay import Sheet
 from hvdc_ident.summary import Results, RunSummary
 from hvdc_ident.summary.phrases import by_place, gained_sentence
+from hvdc_ident.summary.stage_results import SizeCurves
 from hvdc_ident.summary.tables import findings_table
 from hvdc_ident.text import capital, estimate_text, listed, percentage, quantity, span, with_unit
 
@@ -41,7 +42,7 @@ def _render(results: Results) -> str:
             _findings(s),
             _curve(found),
             _gap(s, found),
-            _slider(results.get("discrepancy").get("sizes")),
+            _slider(results.objects.of_diagnosis.sizes),
             folded(
                 "Where model and recordings differ",
                 _where(s, found),
@@ -110,39 +111,38 @@ def _gap(s: RunSummary, found: Diagnosis) -> str:
     return captioned(picture, caption) + line + note
 
 
-def _slider(sizes: dict[str, Any] | None) -> str:
+def _slider(sizes: SizeCurves | None) -> str:
     """The curves at several sizes of the effect in one drawing, of which a slider shows one."""
-    if not sizes or not sizes.get("curves"):
+    if sizes is None:
         return ""
-    chosen = sizes.get("chosen") or 0
-    data = json.dumps({"labels": sizes["labels"]}).replace("<", "\\u003c")
-    label = f"size of the effect, {sizes['effect']} at {listed(sizes['at'])}"
-    caption = f"{text(sizes['output'])} in {text(sizes['experiment'])} with another size of the effect; below, recorded less simulated."
+    chosen = sizes.chosen or 0
+    data = json.dumps({"labels": sizes.labels}).replace("<", "\\u003c")
+    label = f"size of the effect, {sizes.effect} at {listed(sizes.at)}"
+    caption = f"{text(sizes.output)} in {text(sizes.experiment)} with another size of the effect; below, recorded less simulated."
     return (
         f'<div data-sizes="1" class="screen">{captioned(_at_sizes(sizes, chosen), caption)}<p class="small"><label>{text(label)}: '
-        f'<input type="range" hidden min="0" max="{len(sizes["curves"]) - 1}" value="{chosen}" aria-label="{text(label)}">'
-        f"</label> <output>{text(sizes['labels'][chosen])}</output></p>"
+        f'<input type="range" hidden min="0" max="{len(sizes.curves) - 1}" value="{chosen}" aria-label="{text(label)}">'
+        f"</label> <output>{text(sizes.labels[chosen])}</output></p>"
         f'<script type="application/json">{data}</script></div>'
     )
 
 
-def _at_sizes(sizes: dict[str, Any], chosen: int) -> str:
+def _at_sizes(sizes: SizeCurves, chosen: int) -> str:
     """The drawing: recorded and simulated above, what is left below; the curves of one size are shown."""
-    time, measured = np.asarray(sizes["time"], dtype=float), np.asarray(sizes["measured"], dtype=float)
+    time, measured, unit = sizes.time, sizes.measured, sizes.output_unit
     sheet = Sheet.new(7.4, 3.6, 0.5)
-    top, strip, unit = sheet.top, sheet.strip, sizes.get("output_unit") or ""
+    top, strip = sheet.top, sheet.strip
     top.plot(*visible(time, measured), color=RECORDED, linewidth=1.0, label="recorded")
-    for k, curve in enumerate(sizes["curves"]):
-        values = np.asarray(curve, dtype=float)
+    for k, values in enumerate(sizes.curves):
         for axes, shown in ((top, values), (strip, measured - values)):
             label = "model" if k == chosen and axes is top else None
             (line,) = axes.plot(*visible(time, shown), color=EFFECT, linewidth=1.3, label=label)
             line.set_gid(f"size-{k}-{'top' if axes is top else 'strip'}")
-    top.set_ylabel(with_unit(str(sizes["output"]), unit), fontsize=8)
+    top.set_ylabel(with_unit(sizes.output, unit), fontsize=8)
     strip.set_ylabel(with_unit("error", unit), fontsize=8)
     top.legend(frameon=False, fontsize=8)
-    drawn = svg(sheet.figure, f"{sizes['output']} in {sizes['experiment']}: recorded, and the model with the effect")
-    for k in range(len(sizes["curves"])):
+    drawn = svg(sheet.figure, f"{sizes.output} in {sizes.experiment}: recorded, and the model with the effect")
+    for k in range(len(sizes.curves)):
         hidden = "" if k == chosen else ' style="display: none"'
         for place in ("top", "strip"):
             drawn = drawn.replace(f'<g id="size-{k}-{place}">', f'<g class="size" data-k="{k}"{hidden}>', 1)
