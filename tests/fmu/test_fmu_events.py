@@ -238,7 +238,7 @@ def test_the_step_that_an_event_ends_is_completed_too(fmu, tmp_path, version):
 
 
 # The spring whose input changes at events alone, and which refuses what belongs into another mode.
-MODAL = replace(
+BY_MODE = replace(
     spring("modes", own=False),
     code="#define STRICT\n#define AT_SET(r, v, x) if (v == 8 && m->mode == CONTINUOUS_TIME_MODE) return 3\n" + spring().code,
     variables=tuple(replace(v, variability="discrete") if v.name == "u" else v for v in spring().variables),
@@ -248,7 +248,7 @@ MODAL = replace(
 @pytest.mark.parametrize("version", [2, 3])
 def test_every_call_is_made_in_the_mode_it_belongs_into(tmp_path, version):
     """A run with a jump of the input, and the derivatives at a point beside the start."""
-    model = stepping(MODAL, tmp_path, version)
+    model = stepping(BY_MODE, tmp_path, version)
     time = np.linspace(0.0, 5.0, 251)
     found = simulate(model, experiment("step", time, {"u": InputSignal.step(1.0, 0.0, 1.0)}))
     assert np.abs(found["y"] - response(time)).max() < 2e-7
