@@ -11,8 +11,6 @@ first runs, apart from what the power flow of the plant needs.
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import tempfile
 import tomllib
 from collections.abc import Sequence
@@ -151,7 +149,7 @@ def warm() -> None:
     figures(parse_card(card).with_values(point.inputs), "Vref", 0.02, ("gen.H", "avr.K"))
 
 
-def measure() -> None:
+def main() -> None:
     """Print the figures."""
     warm()
     with tempfile.TemporaryDirectory() as folder:
@@ -170,12 +168,5 @@ def measure() -> None:
         print(f"| {n} | {' | '.join(f'{r[n]:.4g}' for r in rows.values())} |")
 
 
-def main() -> None:
-    """Measure in a process that compiles into an empty folder."""
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "HVDC_IDENT_CACHE": folder, "OMP_NUM_THREADS": "1"}
-        subprocess.run([sys.executable, __file__, "--measure"], env=environment, check=True)
-
-
 if __name__ == "__main__":
-    measure() if sys.argv[1:] == ["--measure"] else main()
+    main()

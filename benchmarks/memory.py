@@ -6,9 +6,7 @@ python benchmarks/memory.py [RUNS] [STRUCTURES]
 from __future__ import annotations
 
 import gc
-import os
 import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -37,15 +35,12 @@ def main(runs: int = 10_000, structures: int = 1_000) -> None:
     print(f"{runs} runs: {before} -> {resident()} KiB")
     names = list(link.parameters)
     pairs = [(a, b, c) for a in names for b in names for c in names if len({a, b, c}) == 3]
-    with tempfile.TemporaryDirectory() as empty:
-        os.environ["HVDC_IDENT_CACHE"] = empty
-        for three in pairs[:50]:
-            Engine(link, three)
-        for source in ("compiled", "from disk"):
-            before = resident()
-            for three in pairs[50 : 50 + structures]:
-                Engine(link, three)
-            print(f"{structures} structures, {source}: {before} -> {resident()} KiB", flush=True)
+    for three in pairs[:50]:
+        Engine(link, three)
+    before = resident()
+    for three in pairs[50 : 50 + structures]:
+        Engine(link, three)
+    print(f"{structures} structures: {before} -> {resident()} KiB", flush=True)
 
 
 if __name__ == "__main__":

@@ -149,7 +149,7 @@ def linearize(
     outputs: Names = None,
     values: Values = None,
     sensitivities: Names = (),
-    pade_order: int = 5,
+    pade_order: int | None = None,
     side: Side = "refuse",
     descriptor: bool = False,
 ) -> LinearModel:
@@ -157,7 +157,7 @@ def linearize(
 
     point: default, the steady state at the model's values and `values`. A study gives the inputs, outputs and point of
     its [linearize] where they are not named here.
-    pade_order: of every delay in the state space (frequency responses take delays exactly). sensitivities: parameters whose
+    pade_order: of every delay in the state space, default 5 (frequency responses take delays exactly). sensitivities: parameters whose
     exact derivatives of A, B, C, D come along. side: of a limit on which the point lies, "refuse", "below" or "above".
     descriptor: keep the algebraic unknowns as states, with E.
 

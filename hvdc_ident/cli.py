@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -116,7 +117,7 @@ def _new_unit(folder: Path, recordings: list[Path], model: str | None, unit: Pss
 
 def _tell_new(console: Console, found: NewStudy) -> None:
     console.print_json(found.to_dict())
-    console.say(*found.lines)
+    console.say(*replace(found, door="shell").lines)
 
 
 def check(
@@ -178,7 +179,10 @@ def _check_fmu(
     found = found if found.problem else tested_capabilities(load_model(path, limits=limits), found)  # type: ignore[arg-type]
     shown = found.matching(find) if find else found
     console.print_json(shown.to_dict())
-    console.say(shown.text(None) if every else shown.text())
+    listed = shown.text(None) if every else shown.text()
+    console.say(listed)
+    if listed != shown.text(None):
+        console.say("", "--all shows every variable, --find TEXT those with TEXT in them")
     if found.problem:
         load_model(path)  # raises, with the way out
 

@@ -69,7 +69,7 @@ def plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if is_dataclass(value) and not isinstance(value, type):
-        return value.to_dict() if isinstance(value, Coded) else _plain_other(value)
+        return _plain_dataclass(value)
     if hasattr(value, "tolist"):
         return plain(value.tolist())
     if isinstance(value, list | tuple | set | frozenset):
@@ -85,7 +85,7 @@ def plain(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
-def _plain_other(value: Any) -> Any:
+def _plain_dataclass(value: Any) -> Any:
     """Return a dataclass by its own `to_dict`, where it has one."""
     own = getattr(value, "to_dict", None)
     return plain_fields(value) if own is None else plain(own())
@@ -150,7 +150,8 @@ def _read(kind: Any, value: Any) -> Any:
 
 def _read_as(kind: type, parts: tuple[Any, ...], value: Any) -> Any:
     if is_dataclass(kind):
-        return kind.from_dict(value) if issubclass(kind, Coded) else _fields(kind, value)
+        own = getattr(kind, "from_dict", None)
+        return _fields(kind, value) if own is None else own(value)
     if issubclass(kind, Mapping):
         _expect(isinstance(value, Mapping), value, "a mapping")
         of = parts[-1] if parts else Any

@@ -328,6 +328,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             raise typer.Exit(1) from None
         except MemoryError:
             end(1, "not enough memory for this study")
+        except ImportError as e:
+            end(1, f"the installation is incomplete: {one_line(e, 300)}. Try: `pip install --force-reinstall hvdc_ident`")
         except Exception as e:
             if os.environ.get("HVDC_IDENT_DEBUG") == "1":
                 traceback.print_exc()

@@ -14,8 +14,8 @@ from hvdc_ident.errors import InputError
 
 WIDTH = 110
 """Characters in a line of a summary."""
-_ONE = r"[-+<>]? ?[\d.,]*(e[-+]\d+)?( %)?"
-_NUMBER = re.compile(rf"((below|above) )?{_ONE}( to {_ONE})?|–")
+_ONE = r"[-+<>]? ?[\d.,]*(e[-+]?\d+)?( %|j)?"
+_NUMBER = re.compile(rf"((below|above) )?{_ONE}( (to|>|±) {_ONE})?|–")
 ROWS_SHOWN = 40
 """Rows of a table that a summary lists, where nothing else is said."""
 

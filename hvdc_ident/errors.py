@@ -10,9 +10,10 @@
     │   ├── StudyError          a study file that asks for the impossible
     │   ├── SteadyStateError    a model that has no steady state where one was asked for
     │   └── LinearizationError  a point, loop or reduction that has no linear answer
-    └── ComputationError        the work ran and failed: exit code 1
-        ├── SimulationError     a trajectory that did not reach its end
-        └── FitError            an estimation that did not reach an optimum
+    ├── ComputationError        the work ran and failed: exit code 1
+    │   ├── SimulationError     a trajectory that did not reach its end
+    │   └── FitError            an estimation that did not reach an optimum
+    └── InstallationError       a part of the package is not there, or of another version: exit code 1
 
 Every message says what is wrong, where, what was expected, what was found and what to try.
 """
@@ -155,6 +156,10 @@ class FitError(ComputationError):
     """An estimation that did not reach an optimum."""
 
 
+class InstallationError(HvdcIdentError):
+    """A part of the package that is not there, or of another version: nothing that was asked for is at fault."""
+
+
 LINE = 100
 """Characters: a message shows as many known names as a line holds, and never more than 12."""
 
@@ -172,11 +177,11 @@ def nearest(name: str, known: Iterable[str]) -> list[str]:
 
 
 def unknown_name(
-    kind: str, name: str, known: Iterable[str], *, where: str = "", listing: str = "", hint: str = ""
+    kind: str, name: str, known: Iterable[str], *, where: str = "", listing: NextStep | None = None, hint: str = ""
 ) -> UnknownNameError:
     """Return the error for a name that is not among the known ones, with the nearest of them as the hint.
 
-    listing: what lists all of them, said where the message cannot. hint: what to try where none is near.
+    listing: the step that lists all of them, said where the message cannot. hint: what to try where none is near.
     """
     names = [str(k) for k in known]
     near = nearest(name, names)
@@ -185,13 +190,12 @@ def unknown_name(
         near = sorted((n for n in names if part in n.casefold()), key=len)[:3]
     shown = ", ".join(names[: _shown(names)])
     more = len(names) - _shown(names)
-    hints = [f"did you mean {' or '.join(repr(n) for n in near)}?"] if near else [hint] if hint else []
-    hints += [f"{listing} lists them"] if listing and more else []
     return UnknownNameError(
         f"no {kind} '{name}'",
         where=where,
         expected=(f"one of {shown}" + (f" and {more} more" if more else "")) if names else f"no {kind}s at all",
-        hint=" ".join(hints),
+        hint=f"did you mean {' or '.join(repr(n) for n in near)}?" if near else hint,
+        next=(listing,) if listing is not None and more else (),
     )
 
 

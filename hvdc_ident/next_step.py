@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 Door = Literal["shell", "python", "page"]
@@ -29,6 +29,10 @@ NextKind = Literal[
     "new-unit",
     "signals",
     "variables",
+    "find",
+    "compile",
+    "check",
+    "option",
 ]
 TO_DO: dict[str, dict[Door, str]] = {
     "diagnose": {"shell": "`hvdc-ident diagnose STUDY`", "python": "`hi.diagnose(...)`", "page": "the stage diagnose"},
@@ -70,6 +74,17 @@ TO_DO: dict[str, dict[Door, str]] = {
         "python": "`print(hi.load_model({!r}).capabilities)`",
         "page": "`hvdc-ident check {}` in a shell",
     },
+    "find": {
+        "shell": "`hvdc-ident check {} --find TEXT`",
+        "python": "`print(hi.load_model({!r}).capabilities)`",
+        "page": "`hvdc-ident check {} --find TEXT` in a shell",
+    },
+    "check": {"shell": "`hvdc-ident check {}`", "python": "`hi.check({!r})`", "page": "`hvdc-ident check {}` in a shell"},
+    "compile": {
+        "shell": "`hvdc-ident check {} --compile`",
+        "python": "`hvdc_ident.fmu.compile_fmu({!r})`",
+        "page": "`hvdc-ident check {} --compile` in a shell",
+    },
 }
 """By kind, what to do; {} is the text of the step, the path of a file or the name of a set of values."""
 PURPOSES = {
@@ -87,6 +102,9 @@ PURPOSES = {
     "new-unit": "writes a study that says so",
     "signals": "lists its signals",
     "variables": "lists its variables; a study names it in [model] source",
+    "find": "lists its variables",
+    "check": "says what a run would stumble over",
+    "compile": "compiles the C sources in it, into a new file",
 }
 VALUES = {
     "effect": "takes those with the effect",
@@ -103,12 +121,19 @@ class NextStep:
     kind: run the diagnosis; record what tells likely effects apart ("separate"); write the letter to the model's owner; record what
     narrows the intervals; export the values; see why nothing is estimated; fit; fit a parameter against its verdict; take the given
     values; state a larger noise, or a smaller one; take another set of values; take another folder; run the study; write a study to
-    start from, one of a recording, one of a unit of PSS/E; list the signals of a recording, the variables of an FMU. text: of a
-    recording, what to record; of a noise, its standard deviations by output; of values, their name; of a file, its path.
+    start from, one of a recording, one of a unit of PSS/E; list the signals of a recording, the variables of an FMU; compile its
+    sources; check a study; give an argument ("option").
+    text: of a recording, what to record; of a noise, its standard deviations by output; of values, their name; of a file, its path;
+    of an argument, its name and value as `workers = 1`. why: what that argument does.
     """
 
     kind: NextKind
     text: str = ""
+    why: str = field(default="", metadata={"json": "why", "optional": True})
+
+
+IN_THIS_PROCESS = NextStep("option", "workers = 1", "does the work in this process")
+ON_DASK = NextStep("option", 'executor = "dask://HOST:PORT"', "does it where a `dask scheduler` runs")
 
 
 def next_phrase(step: NextStep, door: Door = "shell") -> str:
@@ -119,8 +144,21 @@ def next_phrase(step: NextStep, door: Door = "shell") -> str:
         return (
             f"state noise = {{{step.text}}}, or leave it out to have it estimated: the intervals are too wide as they are"
         )
+    if step.kind == "option":
+        return f"`{_option(step.text, door)}` {step.why}"
     told = shlex.quote(step.text) if door == "shell" else step.text
     return f"{TO_DO[step.kind][door].format(told)} {VALUES[step.text] if step.kind == 'values' else PURPOSES[step.kind]}"
+
+
+def _option(text: str, door: Door) -> str:
+    """Return an argument as it is given: `--workers 1` on a command line, `workers=1` in Python, `workers = 1` elsewhere."""
+    name, value = text.split(" = ", 1)
+    if door == "page":
+        return text
+    if door == "python":
+        return f"{name}={value}"
+    flag = f"--{name.replace('_', '-')}"
+    return flag if value == "True" else f"{flag} {value.strip(chr(34))}"
 
 
 def next_sentence(step: NextStep, door: Door = "shell") -> str:

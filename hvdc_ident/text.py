@@ -6,8 +6,8 @@ import math
 import re
 import shlex
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 Interval = Sequence[float | None]
 """The ends of an interval; one that is None is open."""
@@ -206,12 +206,3 @@ def value_by_place(values: Sequence[ValueAtPlace]) -> str:
         )
         told.append(f"{value} if {where}")
     return ", ".join(told)
-
-
-def unstable_roots(stability: Mapping[str, Any]) -> str:
-    """Return how many roots lie right of the imaginary axis, in words. stability: as the results of a linear model have it."""
-    count = stability["unstable_roots"]
-    if count is None or math.isinf(count):
-        return "infinitely many unstable roots"
-    number = f"{count:.0f} unstable root{'' if count == 1 else 's'}"
-    return f"at least {number}" if stability["reason"] else number

@@ -16,6 +16,7 @@ from typer.testing import CliRunner, Result
 from hvdc_ident.cli import app
 from hvdc_ident.errors import SimulationError, unknown_name
 from hvdc_ident.executor import StageProgress, times_of
+from hvdc_ident.simulate import core
 from hvdc_ident.study.stages import stages
 
 CARD = """\
@@ -309,6 +310,25 @@ def test_catalogues(kind: str) -> None:
     assert text.exit_code == 0
     assert len(text.stdout.splitlines()) == len(data[kind]) > 0
     assert all(line.strip() for line in data[kind].values())
+
+
+def test_a_missing_core_is_told_as_an_incomplete_installation(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(core, "FOLDER", tmp_path)
+    core.library.cache_clear()
+    done = call("simulate", study, "--out", tmp_path / "r")
+    core.library.cache_clear()
+    assert done.exit_code == 1 and "the installation is incomplete: the compiled core is not there" in done.output
+    assert "pip install" in done.output and "bug" not in done.output
+
+
+def test_a_missing_package_is_told_as_an_incomplete_installation(study: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(*_: object) -> None:
+        raise ModuleNotFoundError("No module named 'h5py'")
+
+    monkeypatch.setattr("hvdc_ident.study.checks.need_experiments", missing)
+    done = call("simulate", study)
+    assert done.exit_code == 1 and "the installation is incomplete: ModuleNotFoundError: No module named 'h5py'" in done.output
+    assert "pip install" in done.output and "bug" not in done.output
 
 
 def test_convert_and_list(study: Path, tmp_path: Path) -> None:

@@ -69,6 +69,18 @@ def test_the_sdist_holds_the_sources_with_tests_and_guides(built: dict[str, Path
     assert held >= _package_files() | own | top
 
 
+def test_a_wheel_for_another_platform_asks_for_zig_and_an_unknown_one_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is built with it is not run here: zig is too large to fetch for a test."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    import build_backend
+
+    monkeypatch.setenv("HVDC_IDENT_PLATFORM", "macosx_11_0_arm64")
+    assert any(r.startswith("ziglang") for r in build_backend.get_requires_for_build_wheel())
+    monkeypatch.setenv("HVDC_IDENT_PLATFORM", "beos")
+    with pytest.raises(ValueError, match=r"expected one of manylinux2014_x86_64.*got beos"):
+        build_backend.get_requires_for_build_wheel()
+
+
 def test_the_metadata_say_what_an_index_shows(built: dict[str, Path]) -> None:
     with zipfile.ZipFile(built["wheel"]) as archive:
         name = next(n for n in archive.namelist() if n.endswith(".dist-info/METADATA"))

@@ -24,7 +24,7 @@ options result candidates movable nominal prediction hypothesis screen location 
 stand_ins moves known_errors remainder forms size_search search candidate_table classes findings verdict diagnosis
 """,
     "linearize": """
-limits system delays sampling characteristic stability equilibrium plot derivatives point linear_model zeros realisation frequency
+limits system delays sampling characteristic stability equilibrium plot derivatives point linear_model zeros realisation frequency kinds
 fmu_linear jacobian operating_point linearisation mode delayed_modes delayed_locus modal gain_limits loops reduction distance
 transfer_function formula impedance response_file export
 """,

@@ -20,11 +20,12 @@ from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
 from hvdc_ident.study.assemble import study_of
 from hvdc_ident.study.column_matching import Kind, Matching
-from hvdc_ident.study.new_study import matched
+from hvdc_ident.study.new_study import proposal
 from hvdc_ident.study.parse import checked
-from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments, with_derived
+from hvdc_ident.study.recordings import Recordings, read_experiments, with_derived
 from hvdc_ident.study.study import with_nuisances
 from hvdc_ident.study.summary import Summary
+from hvdc_ident.summary.levels import NoiseNote
 
 WRITTEN = ("name", "data", "role", "inputs", "outputs", "columns", "event", "window")
 """Keys of an experiment that a mapping states; all others are kept."""
@@ -98,6 +99,7 @@ class RecordingMap:
             "role": self.role if self.role != "fit" else None,
             **sides,
             "columns": {**self.kept.get("columns", {}), **own},
+            "phases": self.kept.get("phases"),
             "event": self.event,
             "window": None if self.window is None else list(self.window),
         }
@@ -139,7 +141,7 @@ def _ordered(lines: Sequence[SignalLine]) -> tuple[SignalLine, ...]:
 
 
 class LoadedRecording(Recordings):
-    """A recording that has been read, as the reader of experiments asks for it: a file of a million rows is read once."""
+    """A recording as it was read, as the reader of experiments asks for it: a file of a million rows is read once."""
 
     def __init__(self, record: Trajectory) -> None:
         super().__init__(Path())
@@ -166,10 +168,11 @@ class Draft:
 
 
 def proposed(record: Trajectory, model: AnyModel, name: str, data: str) -> tuple[RecordingMap, Matching]:
-    """Return the mapping that names, units and rest levels suggest, and the matching behind it, with candidates for the rest."""
-    found, _ = matched(record, model)
+    """Return the mapping that `new` proposes too, with what three phases give, and the matching behind it, with candidates for the rest."""
+    found, _, phases = proposal(record, model, name)
     lines = [SignalLine(m.target.name, m.target.kind, m.column.name, why=m.reason) for m in found.mapped]
-    return RecordingMap(name, data, _ordered(lines)), found
+    stated = [line.model_dump(exclude_none=True, exclude_defaults=True) for line in phases]
+    return RecordingMap(name, data, _ordered(lines), kept=FrozenMap({"phases": stated} if stated else {})), found
 
 
 def columns_with_derived(mapping: RecordingMap, record: Trajectory, where: str) -> Trajectory:

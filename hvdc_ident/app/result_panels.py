@@ -113,7 +113,7 @@ def _fitted(found: FoundResults, page: Page) -> None:
     names = [n for n in results.experiments if results.table(f"fit.{n}.csv") is not None]
     if not names:
         return
-    roles = {n: "held out" if results.experiments[n].get("role") == "holdout" else "fitted" for n in names}
+    roles = {n: "held out" if results.experiments[n].role == "holdout" else "fitted" for n in names}
     with ui.element("div").classes("line"):
         which = ui.select({n: f"{n} ({roles[n]})" for n in names}, value=names[0], label="experiment")
         which.props("dense options-dense").style("min-width: 14rem")

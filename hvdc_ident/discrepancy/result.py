@@ -12,6 +12,7 @@ from hvdc_ident.display import Shown, data_frame
 from hvdc_ident.display import Table as TextTable
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import InputError, SteadyStateError
+from hvdc_ident.fit.adequacy import ResidualTests
 from hvdc_ident.fit.result import Estimate
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import interval_text, interval_words, percentage, value_by_place
@@ -266,7 +267,7 @@ class Diagnosis(Coded, Shown):
     parameters_refitted: FrozenMap[float] = field(default_factory=FrozenMap)
     parameters_after: FrozenMap[float] = field(default_factory=FrozenMap)
     estimates_after: FrozenMap[Estimate] = field(default_factory=FrozenMap)
-    residual_tests_after: Mapping[str, Any] = field(default_factory=dict)
+    residual_tests_after: ResidualTests = field(default_factory=dict)
     augmented: AnyModel | None = field(default=None, metadata=NOT_STORED)
     augmented_model: str | None = None
     fallback: Mapping[str, Any] | None = None

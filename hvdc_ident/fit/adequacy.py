@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.special import chdtrc, fdtri
@@ -331,29 +331,68 @@ def _line(output: str, size: ResidualSize, source: str) -> str:
     return ""
 
 
-def residual_tests(blocks: Sequence[ResidualBlock], experiments: Sequence[Experiment]) -> dict[str, dict[str, Any]]:
-    """Return the tests by output and experiment; p is the chance of such a value from white noise, None where not defined.
+@dataclass(frozen=True)
+class Whiteness:
+    """Ljung and Box's statistic over so many lags, with its p."""
 
-    Each: n, mean and std (in sigma), ljung_box {statistic, lags, p}, runs {runs, expected, p},
-    inputs {name: {correlation, lag, p}} with lag in rows, the input leading.
-    """
+    statistic: float | None
+    lags: int
+    p: float | None
+
+
+@dataclass(frozen=True)
+class RunsTest:
+    """The number of runs of one sign against the number that chance gives, with its p."""
+
+    runs: int
+    expected: float | None
+    p: float | None
+
+
+@dataclass(frozen=True)
+class InputCorrelation:
+    """The largest correlation of a residual with an input, its lag in rows, the input leading, and the p of all lags."""
+
+    correlation: float | None
+    lag: int | None
+    p: float | None
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """The tests of one residual; mean and std in sigma. p is the chance of such a value from white noise, None where not defined."""
+
+    n: int
+    mean: float
+    std: float
+    ljung_box: Whiteness
+    runs: RunsTest
+    inputs: Mapping[str, InputCorrelation]
+
+
+ResidualTests = Mapping[str, Mapping[str, ResidualTest]]
+"""Tests by output and experiment."""
+
+
+def residual_tests(blocks: Sequence[ResidualBlock], experiments: Sequence[Experiment]) -> dict[str, dict[str, ResidualTest]]:
+    """Return the tests by output and experiment."""
     by_name = {e.name: e for e in experiments}
-    table: dict[str, dict[str, Any]] = {}
+    table: dict[str, dict[str, ResidualTest]] = {}
     for block in blocks:
         r, experiment = block.residual, by_name[block.experiment]
         inputs = {n: signal(experiment.time)[block.rows] for n, signal in experiment.inputs.items()}
-        table.setdefault(block.output, {})[block.experiment] = {
-            "n": int(r.size),
-            "mean": float(r.mean()),
-            "std": float(r.std()),
-            "ljung_box": ljung_box(r, parts=block.stretches),
-            "runs": runs(r),
-            "inputs": {n: cross_correlation(r, u) for n, u in inputs.items() if np.ptp(u) > 0},
-        }
+        table.setdefault(block.output, {})[block.experiment] = ResidualTest(
+            int(r.size),
+            float(r.mean()),
+            float(r.std()),
+            ljung_box(r, parts=block.stretches),
+            runs(r),
+            {n: cross_correlation(r, u) for n, u in inputs.items() if np.ptp(u) > 0},
+        )
     return table
 
 
-def ljung_box(r: Array, parts: Sequence[slice] = ()) -> dict[str, Any]:
+def ljung_box(r: Array, parts: Sequence[slice] = ()) -> Whiteness:
     """Return Ljung and Box's (1978) statistic over the first 10 lags, or a fifth of the rows, with its p.
 
     parts: stretches of rows between which some are missing; none for one stretch.
@@ -363,14 +402,14 @@ def ljung_box(r: Array, parts: Sequence[slice] = ()) -> dict[str, Any]:
     centred = r - r.mean()
     power = float(centred @ centred)
     if lags < 1 or power == 0.0:
-        return {"statistic": None, "lags": lags, "p": None}
+        return Whiteness(None, lags, None)
     records = [centred[part] for part in parts] or [centred]
     acf = np.array([sum(float(c[k:] @ c[:-k]) for c in records) / power for k in range(1, lags + 1)])
     statistic = float(n * (n + 2) * np.sum(acf**2 / (n - np.arange(1, lags + 1))))
-    return {"statistic": statistic, "lags": lags, "p": float(chdtrc(lags, statistic))}
+    return Whiteness(statistic, lags, float(chdtrc(lags, statistic)))
 
 
-def runs(r: Array) -> dict[str, Any]:
+def runs(r: Array) -> RunsTest:
     """Return the number of runs of one sign against what chance gives (Wald and Wolfowitz 1940), with its two-sided p."""
     signs = np.sign(r)
     signs = signs[signs != 0]
@@ -378,15 +417,15 @@ def runs(r: Array) -> dict[str, Any]:
     count = int(1 + (np.diff(signs) != 0).sum()) if signs.size else 0
     n = up + down
     if not up or not down or n < 3:
-        return {"runs": count, "expected": None, "p": None}
+        return RunsTest(count, None, None)
     expected = 1.0 + 2.0 * up * down / n
     variance = (expected - 1.0) * (expected - 2.0) / (n - 1.0)
     if variance <= 0:
-        return {"runs": count, "expected": expected, "p": None}
-    return {"runs": count, "expected": expected, "p": math.erfc(abs(count - expected) / math.sqrt(2.0 * variance))}
+        return RunsTest(count, expected, None)
+    return RunsTest(count, expected, math.erfc(abs(count - expected) / math.sqrt(2.0 * variance)))
 
 
-def cross_correlation(r: Array, u: Array) -> dict[str, Any]:
+def cross_correlation(r: Array, u: Array) -> InputCorrelation:
     """Return the largest correlation of the residual with the same or an earlier input row, its lag, and the p of all lags.
 
     Both are first filtered by their own AR(1) coefficient, so that two slow signals do not count as related; the
@@ -397,10 +436,10 @@ def cross_correlation(r: Array, u: Array) -> dict[str, Any]:
     a, b = _innovation(r), _innovation(u)
     power = math.sqrt(float(a @ a) * float(b @ b))
     if power == 0.0 or n < 5:
-        return {"correlation": None, "lag": None, "p": None}
+        return InputCorrelation(None, None, None)
     ccf = np.array([float(a[k:] @ b[: b.size - k]) / power for k in range(lags + 1)])
     lag = int(np.argmax(np.abs(ccf)))
-    return {"correlation": float(ccf[lag]), "lag": lag, "p": float(chdtrc(lags + 1, n * float(ccf @ ccf)))}
+    return InputCorrelation(float(ccf[lag]), lag, float(chdtrc(lags + 1, n * float(ccf @ ccf))))
 
 
 def _innovation(signal: Array) -> Array:

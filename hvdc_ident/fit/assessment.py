@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
@@ -18,7 +17,7 @@ from hvdc_ident.fit.descent import descend
 from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Curve, compared_rows, stretches
-from hvdc_ident.fit.result import FitResult
+from hvdc_ident.fit.result import FitResult, Goodness, HeldOut, HeldOutQuality, SignalQuality
 from hvdc_ident.fit.simulator import observe, unknown_of
 from hvdc_ident.immutable import FrozenMap
 
@@ -127,29 +126,24 @@ def curves(
     return table
 
 
-def goodness(by_experiment: Mapping[str, Mapping[str, Curve]]) -> dict[str, Any]:
-    """Return the quality of the curves of the fitted experiments: {outputs {output {experiment: see `_quality`}}}."""
-    table: dict[str, dict[str, Any]] = {}
+def goodness(by_experiment: Mapping[str, Mapping[str, Curve]]) -> Goodness:
+    """Return the quality of the curves of the fitted experiments."""
+    table: dict[str, dict[str, SignalQuality]] = {}
     for experiment, line in by_experiment.items():
         for output, c in line.items():
             table.setdefault(output, {})[experiment] = _quality(c)
-    return {"outputs": table}
+    return Goodness(table)
 
 
-def _quality(c: Curve) -> dict[str, Any]:
-    """Return the quality of one curve.
-
-    n: rows; rmse, in the unit; r2: share of the variance explained, None where the record stands still; in_band: share of rows
-    in the 95 % band.
-    """
+def _quality(c: Curve) -> SignalQuality:
     e, y = c.misfit, c.measured[c.rows]
     moved = float(np.sum((y - y.mean()) ** 2))
-    return {
-        "n": int(e.size),
-        "rmse": c.rmse,
-        "r2": 1.0 - float(e @ e) / moved if moved > 0 else None,
-        "in_band": float(np.mean(np.abs(e) <= c.band[c.rows])) if c.band is not None else None,
-    }
+    return SignalQuality(
+        int(e.size),
+        c.rmse,
+        1.0 - float(e @ e) / moved if moved > 0 else None,
+        float(np.mean(np.abs(e) <= c.band[c.rows])) if c.band is not None else None,
+    )
 
 
 def validation(
@@ -157,26 +151,21 @@ def validation(
     result: FitResult,
     by_experiment: Mapping[str, Mapping[str, Curve] | None],
     nuisances: Mapping[str, Mapping[str, float] | None],
-) -> dict[str, Any]:
-    """Return the held-out experiments by name: {status, nuisance, outputs {output: quality and comparison with the fit}}.
-
-    of_fit: RMSE over that of the fitted experiments of this output; near 1 the estimates hold there too. ljung_box:
-    whiteness of the residual. An experiment that cannot be simulated has status "failed".
-    """
+) -> dict[str, HeldOut]:
+    """Return the quality of the curves of the held-out experiments, by name."""
     fitted = {e.name for e in problem.experiments if e.role == "fit"}
-    table: dict[str, Any] = {}
+    table = {}
     for name, line in by_experiment.items():
         outputs = {}
         for output, c in (line or {}).items():
             errors = [v for e, v in result.rmse.get(output, {}).items() if e in fitted and v is not None]
             typical = float(np.sqrt(np.mean(np.square(errors)))) if errors else None
             quality = _quality(c)
-            outputs[output] = {
-                **quality,
-                "rmse_start": result.rmse_start.get(output, {}).get(name),
-                "of_fit": quality["rmse"] / typical if typical else None,
-                "ljung_box": ljung_box(c.residual, parts=stretches(c.rows)),
-            }
-        status = "done" if line else "failed"
-        table[name] = {"status": status, "nuisance": dict(nuisances.get(name) or {}), "outputs": outputs}
+            outputs[output] = HeldOutQuality(
+                quality,
+                result.rmse_start.get(output, {}).get(name),
+                quality.rmse / typical if typical else None,
+                ljung_box(c.residual, parts=stretches(c.rows)),
+            )
+        table[name] = HeldOut("done" if line else "failed", dict(nuisances.get(name) or {}), outputs)
     return table

@@ -6,13 +6,13 @@ It is made once for a set of values, by signal (an output of an experiment), and
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.codec import Coded
+from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.data.units import same_unit
 from hvdc_ident.fit.adequacy import ResidualSize, sizes_of_runs
@@ -26,18 +26,59 @@ Yardstick = Literal["noise", "tolerance", "windows"]
 
 
 @dataclass(frozen=True)
+class Window:
+    """The error of a signal in a window. begin, end: s; n: rows. limits: by kind of error, None where there is none for the unit.
+
+    max, mean, mean_absolute: in the output's unit. within: None where there is no limit, or no row.
+    """
+
+    begin: float = field(metadata=stored_as("from"))
+    end: float = field(metadata=stored_as("to"))
+    n: int
+    limits: Mapping[str, float] | None
+    max: float | None = None
+    mean: float | None = None
+    mean_absolute: float | None = None
+    within: bool | None = None
+
+
+@dataclass(frozen=True)
+class WindowErrors:
+    """The errors of a signal in the windows of a profile. event: s, None where there is none, and then no window.
+
+    within: whether it keeps its limits in every window that is judged; None where none is, with the reason. end: the instant the event
+    is over, s; end_from: "inputs" or "settling".
+    """
+
+    event: float | None = None
+    within: bool | None = None
+    reason: str = ""
+    end: float | None = field(default=None, metadata=stored_as("end", optional=True))
+    end_from: str = field(default="", metadata=stored_as("end_from", optional=True))
+    before: Window | None = field(default=None, metadata=stored_as("before", optional=True))
+    during: Window | None = field(default=None, metadata=stored_as("during", optional=True))
+    after: Window | None = field(default=None, metadata=stored_as("after", optional=True))
+
+    @property
+    def by_name(self) -> dict[str, Window]:
+        """The windows by name."""
+        named = {"before": self.before, "during": self.during, "after": self.after}
+        return {name: window for name, window in named.items() if window is not None}
+
+
+@dataclass(frozen=True)
 class SignalJudgement:
     """One output of one experiment. rmse, peak: root mean square and largest modulus of the error, in the output's unit.
 
     noise: its standard deviation, in the unit; None where none is known. tolerance: of the RMSE, in the unit; None without one.
-    windows: the errors in the windows, see `_errors`. follows: by what the error is held against, None where it is not judged.
+    windows: the errors in the windows. follows: by what the error is held against, None where it is not judged.
     """
 
     rmse: float
     peak: float
     noise: float | None
     tolerance: float | None
-    windows: Mapping[str, Any]
+    windows: WindowErrors
     follows: FrozenMap[bool | None]
 
 
@@ -133,48 +174,42 @@ def judge(
     return Judgement(by, FrozenMap({o: FrozenMap(line) for o, line in signals.items()}))
 
 
-def _signal(curve: Curve, size: ResidualSize, tolerance: float | None, windows: Mapping[str, Any]) -> SignalJudgement:
+def _signal(curve: Curve, size: ResidualSize, tolerance: float | None, windows: WindowErrors) -> SignalJudgement:
     rmse = curve.rmse
     follows = FrozenMap(
         {
             "noise": size.follows,
             "tolerance": None if tolerance is None else rmse <= tolerance,
-            "windows": windows["within"],
+            "windows": windows.within,
         }
     )
     return SignalJudgement(rmse, float(np.abs(curve.misfit).max()), size.noise, tolerance, windows, follows)
 
 
-def _errors(e: Experiment, curve: Curve, profile: ToleranceProfile, unit: str) -> dict[str, Any]:
-    """Return the errors of a signal within the windows of a profile.
-
-    event, end (s; the instant the event is over), end_from ("inputs" or "settling"), and for each window `from`, `to` (s), n, max,
-    mean, mean_absolute (in the output's unit), limits and within (None where there is no limit for the unit, or no row in the
-    window). within: of the signal, whether it keeps its limits in every window that is judged; None where none is, with the reason.
-    """
+def _errors(e: Experiment, curve: Curve, profile: ToleranceProfile, unit: str) -> WindowErrors:
+    """Return the errors of a signal within the windows of a profile."""
     if e.event is None:
-        return {"event": None, "within": None, "reason": "no event: no input moves and none is given"}
+        return WindowErrors(reason="no event: no input moves and none is given")
     end, source = event_end(e, curve.measured, profile.windows["settling"])
     spans = windows(e, end, profile)
     rows = np.zeros(e.time.size, dtype=bool)
     rows[curve.rows] = True
     limited = same_unit(unit, profile.unit)
     found = {w: _window(e.time, spans[w], rows, curve, profile.limits[w] if limited else None) for w in WINDOWS}
-    judged = [w["within"] for w in found.values() if w["within"] is not None]
+    judged = [w.within for w in found.values() if w.within is not None]
     reason = f"the limits are in {profile.unit}, the output is {f'in {unit}' if unit else 'without a unit'}"
     reason = "" if judged else "no row in any window" if limited else reason
-    within = all(judged) if judged else None
-    return {"event": e.event, "end": end, "end_from": source, "within": within, "reason": reason, **found}
+    return WindowErrors(e.event, all(judged) if judged else None, reason, end, source, **found)
 
 
 def _window(
     time: Array, span: Span, rows: NDArray[np.bool_], curve: Curve, limits: Mapping[str, float] | None
-) -> dict[str, Any]:
+) -> Window:
     inside = rows & (time >= span[0]) & (time <= span[1])
     n = int(inside.sum())
-    line: dict[str, Any] = {"from": span[0], "to": span[1], "n": n, "limits": dict(limits) if limits else None}
+    empty = Window(*span, n, dict(limits) if limits else None)
     if n == 0:
-        return {**line, "max": None, "mean": None, "mean_absolute": None, "within": None}
+        return empty
     error = curve.model[inside] - curve.measured[inside]
     kinds = {
         "max": float(np.abs(error).max()),
@@ -182,7 +217,7 @@ def _window(
         "mean_absolute": float(np.abs(error).mean()),
     }
     within = all(abs(kinds[k]) <= v for k, v in limits.items()) if limits else None
-    return {**line, **kinds, "within": within}
+    return replace(empty, within=within, max=kinds["max"], mean=kinds["mean"], mean_absolute=kinds["mean_absolute"])
 
 
 def windows(e: Experiment, end: float, profile: ToleranceProfile) -> dict[str, Span]:

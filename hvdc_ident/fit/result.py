@@ -10,10 +10,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-from hvdc_ident.codec import NOT_STORED, Coded
+from hvdc_ident.codec import INLINE, NOT_STORED, Coded
 from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
-from hvdc_ident.fit.adequacy import Adequacy
+from hvdc_ident.fit.adequacy import Adequacy, ResidualTests, Whiteness
 from hvdc_ident.fit.jump_instants import PlacedInstant
 from hvdc_ident.fit.residual import Curve
 from hvdc_ident.immutable import FrozenMap
@@ -89,6 +89,49 @@ class Covariance:
     dof: float = math.inf
 
 
+@dataclass(frozen=True)
+class SignalQuality:
+    """The quality of a curve. n: rows; rmse, in the unit; r2: share of the variance explained, None where the record stands still;
+    in_band: share of rows in the 95 % band, None without one."""
+
+    n: int
+    rmse: float
+    r2: float | None
+    in_band: float | None
+
+
+@dataclass(frozen=True)
+class Goodness:
+    """The quality of the curves of fitted experiments, by output and experiment."""
+
+    outputs: Mapping[str, Mapping[str, SignalQuality]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class HeldOutQuality:
+    """The quality of a curve of a held-out experiment. rmse_start: at the start. ljung_box: whiteness of the residual.
+
+    of_fit: RMSE over that of the fitted experiments of this output; near 1 the estimates hold there too.
+    """
+
+    quality: SignalQuality = field(metadata=INLINE)
+    rmse_start: float | None
+    of_fit: float | None
+    ljung_box: Whiteness
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """A held-out experiment at the estimates, by output. status: "done", or "failed" where it cannot be simulated.
+
+    nuisance: what was estimated from the experiment itself.
+    """
+
+    status: Literal["done", "failed"]
+    nuisance: Mapping[str, float]
+    outputs: Mapping[str, HeldOutQuality]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class FitResult(Coded, Shown):
     """The outcome of a fit; `to_dict` is the JSON.
@@ -107,7 +150,7 @@ class FitResult(Coded, Shown):
     next: what to try where nothing was fitted. per_experiment: statistics over fits to single experiments, where they were made.
     loss, whitening: what residuals cost, and the AR coefficients they were whitened with, by output.
     dof: degrees of freedom of Student's t behind the intervals, None where the noise is known and white (its square is
-    the F quantile of one parameter). goodness, validation: see there.
+    the F quantile of one parameter). goodness: of the fitted curves; validation: held-out experiments by name.
     covariance: of the unknowns that have one; not in the JSON, which has std and correlation.
     instants: what the rows tell of each parameter that sets the instant of a jump; not in the JSON, whose estimates say it.
     curves: every output of every experiment at the estimates, where assessed; in the files of waveforms, not in the JSON.
@@ -132,7 +175,7 @@ class FitResult(Coded, Shown):
     rho: FrozenMap[float] = field(default_factory=FrozenMap)
     effective_samples: FrozenMap[float] = field(default_factory=FrozenMap)
     correlation: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    residual_tests: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    residual_tests: ResidualTests = field(default_factory=dict)
     starts: tuple[StartOutcome, ...] = ()
     search_doubt: str = ""
     next: tuple[NextStep, ...] = ()
@@ -140,8 +183,8 @@ class FitResult(Coded, Shown):
     loss: str = "linear"
     whitening: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     dof: float | None = None
-    goodness: Mapping[str, Any] = field(default_factory=dict)
-    validation: Mapping[str, Any] = field(default_factory=dict)
+    goodness: Goodness = field(default_factory=Goodness)
+    validation: Mapping[str, HeldOut] = field(default_factory=dict)
     covariance: Covariance | None = field(default=None, metadata=NOT_STORED)
     instants: Mapping[str, PlacedInstant] = field(default_factory=dict, metadata=NOT_STORED)
     curves: Mapping[str, Mapping[str, Curve]] = field(default_factory=dict, metadata=NOT_STORED)

@@ -147,9 +147,7 @@ class Capabilities(Coded):
                 padded = "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=False))
                 lines.append(f"  {padded}  {row[-1]}".rstrip())
             if len(variables) > len(shown):
-                lines.append(
-                    f"  ... and {len(variables) - len(shown)} more: --all shows them, --find TEXT those with TEXT"
-                )
+                lines.append(f"  ... and {len(variables) - len(shown)} more")
         if self.arrays:
             sizes = [f"{n} ({s})" for n, s in self.arrays.items()][:rows]
             lines += [

@@ -55,19 +55,18 @@ def library_suffix() -> str:
     return {"darwin": ".dylib", "win32": ".dll"}.get(sys.platform, ".so")
 
 
-def compiled(command: list[str], sources: Mapping[str, str]) -> bytes:
-    """Return the shared library made of the sources ({name: text}), with the flags of CFLAGS.
+def compiled(command: list[str], sources: Mapping[str, str], main: str) -> bytes:
+    """Return the shared library made of the sources ({name: text}), with the flags of CFLAGS. main: the one that includes the others.
 
     Raises ComputationError with the compiler's first error.
     """
     with tempfile.TemporaryDirectory(prefix="hvdc-ident-") as place:
         for name, text in sources.items():
             Path(place, name).write_text(text, encoding="utf-8")
-        files = [n for n in sources if n.endswith(".c")]
         flags = [*EXPORT_FLAGS, *shlex.split(os.environ.get("CFLAGS", ""))]
         hint = "set CC to another compiler, or export without a binary"
         refusal = "the C compiler did not accept the FMU's sources", shlex.join(command), hint
-        return _library(command, [*flags, *files], Path(place), refusal)
+        return _library(command, [*flags, main], Path(place), refusal)
 
 
 def compile_fmu(path: Path, target: Path | None = None) -> Path:

@@ -15,6 +15,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import ModelError, one_line
 from hvdc_ident.fmu.archive import DESCRIPTION, Folder, check_archive, check_identifier, first_bytes, machine_of
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.next_step import NextStep
 
 Interface = Literal["model-exchange", "co-simulation"]
 INTERFACES: tuple[Interface, ...] = ("model-exchange", "co-simulation")
@@ -288,8 +289,7 @@ def check_binary(path: Path, names: Iterable[str], version: int, identifier: str
     file, have = f"{identifier}{sharedLibraryExtension}", platforms(names)
     expected = f"binaries/{folder}/{file}"
     hint = "have it exported for this machine by the tool it comes from"
-    if has_sources(names):
-        hint = f"`hvdc-ident check {path.name} --compile` compiles the C sources in it, into a new file; or {hint}"
+    steps = (NextStep("compile", path.name),) if has_sources(names) else ()
     if file in have.get(folder, ()):
         with Path(sys.executable).open("rb") as interpreter:
             machine, local = machine_of(first_bytes(path, expected)), machine_of(interpreter.read(64))
@@ -298,7 +298,7 @@ def check_binary(path: Path, names: Iterable[str], version: int, identifier: str
         what, expected, got = f"the FMU's binary {expected} is for another machine", local, machine
     else:
         what, got = "the FMU has no binary for this machine", _in_its_place(folder, have, has_sources(names))
-    raise ModelError(what, where=str(path), expected=expected, got=got, hint=hint)
+    raise ModelError(what, where=str(path), expected=expected, got=got, hint=hint, next=steps)
 
 
 def _in_its_place(folder: str, have: Mapping[str, list[str]], sources: bool) -> str:

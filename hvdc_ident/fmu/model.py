@@ -22,6 +22,7 @@ from hvdc_ident.fmu.description import Description, Interface, Variable, read_de
 from hvdc_ident.fmu.worker_pool import Limits, WorkerPool
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Output
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.parameters import Input, Parameter, with_values
 from hvdc_ident.simulate import Simulation, Tolerance
 
@@ -152,9 +153,9 @@ class FmuModel:
         raise unknown_name("output", name, known, where=where, listing=self._listing)
 
     @property
-    def _listing(self) -> str:
-        """The command that lists the FMU's variables."""
-        return f"`hvdc-ident check {self.fmu.path.name} --find TEXT`"
+    def _listing(self) -> NextStep:
+        """The step that lists the FMU's variables."""
+        return NextStep("find", self.fmu.path.name)
 
     def with_effects(self, effects: Iterable[Any]) -> FmuModel:
         """Return the model with effects at its inputs and outputs, one after the other; neutral ones change nothing."""

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Trajectory, scaled
-from hvdc_ident.errors import WaveformError, unknown_name
+from hvdc_ident.errors import WaveformError, in_python, unknown_name
 
 __all__ = [
     "MAX_BYTES",
@@ -92,6 +92,7 @@ def formats() -> dict[str, Format]:
     return dict(_catalogue())
 
 
+@in_python
 def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None = None) -> Trajectory:
     """The waveforms of a file of any known format: time in s, signals in the file's units, NaN where not recorded.
 

@@ -8,7 +8,7 @@ many there must be is counted by the argument principle on the same determinant,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
@@ -66,14 +66,26 @@ class Part:
         return np.asarray(np.abs(self.matrix[n:, n:]) * kept[:, None])
 
     def factors(self, s: Array) -> Array:
-        """E(s), (frequencies, delays); as large as at `FARTHEST` left of it, where only states before a delay have roots."""
-        return np.array(self._of_delays(response, s), dtype=complex).reshape(len(self.channels), s.size).T
+        """Return (frequencies, rows) what the matrix's rows are multiplied by: 1 of a state, E(s) of a delay.
+
+        E is as large as at `FARTHEST` left of it, where only states before a delay have roots.
+        """
+        return np.stack([*[np.ones_like(s)] * self.nx, *self._of_delays(response, s)], axis=-1)
+
+    def factors_by_s(self, s: Array) -> Array:
+        """Return the derivative of the factors by s."""
+        return np.stack([*[np.zeros_like(s)] * self.nx, *self._of_delays(response_by_s, s)], axis=-1)
+
+    def factors_along(self, s: Array, times: Sequence[Array]) -> Array:
+        """Return the derivative of the factors for a derivative of each delay's time, and of its compute time where it has one."""
+        slopes = self._of_delays(response_slopes, s)
+        moved = [sum(x * t for x, t in zip(by, time, strict=False)) for by, time in zip(slopes, times, strict=True)]
+        return np.stack([*[np.zeros_like(s)] * self.nx, *moved], axis=-1)
 
     def pencil(self, s: Array) -> Array:
         """(frequencies, rows, columns) of the matrix whose determinant is the characteristic function."""
         n, e = self.nx, len(self.channels)
-        rows = np.concatenate([np.ones((s.size, n)), self.factors(s)], axis=1)
-        found = -rows[:, :, None] * self.matrix
+        found = -self.factors(s)[:, :, None] * self.matrix
         found[:, range(n), range(n)] += s[:, None]
         found[:, range(n, n + e), range(n, n + e)] += 1.0
         return np.asarray(found)
@@ -81,19 +93,17 @@ class Part:
     def pencil_by_s(self, s: Array) -> Array:
         """The derivative of the pencil by s."""
         n = self.nx
-        slopes = self._of_delays(response_by_s, s)
-        rows = np.concatenate([np.zeros((s.size, n)), np.array(slopes).reshape(len(self.channels), s.size).T], axis=1)
-        found = -rows[:, :, None] * self.matrix
+        found = -self.factors_by_s(s)[:, :, None] * self.matrix
         found[:, range(n), range(n)] += 1.0
         return np.asarray(found)
 
-    def factor_slopes(self, s: Array) -> list[tuple[Array, Array]]:
-        """Return for each delay the derivatives of its factor by its time and by its compute time."""
-        return self._of_delays(response_slopes, s)
+    def pencil_along(self, s: Array, matrix: Array, times: Sequence[Array]) -> Array:
+        """Return the derivative of the pencil for a derivative of the matrix and of the delays' times."""
+        return -self.factors(s)[:, :, None] * matrix - self.factors_along(s, times)[:, :, None] * self.matrix
 
     def _of_delays(self, function: Callable[[str, float, float, Array], T], s: Array) -> list[T]:
         """Return a function of kind, time, compute time and frequencies for each delay, at the edge of the search left of it."""
-        held = (np.maximum(s.real, -FARTHEST / length) + 1j * s.imag for length in self.lengths)
+        held = (np.maximum(s.real, -FARTHEST / x if x else -np.inf) + 1j * s.imag for x in self.lengths.tolist())
         return [function(c.kind, c.time, c.compute, x) for c, x in zip(self.channels, held, strict=True)]
 
     # --- counting ---
@@ -138,7 +148,7 @@ class Part:
         s = np.array([complex(line, top)])
         a, b = self.matrix[:n, :n], self.matrix[:n, n:]
         inner = self.matrix[n:, n:] + self.matrix[n:, :n] @ np.linalg.solve(s[0] * np.eye(n) - a, b)
-        through = np.linalg.eigvals(self.factors(s)[0][:, None] * inner)
+        through = np.linalg.eigvals(self.factors(s)[0, n:, None] * inner)
         phase = n * np.angle(s[0]) + np.angle(1.0 - np.linalg.eigvals(a) / s[0]).sum() if n else 0.0
         phase += np.angle(1.0 - through).sum()
         found = (phase - self._turned(line, top)) / np.pi

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.characteristic import Part
-from hvdc_ident.linearize.delays import DelayFreePart
-from hvdc_ident.linearize.linear_model import Gradient, LinearModel
+from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.mode import Mode
-from hvdc_ident.linearize.stability import ZERO, Characteristic, sliding_means
+from hvdc_ident.linearize.stability import ZERO, Change, Characteristic, sliding_means
 from hvdc_ident.linearize.system import Array
 
 ALIKE = 1e-7
 """Roots nearer to each other than this share of their size are taken for one of several times."""
+Along = tuple[Array, Sequence[Array]]
+"""The change of a part's matrix with a parameter, and of each of its delays' times, s."""
 CONTOUR = 32
 """Points of the circle around roots that are not apart; the trapezoidal rule converges geometrically on it."""
 
@@ -29,9 +30,8 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     -u dP v / (u P' v). Both depend on the part of the equation alone that the root belongs to, and are taken from it: what a
     fast root leaves in a delay behind it is exp(-s T) times as large as its states, and would hide them.
     """
-    core = model.delay_free
-    assert core is not None
-    zero_delays = [c.name for c in core.channels if c.total == 0.0]
+    assert model.exact is not None
+    zero_delays = [c.name for c in model.exact.channels if c.total == 0.0]
     if zero_delays:
         raise LinearizationError(
             "modes have no computed derivative by a delay of 0 s",
@@ -43,7 +43,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     found_roots = equation.roots
     roots = found_roots.values if found_roots.averaged is None else found_roots.averaged
     whole, means = equation.whole, sliding_means(equation)
-    names = (*model.state_names[: core.nx], *(c.name for c in core.channels))
+    names = (*model.state_names[: equation.nx], *(c.name for c in equation.channels))
     zero = ZERO * max(1.0, float(np.abs(roots).max(initial=0.0)))
     slowest = np.argsort(np.abs(roots), kind="stable")[:means]
     found = []
@@ -59,8 +59,9 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
         share[own] = _participation(part, complex(root), right_of_own, left_of_own)
         radius = 0.3 * float(np.abs(roots - root)[apart].min(initial=whole.unit))
         slopes = {
-            name: _slope(part, _Direction.of(core, g, own), complex(root), right_of_own, left_of_own, place, radius)
+            name: _slope(part, _of_part(g.exact, own, part.nx), complex(root), right_of_own, left_of_own, place, radius)
             for name, g in model.gradients.items()
+            if g.exact is not None
         }
         mean = k in slowest and abs(root) <= zero
         found.append(
@@ -117,47 +118,26 @@ def _shape(right: Array, place: int) -> Array:
     return np.asarray(v / v[np.argmax(np.abs(v))])
 
 
-@dataclass(frozen=True, eq=False)
-class _Direction:
-    """Change of a part with a parameter: of its matrix, and of each delay's times, s."""
-
-    matrix: Array
-    times: tuple[Array, ...]
-
-    @classmethod
-    def of(cls, core: DelayFreePart, gradient: Gradient, places: Array) -> _Direction:
-        assert gradient.delay_free is not None
-        n = core.nx
-        rows, columns = (np.where(places < n, places, places + k) for k in (core.no, core.nu))
-        times = tuple(gradient.times[i - n] for i in places if i >= n)
-        return cls(gradient.delay_free[np.ix_(rows, columns)], times)
+def _of_part(change: Change, places: Array, nx: int) -> Along:
+    """Return the change of a part's matrix and of its delays' times. nx: states of the part, which come first."""
+    first = change.matrix.shape[0] - len(change.times)
+    return change.matrix[np.ix_(places, places)], tuple(change.times[i - first] for i in places[nx:])
 
 
 def _slope(
-    part: Part, direction: _Direction, root: complex, right: Array, left: Array, place: int, radius: float
+    part: Part, along: Along, root: complex, right: Array, left: Array, place: int, radius: float
 ) -> complex:
     """Return the derivative of a root by a parameter; of roots that are one and not apart, the mean."""
     s = np.array([root])
     inner = left @ part.pencil_by_s(s)[0] @ right
     if np.linalg.cond(inner) < 1e6:
-        values = np.linalg.eigvals(-np.linalg.solve(inner, left @ _along(part, direction, s)[0] @ right))
+        values = np.linalg.eigvals(-np.linalg.solve(inner, left @ part.pencil_along(s, *along)[0] @ right))
         return complex(np.sort_complex(values)[min(place, values.size - 1)])
     around = root + radius * np.exp(2j * np.pi * np.arange(CONTOUR) / CONTOUR)
-    pencil, slope, along = part.pencil(around), part.pencil_by_s(around), _along(part, direction, around)
+    pencil, slope, change = part.pencil(around), part.pencil_by_s(around), part.pencil_along(around, *along)
     count = np.trace(np.linalg.solve(pencil, slope), axis1=1, axis2=2) @ (around - root)
-    moved = np.trace(np.linalg.solve(pencil, along), axis1=1, axis2=2) @ (around - root)
+    moved = np.trace(np.linalg.solve(pencil, change), axis1=1, axis2=2) @ (around - root)
     return complex(-moved / count)
-
-
-def _along(part: Part, direction: _Direction, s: Array) -> Array:
-    """Return the derivative of the pencil by a parameter."""
-    n, e = part.nx, len(part.channels)
-    factors = np.ones((s.size, n + e), dtype=complex)
-    slopes = np.zeros((s.size, n + e), dtype=complex)
-    factors[:, n:] = part.factors(s)
-    for i, ((by_time, by_compute), times) in enumerate(zip(part.factor_slopes(s), direction.times, strict=True)):
-        slopes[:, n + i] = by_time * times[0] + (by_compute * times[1] if len(times) > 1 else 0.0)
-    return np.asarray(-(factors[:, :, None] * direction.matrix + slopes[:, :, None] * part.matrix))
 
 
 def _kind(equation: Characteristic, root: complex, right: Array, left: Array, zero: float) -> str:

@@ -1,13 +1,13 @@
 """Elimination of algebraic unknowns, and delays and sampled blocks of a linear model: Pade approximants and exact responses.
 
-`DelayFreePart` is a linear model before its delays are approximated, from which the exact frequency response is computed;
+`without_unknowns` is a linear model before its delays are approximated, from which its exact characteristic equation is made;
 `Blocks` is the matrix over states, inputs and unknowns in which Pade states stand for the delays.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
@@ -161,139 +161,46 @@ def channels(model: Model, s: CompiledSystem, p: Array) -> tuple[Channel, ...]:
 
 
 def _order(size: Layout, inputs: list[int], closed: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return the Jacobian's rows [x', outputs, delayed, eliminated] and columns, the closed delays among the eliminated."""
+    """Return the Jacobian's rows [x', delayed, outputs, eliminated] and columns, the closed delays among the eliminated."""
     open_ = [k for k in range(size.ne) if k not in closed]
     rows = [
         *range(size.nx),
+        *(size.n + k for k in open_),
         *range(size.n + size.ne, size.main),
-        *(size.n + k for k in (*open_, *closed)),
+        *(size.n + k for k in closed),
         *range(size.nx, size.n),
     ]
     columns = [
         *range(size.nx),
+        *(size.n + size.nu + k for k in open_),
         *(size.n + k for k in inputs),
-        *(size.n + size.nu + k for k in (*open_, *closed)),
+        *(size.n + size.nu + k for k in closed),
         *range(size.nx, size.n),
     ]
     return rows, columns
 
 
-def _core(size: Layout, jac: Array, inputs: list[int], closed: Sequence[int]) -> SchurComplement:
-    """Return the Jacobian over [x, inputs, delays' outputs], unknowns and delays of 0 s eliminated."""
+def without_unknowns(size: Layout, jac: Array, inputs: list[int], closed: Sequence[int]) -> SchurComplement:
+    """Return the Jacobian over rows [x', delayed, outputs] and columns [x, delays' outputs, inputs], unknowns eliminated.
+
+    closed: delays of 0 s by their place, which are none.
+    """
     rows, columns = _order(size, inputs, closed)
     jac = jac.copy()
     for k in closed:  # the delayed signal is the signal itself
         jac[size.n + k, size.n + size.nu + k] -= 1.0
-    count = size.ne - len(closed)
-    return eliminate(jac[np.ix_(rows, columns)], size.nx + size.no + count, size.nx + len(inputs) + count)
+    count = size.nx + size.ne - len(closed)
+    return eliminate(jac[np.ix_(rows, columns)], count + size.no, count + len(inputs))
 
 
-@dataclass(frozen=True, eq=False)
-class DelayFreePart:
-    """matrix: rows [x', outputs, delayed], columns [x, inputs, delays' outputs], unknowns eliminated."""
-
-    matrix: Array
-    nx: int
-    no: int
-    nu: int
-    channels: tuple[Channel, ...]
-
-    @classmethod
-    def of(
-        cls, size: Layout, jac: Array, inputs: list[int], found: tuple[Channel, ...], closed: Sequence[int] = ()
-    ) -> DelayFreePart:
-        """Return the core of a Jacobian (main rows, columns). closed: delays of 0 s by their place, which are none."""
-        reduced = _core(size, jac, inputs, closed)
-        if not np.isfinite(reduced.condition):
-            raise LinearizationError("the algebraic part is singular", got="no solution for its unknowns")
-        kept = tuple(c for k, c in enumerate(found) if k not in closed)
-        return cls(reduced.result, size.nx, size.no, len(inputs), kept)
-
-    @staticmethod
-    def derivative(size: Layout, jac: Array, djac: Array, inputs: list[int], closed: Sequence[int] = ()) -> Array:
-        """Return (directions, ...) the derivative of the core's matrix. closed: as in `of`."""
-        rows, columns = _order(size, inputs, closed)
-        count = size.ne - len(closed)
-        r, c = size.nx + size.no + count, size.nx + len(inputs) + count
-        d = djac[:, np.array(rows)[:, None], columns]
-        return _core(size, jac, inputs, closed).derivative(d[:, :r, :c], d[:, :r, c:], d[:, r:, :c], d[:, r:, c:])
-
-    def without_zero_delays(self) -> DelayFreePart:
-        """Return the core in which what a delay of 0 s gives is what it gets. Raises LinearizationError for a loop of gain 1."""
-        closed = [k for k, c in enumerate(self.channels) if c.total == 0.0]
-        if not closed:
-            return self
-        kept = [k for k in range(len(self.channels)) if k not in closed]
-        r, c = self.nx + self.no, self.nx + self.nu
-        matrix = self.matrix.copy()
-        matrix[[r + k for k in closed], [c + k for k in closed]] -= 1.0
-        rows = [*range(r), *(r + k for k in (*kept, *closed))]
-        columns = [*range(c), *(c + k for k in (*kept, *closed))]
-        reduced = eliminate(matrix[np.ix_(rows, columns)], r + len(kept), c + len(kept))
-        if not np.isfinite(reduced.condition):
-            raise LinearizationError("the loop through a delay of 0 s is singular", got="no solution for its signals")
-        return replace(self, matrix=reduced.result, channels=tuple(self.channels[k] for k in kept))
-
-    def response(self, s: Array) -> Array:
-        """Return (frequencies, outputs, inputs) exact transfer matrix at complex frequencies s, rad/s."""
-        try:
-            return self._solve(s)
-        except LinearizationError:
-            if not (s == 0).any():
-                raise
-        # A sliding mean is 0/0 at s = 0: the even part of the response beside it is its limit there, to 1e-10.
-        beside = 1e-5j / (max(c.total for c in self.channels) or 1.0)
-        found = self._solve(np.where(s == 0, beside, s))
-        found[s == 0] = found[s == 0].real
-        return found
-
-    def response_along(self, s: Array, change: Array, times: tuple[Array, ...]) -> Array:
-        """Return the derivative of the response for a derivative of the matrix and of each channel's times."""
-        slopes = np.zeros((len(self.channels), s.size), dtype=complex)
-        for i, c in enumerate(self.channels):
-            by_time, by_compute = response_slopes(c.kind, c.time, c.compute, s)
-            slopes[i] = by_time * times[i][0] + (by_compute * times[i][1] if len(times[i]) > 1 else 0.0)
-        return self._solve(s, (change, slopes, 0.0))
-
-    def response_by_s(self, s: Array) -> Array:
-        """Return the derivative of the response by s."""
-        slopes = [response_by_s(c.kind, c.time, c.compute, s) for c in self.channels]
-        return self._solve(s, (np.zeros_like(self.matrix), np.array(slopes), 1.0))
-
-    def _solve(self, s: Array, along: tuple[Array, Array, float] | None = None) -> Array:
-        """Return the response, or its derivative along a change of the matrix, of each delay's factor, and of s."""
-        n, o, u, e = self.nx, self.no, self.nu, len(self.channels)
-        m = self.matrix
-        exact = np.array([response(c.kind, c.time, c.compute, s) for c in self.channels])  # (e, f)
-        k = s.size
-        x, inp, fed = slice(0, n), slice(n, n + u), slice(n + u, n + u + e)
-        out, src = slice(n, n + o), slice(n + o, n + o + e)
-        unknown = np.zeros((k, n + e, n + e), dtype=complex)
-        unknown[:, :n, :n] = m[x, x] - s[:, None, None] * np.eye(n)
-        unknown[:, :n, n:] = m[x, fed]
-        factor = exact.T[:, :, None]
-        unknown[:, n:, :n] = factor * m[src, x]
-        unknown[:, n:, n:] = factor * m[src, fed] - np.eye(e)
-        given = np.concatenate([np.broadcast_to(m[x, inp], (k, n, u)), factor * m[src, inp]], axis=1)
-        read = np.concatenate([m[out, x], m[out, fed]], axis=1)
-        try:
-            right = np.linalg.solve(unknown, given)
-        except np.linalg.LinAlgError:
-            raise LinearizationError("a frequency lies exactly on a pole", hint="leave this frequency out") from None
-        if along is None:
-            return np.asarray(m[out, inp] - read @ right)
-        change, slopes, by_s = along
-        dfactor = slopes.T[:, :, None]
-        d_unknown = np.zeros_like(unknown)
-        d_unknown[:, :n, :n], d_unknown[:, :n, n:] = change[x, x] - by_s * np.eye(n), change[x, fed]
-        d_unknown[:, n:, :n] = factor * change[src, x] + dfactor * m[src, x]
-        d_unknown[:, n:, n:] = factor * change[src, fed] + dfactor * m[src, fed]
-        d_given = np.concatenate(
-            [np.broadcast_to(change[x, inp], (k, n, u)), factor * change[src, inp] + dfactor * m[src, inp]], axis=1
-        )
-        d_read = np.concatenate([change[out, x], change[out, fed]], axis=1)
-        d_right = np.linalg.solve(unknown, d_given - d_unknown @ right)
-        return np.asarray(change[out, inp] - d_read @ right - read @ d_right)
+def without_unknowns_along(size: Layout, jac: Array, djac: Array, inputs: list[int], closed: Sequence[int]) -> Array:
+    """Return (directions, ...) the derivative of the result of `without_unknowns` for derivatives of the Jacobian."""
+    rows, columns = _order(size, inputs, closed)
+    count = size.nx + size.ne - len(closed)
+    r, c = count + size.no, count + len(inputs)
+    d = djac[:, np.array(rows)[:, None], columns]
+    reduced = without_unknowns(size, jac, inputs, closed)
+    return reduced.derivative(d[:, :r, :c], d[:, :r, c:], d[:, r:, :c], d[:, r:, c:])
 
 
 class Blocks:

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.delays import Blocks, DelayFreePart, SchurComplement, channels, eliminate
+from hvdc_ident.linearize.delays import Blocks, SchurComplement, channels, eliminate
 from hvdc_ident.linearize.limits import in_use, nodes_in_use, structure_roots
 from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array, CompiledSystem
@@ -17,6 +17,8 @@ Side = Literal["refuse", "below", "above"]
 WELL_POSED = 1e12
 """Largest condition number of the algebraic part that is eliminated; beyond it the model stays a descriptor."""
 ON_KINK = 1e-9
+PADE_ORDER = 5
+"""Order of the approximants of delays where none is asked for."""
 
 
 def constants(model: Model) -> list[str]:
@@ -41,9 +43,9 @@ def eliminated(
     return modes, jac, parts, eliminate(parts.matrix(jac), parts.rows, parts.columns)
 
 
-def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array, pade_order: int = 5) -> Array:
+def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Array:
     """Return A, (states, states), at a point given by its vectors, without states that never move. Raises as `linearize` does."""
-    _, _, parts, reduced = eliminated(model, s, y, w, p, "refuse", pade_order)
+    _, _, parts, reduced = eliminated(model, s, y, w, p, "refuse", PADE_ORDER)
     if reduced.condition > WELL_POSED:
         raise LinearizationError(
             "the algebraic part is ill-conditioned",
@@ -67,7 +69,7 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
     _refuse_flat_roots(s, y, w, p, modes, model.name)
     found = channels(model, s, p)
     closed = [k for k, c in enumerate(found) if c.total == 0.0]
-    return Characteristic.of(DelayFreePart.of(s.layout, jac, list(range(s.layout.nu)), found, closed))
+    return Characteristic.of(s.layout, jac, list(range(s.layout.nu)), found, closed)
 
 
 def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:

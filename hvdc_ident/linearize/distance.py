@@ -9,11 +9,11 @@ import scipy.linalg
 
 from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.frequency import transfer, wide_omega
+from hvdc_ident.linearize.frequency import followed, transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.realisation import on_axis, visible
 from hvdc_ident.linearize.reduction import Peak, difference, hankel, linf_norm, peak_over, same_channels
-from hvdc_ident.linearize.stability import Characteristic, Stability, stability
+from hvdc_ident.linearize.stability import ZERO, Characteristic, Stability, sliding_means, stability
 from hvdc_ident.linearize.system import Array
 
 StateSpace = tuple[Array, Array, Array, Array]
@@ -69,35 +69,100 @@ def _padded(values: Array, size: int) -> Array:
 
 
 def winding_count(first: LinearModel, second: LinearModel) -> int:
-    """wno det(1 + P2~ P1) + eta(P1) - eta(P2) - eta0(P2), the count that must be 0; delays in their Pade form.
+    """Return wno det(1 + P2~ P1) + eta(P1) - eta(P2) - eta0(P2), the count that must be 0; delays exact.
 
     The contour passes poles on the axis on their right, so that wno counts zeros less poles right of it; modes that are
-    hidden from inputs or outputs do not belong to the transfer functions and are left out.
+    hidden from inputs or outputs do not belong to the transfer functions and are left out. Raises LinearizationError
+    where the number of a model's unstable poles is not known or infinite, or the determinant has no limit at high frequency.
     """
-    a1, b1, c1, d1 = visible(first)
-    a2, b2, c2, d2 = visible(second)
-    # P2~(s) = P2(-s)^T, in series behind P1, with unit negative feedback.
-    at, bt, ct, dt = -a2.T, -c2.T, b2.T, d2.T
-    through = np.eye(d1.shape[1]) + dt @ d1
+    one, two = _equation(first), _equation(second)
+    through = np.eye(one.through.shape[1]) + two.through.T @ one.through
     if np.linalg.cond(through) > 1e12:
         return 1_000_000
-    series_a = np.block([[a1, np.zeros((a1.shape[0], at.shape[0]))], [bt @ c1, at]])
-    series_b = np.concatenate([b1, bt @ d1])
-    series_c = np.concatenate([dt @ c1, ct], axis=1)
+    (right1, axis1), (right2, axis2) = (_poles_of(e, m) for e, m in ((one, first), (two, second)))
+    if one.channels or two.channels:
+        winding = _wound(one, two, through, np.concatenate([axis1, axis2]).imag)
+    else:
+        winding = _zeros_less_poles(one, two, through)
+    return winding + right1 - right2 - axis2.size
+
+
+def _poles_of(equation: Characteristic, model: LinearModel) -> tuple[int, Array]:
+    """Return the number of poles right of the axis and those on it, sliding means left out."""
+    if not equation.channels:
+        return _right_and_on_axis(equation.matrix)
+    roots = equation.roots
+    if roots.unstable is None or np.isinf(roots.unstable):
+        raise LinearizationError(
+            "the number of unstable poles is not known", where=f"linear model '{model.name}'", got=roots.reason
+        )
+    nearest = roots.values[np.argsort(np.abs(roots.values.real), kind="stable")[: roots.axis]]
+    return int(roots.unstable), nearest[np.argsort(np.abs(nearest), kind="stable")[sliding_means(equation) :]]
+
+
+def _zeros_less_poles(one: Characteristic, two: Characteristic, through: Array) -> int:
+    """Return the zeros less the poles of det(1 + P2~ P1) right of the axis, without delays: from eigenvalues."""
+    # P2~(s) = P2(-s)^T, in series behind P1, with unit negative feedback.
+    at, bt, ct, dt = -two.matrix.T, -two.read.T, two.given.T, two.through.T
+    series_a = np.block([[one.matrix, np.zeros((one.nx, two.nx))], [bt @ one.read, at]])
+    series_b = np.concatenate([one.given, bt @ one.through])
+    series_c = np.concatenate([dt @ one.read, ct], axis=1)
     closed = series_a - series_b @ np.linalg.solve(through, series_c)
-    right1 = _count(a1)[0]
-    right2, axis2 = _count(a2)
-    zeros, poles = _count(closed)[0], right1 + _count(at)[0]
-    return zeros - poles + right1 - right2 - axis2
+    right = [_right_and_on_axis(a)[0] for a in (closed, one.matrix, at)]
+    return right[0] - right[1] - right[2]
 
 
-def _count(a: Array) -> tuple[int, int]:
-    """Return (eigenvalues right of the axis, eigenvalues on it)."""
-    if a.shape[0] == 0:
-        return 0, 0
-    values = np.linalg.eigvals(a)
+def _right_and_on_axis(a: Array) -> tuple[int, Array]:
+    """Return the number of eigenvalues right of the imaginary axis, and those on it."""
+    values = np.linalg.eigvals(a).astype(complex)
     axis = on_axis(values, a)
-    return int(((values.real > 0) & ~axis).sum()), int(axis.sum())
+    return int(((values.real > 0) & ~axis).sum()), values[axis]
+
+
+BESIDE = 1e-4
+"""Distance from a pole on the axis, as a share of its size and of that of the slowest pole, at which the contour passes it."""
+
+
+def _wound(one: Characteristic, two: Characteristic, through: Array, axis: Array) -> int:
+    """Return the zeros less the poles of f = det(1 + P2~ P1) right of the axis, by the turns of f along it, delays exact.
+
+    axis: frequencies of the poles on it, rad/s.
+
+    From a point right of 0 up the axis, round the poles on it; f is real at the first point, and at infinity. Raises
+    LinearizationError where the turns do not close.
+    """
+
+    def determinant(s: Array) -> tuple[Array, Array, Array]:
+        (p1, d1), (p2, d2) = one.response_by_s(s), two.response_by_s(-s)
+        mirrored, slope = np.swapaxes(p2, 1, 2), -np.swapaxes(d2, 1, 2)
+        inner = np.eye(p1.shape[2]) + mirrored @ p1
+        value = np.linalg.det(inner)[:, None, None]
+        turned = np.trace(np.linalg.solve(inner, slope @ p1 + mirrored @ d1), axis1=1, axis2=2)[:, None, None]
+        return value, turned * value, np.zeros(value.shape)
+
+    sizes = np.abs(np.concatenate([one.roots.values, two.roots.values]))
+    sizes = sizes[sizes > ZERO * max(1.0, float(sizes.max(initial=0.0)))] if sizes.size else np.ones(1)
+    near, far = BESIDE * float(sizes.min(initial=1.0)), 1e9 * float(sizes.max(initial=1.0))
+    path = [near + 0j, 1j * near]
+    axis = np.unique(axis[axis > near])
+    for w in axis:
+        path += [1j * w * (1.0 - BESIDE), w * (BESIDE + 1j), 1j * w * (1.0 + BESIDE)]
+    resonant = np.abs(np.concatenate([one.roots.values.imag, two.roots.values.imag]))
+    for w in resonant[(resonant > near) & (resonant < far)]:
+        if (np.abs(w - axis) > 2.0 * BESIDE * w).all():
+            path.append(1j * w)
+    path = [*path[:2], *sorted(path[2:], key=lambda s: s.imag), 1j * far]
+    _, change = followed(determinant, np.array(path))
+    end = complex(determinant(np.array([1j * far]))[0][0, 0, 0])
+    left = np.angle(np.linalg.det(through) / end)
+    turns = -(float(change.imag.sum()) + left) / np.pi
+    if abs(left) > 0.1 or abs(turns - round(turns)) > 1e-3:
+        raise LinearizationError(
+            "the winding of the nu-gap cannot be counted: its determinant has no limit at high frequency",
+            got=f"{turns:.6g} half turns up to {far:.3g} rad/s",
+            hint="add the lag that is there to the way through the delay",
+        )
+    return round(turns)
 
 
 def _graph(model: LinearModel) -> StateSpace:
@@ -145,7 +210,7 @@ def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Pea
             got=f"{len(controller.input_names)} inputs and {len(controller.output_names)} outputs",
         )
     closed = _four_blocks(plant, controller)
-    if plant.delay_free is None and controller.delay_free is None:
+    if plant.exact is None and controller.exact is None:
         poles = closed.poles()
         if (poles.real >= 0).any():
             return Peak(0.0, float(abs(poles[np.argmax(poles.real)].imag)))
@@ -200,7 +265,7 @@ def _closed_with_delays(plant: LinearModel, controller: LinearModel) -> Stabilit
 
 
 def _equation(model: LinearModel) -> Characteristic:
-    if model.delay_free is not None:
+    if model.exact is not None:
         return model.characteristic.visible()
     a, b, c, d = visible(model)
     return Characteristic(a, a.shape[0], (), b, c, d)

@@ -5,7 +5,8 @@ Effects at the FMU's ends are linearised by themselves and put in series with it
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,7 +20,8 @@ from hvdc_ident.errors import (
 )
 from hvdc_ident.fmu import FmuModel, FmuPoint, at_point, smooth_inputs
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, solved
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch, solved
+from hvdc_ident.linearize.kinds import LinearOptions, PointOptions
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.point import OperatingPoint
@@ -30,20 +32,6 @@ ACCURACY = 1e-9
 """Largest scaled derivative that counts as rest: an FMU's own loops are solved no better."""
 NUDGE = 1e-3
 """Change of a parameter, in its sizes, by which derivatives of A, B, C, D are taken; extrapolated from half of it."""
-
-
-def fmu_of(model: External) -> FmuModel:
-    """Return the FMU that a model is. Raises ModelError for another kind of model, and for effects at an FMU's ends."""
-    if not isinstance(model, FmuModel):
-        raise ModelError("this model shows no equations", where=f"model '{model.name}'")
-    if model.effects:
-        raise ModelError(
-            "an FMU with effects at its ends is not linearised",
-            where=f"model '{model.name}'",
-            expected="the FMU alone",
-            hint="linearise it without them; lags and delays can be put in series with the result",
-        )
-    return model
 
 
 class FmuSystem:
@@ -86,84 +74,138 @@ class FmuSystem:
         return ()
 
 
-def fmu_search(
-    given: External,
-    fixed: Mapping[str, float],
-    free: Collection[str],
-    bounds: Mapping[str, tuple[float, float]],
-    guess: Mapping[str, float],
-    *,
-    at: At,
-    moving: Collection[str],
-    time: float,
-) -> tuple[FmuModel, EquilibriumSearch]:
-    """Return the FMU, with fixed variables recorded, and the search for its point, which begins where its initialisation ends.
+@dataclass(frozen=True)
+class LinearFmu:
+    """A model-exchange FMU, as `kinds.Kind` has it."""
 
-    at="start": the FMU stays there. Raises UnknownNameError, SteadyStateError for a free input that changes in steps.
-    """
-    model = fmu_of(given)
-    known = [*model.parameters, *model.inputs]
-    model = model.recording(n for n in fixed if n not in known and model.records(n))
-    everything = [*known, *model.states, *model.outputs]
-    for name in (*fixed, *guess, *bounds):
-        if name not in everything:
-            raise unknown_name("variable", name, everything, where=f"model '{model.name}'")
-    for name in free:
-        if name in model.inputs and name not in smooth_inputs(model):
-            raise SteadyStateError(f"'{name}' changes in steps only and cannot be sought", where="free")
-    s = FmuSystem(model)
-    begin = at_point(model, {n: v for n, v in fixed.items() if n in known}, None, s.outputs, (), time, check=False)
-    start = dict(zip(s.states, begin.x.tolist(), strict=True))
-    if at == "start":
-        fixed, moving = {**start, **{n: v for n, v in guess.items() if n in start}, **fixed}, s.states
-    return model, EquilibriumSearch.of(model, s, fixed, free, bounds, start, at=at, moving=moving, time=time)
+    model: FmuModel
+
+    @classmethod
+    def of(cls, model: External) -> LinearFmu:
+        """Return the FMU that a model is. Raises ModelError for another kind of model, and for effects at an FMU's ends."""
+        if not isinstance(model, FmuModel):
+            raise ModelError("this model shows no equations", where=f"model '{model.name}'")
+        if model.effects:
+            raise ModelError(
+                "an FMU with effects at its ends is not linearised",
+                where=f"model '{model.name}'",
+                expected="the FMU alone",
+                hint="linearise it without them; lags and delays can be put in series with the result",
+            )
+        return cls(model)
+
+    def point(self, asked: PointOptions) -> OperatingPoint:
+        """Return an operating point, its search begun where the FMU's initialisation ends.
+
+        at="start": the FMU stays there. Raises UnknownNameError, SteadyStateError for a free input that changes in steps.
+        """
+        model, search = self._search(asked)
+        return OperatingPoint.of(model, search, solved(model.name, search, asked.guess), "trimmed")
+
+    def linear(self, point: OperatingPoint, asked: LinearOptions) -> LinearModel:
+        """Return A, B, C, D at a point; derivatives by parameters from differences of points and Jacobians.
+
+        provenance tells the method ("directional", or "finite-difference" where one column is), its error, and whether a
+        limit is near. Raises UnknownNameError, and LinearizationError for an input that changes in steps only, and for an
+        option about delays, limits or algebraic unknowns, which an FMU does not show.
+        """
+        _check_shown(self.model, asked)
+        model = self.model.recording(asked.outputs or ())
+        ins, outs = _names(model, asked.inputs, asked.outputs)
+        require_known("parameter", asked.sensitivities, model.parameters, f"model '{model.name}'")
+        p = _at(model, point, outs)
+        a, b, c, d = _matrices(model, p, ins)
+        notes = {
+            "method": "directional" if p.directional.all() else "finite-difference",
+            "jacobian error": f"{p.error:.2g}, of each row's largest entry",
+            "limits": "differences of two step sizes disagree: a limit is near" if p.near else "held as at the point",
+        }
+        states = tuple(model.states)
+        return LinearModel(
+            a, b, c, d, np.eye(a.shape[0]),
+            states,
+            ins,
+            outs,
+            tuple(model.states[n].unit for n in states),
+            tuple(model.inputs[n].unit for n in ins),
+            tuple(model.outputs[n].unit for n in outs),
+            point=point,
+            name=model.name,
+            provenance=FrozenMap(notes),
+            gradients=FrozenMap({n: LinearFmu(model)._gradient(point, n, ins, outs) for n in asked.sensitivities}),
+        )  # fmt: skip
+
+    def jacobian_error(self, point: OperatingPoint, outputs: Sequence[str] | None) -> float:
+        """Return the largest difference between the Jacobian and central differences, of each row's largest entry.
+
+        Where differences are the Jacobian, it is that between two step sizes.
+        """
+        model = self.model.recording(outputs or ())
+        return _at(model, point, _names(model, None, outputs)[1]).error
+
+    def _search(self, asked: PointOptions) -> tuple[FmuModel, EquilibriumSearch]:
+        """Return the FMU, with fixed variables recorded, and the search for its point."""
+        model, fixed, moving = self.model, asked.fixed, asked.moving
+        known = [*model.parameters, *model.inputs]
+        model = model.recording(n for n in fixed if n not in known and model.records(n))
+        everything = [*known, *model.states, *model.outputs]
+        for name in (*fixed, *asked.guess, *asked.bounds):
+            if name not in everything:
+                raise unknown_name("variable", name, everything, where=f"model '{model.name}'")
+        for name in asked.free:
+            if name in model.inputs and name not in smooth_inputs(model):
+                raise SteadyStateError(f"'{name}' changes in steps only and cannot be sought", where="free")
+        s = FmuSystem(model)
+        given = {n: v for n, v in fixed.items() if n in known}
+        begin = at_point(model, given, None, s.outputs, (), asked.time, check=False)
+        start = dict(zip(s.states, begin.x.tolist(), strict=True))
+        if asked.at == "start":
+            fixed, moving = {**start, **{n: v for n, v in asked.guess.items() if n in start}, **fixed}, s.states
+        search = EquilibriumSearch.of(
+            model, s, fixed, asked.free, asked.bounds, start, at=asked.at, moving=moving, time=asked.time
+        )
+        return model, search
+
+    def _gradient(self, point: OperatingPoint, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> Gradient:
+        """Return the total derivatives of A, B, C, D by a parameter, the shift of the operating point included."""
+        model, parameter = self.model, self.model.parameters[name]
+        held = {**point.parameters, **point.inputs}
+        near = dict(point.states) if point.at == "steady" else {}
+
+        def at(value: float) -> list[Array]:
+            moved = {**held, name: value}
+            search = self._search(PointOptions(moved, guess=near, at=point.at, time=point.time))[1]
+            states = solved(model.name, search, near).v
+            return list(_matrices(model, at_point(model, moved, states, outputs, (), point.time), inputs))
+
+        def slope(h: float) -> list[Array]:
+            here = held[name]
+            if here - h >= parameter.min and here + h <= parameter.max:
+                return [(a - b) / (2 * h) for a, b in zip(at(here + h), at(here - h), strict=True)]
+            side = h if here + 2 * h <= parameter.max else -h
+            three = zip(at(here), at(here + side), at(here + 2 * side), strict=True)
+            return [(-3.0 * a + 4.0 * b - c) / (2 * side) for a, b, c in three]
+
+        coarse, fine = slope(NUDGE * parameter.size), slope(0.5 * NUDGE * parameter.size)
+        a, b, c, d = ((4.0 * f - k) / 3.0 for f, k in zip(fine, coarse, strict=True))
+        return Gradient(a, b, c, d)
 
 
-def linear_model(
-    given: External,
-    point: OperatingPoint,
-    inputs: Sequence[str] | None,
-    outputs: Sequence[str] | None,
-    sensitivities: Sequence[str],
-) -> LinearModel:
-    """Return A, B, C, D of an FMU at a point; derivatives by parameters from differences of points and Jacobians.
-
-    provenance tells the method ("directional", or "finite-difference" where one column is), its error, and whether a
-    limit is near. Raises UnknownNameError, or LinearizationError for an input that changes in steps only.
-    """
-    model = fmu_of(given).recording(outputs or ())
-    ins, outs = _names(model, inputs, outputs)
-    require_known("parameter", sensitivities, model.parameters, f"model '{model.name}'")
-    p = _at(model, point, outs)
-    a, b, c, d = _matrices(model, p, ins)
-    notes = {
-        "method": "directional" if p.directional.all() else "finite-difference",
-        "jacobian error": f"{p.error:.2g}, of each row's largest entry",
-        "limits": "differences of two step sizes disagree: a limit is near" if p.near else "held as at the point",
-    }
-    states = tuple(model.states)
-    return LinearModel(
-        a, b, c, d, np.eye(a.shape[0]),
-        states,
-        ins,
-        outs,
-        tuple(model.states[n].unit for n in states),
-        tuple(model.inputs[n].unit for n in ins),
-        tuple(model.outputs[n].unit for n in outs),
-        point=point,
-        name=model.name,
-        provenance=FrozenMap(notes),
-        gradients=FrozenMap({n: _gradient(model, point, n, ins, outs) for n in sensitivities}),
-    )  # fmt: skip
-
-
-def error_of(given: External, point: OperatingPoint, outputs: Sequence[str] | None) -> float:
-    """Return the largest difference between the Jacobian and central differences, of each row's largest entry.
-
-    Where differences are the Jacobian, it is that between two step sizes.
-    """
-    model = fmu_of(given).recording(outputs or ())
-    return _at(model, point, _names(model, None, outputs)[1]).error
+def _check_shown(model: FmuModel, asked: LinearOptions) -> None:
+    """Raise LinearizationError for an option about what an FMU does not show."""
+    options = (
+        ("pade_order", asked.pade_order is not None, "an FMU does not show its delays"),
+        ("side", asked.side != "refuse", "an FMU does not show its limits"),
+        ("descriptor", asked.descriptor, "an FMU does not show its algebraic unknowns"),
+    )
+    for name, given, why in options:
+        if given:
+            raise LinearizationError(
+                f"{why}: {name} has no meaning",
+                where=f"model '{model.name}'",
+                got=f"{name}={getattr(asked, name)!r}",
+                hint=f"leave {name} out, or take the model's equations",
+            )
 
 
 def _names(
@@ -191,32 +233,3 @@ def _matrices(model: FmuModel, p: FmuPoint, inputs: Sequence[str]) -> tuple[Arra
     through = [n + smooth.index(i) for i in inputs]
     j = p.jacobian
     return j[:n, :n], j[:n, through], j[n:, :n], j[n:, through]
-
-
-def _gradient(
-    model: FmuModel, point: OperatingPoint, name: str, inputs: Sequence[str], outputs: Sequence[str]
-) -> Gradient:
-    """Return the total derivatives of A, B, C, D by a parameter, the shift of the operating point included."""
-    size = model.parameters[name].size
-    held = {**point.parameters, **point.inputs}
-    guess = dict(point.states)
-    low, high = model.parameters[name].min, model.parameters[name].max
-
-    def at(value: float) -> list[Array]:
-        moved = {**held, name: value}
-        near = guess if point.at == "steady" else {}
-        _, search = fmu_search(model, moved, (), {}, near, at=point.at, moving=(), time=point.time)
-        states = solved(model.name, search, near).v
-        return list(_matrices(model, at_point(model, moved, states, outputs, (), point.time), inputs))
-
-    def slope(h: float) -> list[Array]:
-        here = held[name]
-        if here - h >= low and here + h <= high:
-            return [(a - b) / (2 * h) for a, b in zip(at(here + h), at(here - h), strict=True)]
-        side = h if here + 2 * h <= high else -h
-        three = zip(at(here), at(here + side), at(here + 2 * side), strict=True)
-        return [(-3.0 * a + 4.0 * b - c) / (2 * side) for a, b, c in three]
-
-    coarse, fine = slope(NUDGE * size), slope(0.5 * NUDGE * size)
-    a, b, c, d = ((4.0 * f - k) / 3.0 for f, k in zip(fine, coarse, strict=True))
-    return Gradient(a, b, c, d)

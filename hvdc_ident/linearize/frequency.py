@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -146,18 +146,14 @@ def transfer(model: LinearModel, s: Array) -> Array:
     Raises LinearizationError exactly on a pole.
     """
     s = np.atleast_1d(np.asarray(s, dtype=complex))
-    if model.delay_free is not None:
-        return model.delay_free.response(s)
-    if model.A.shape[0] == 0:
-        return np.broadcast_to(model.D.astype(complex), (s.size, *model.D.shape)).copy()
-    pencil = s[:, None, None] * model.E - model.A
     try:
-        inner = np.linalg.solve(pencil, np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape)))
+        if model.exact is not None:
+            return model.exact.response(s)
+        return np.asarray(model.C @ np.linalg.solve(*_pencil(model, s)) + model.D)
     except np.linalg.LinAlgError:
         raise LinearizationError(
             "a frequency lies exactly on a pole", where=f"linear model '{model.name}'", hint="leave this frequency out"
         ) from None
-    return np.asarray(model.C @ inner + model.D)
 
 
 def response(model: LinearModel, omega: Array | Sequence[float]) -> Array:
@@ -165,15 +161,48 @@ def response(model: LinearModel, omega: Array | Sequence[float]) -> Array:
     return transfer(model, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
 
 
-def transfer_slope(model: LinearModel, s: Array) -> Array:
-    """Return (points, outputs, inputs) derivative of the transfer matrix by s; delays exact."""
-    if model.delay_free is not None:
-        return model.delay_free.response_by_s(s)
-    if model.A.shape[0] == 0:
-        return np.zeros((s.size, *model.D.shape), dtype=complex)
-    pencil = s[:, None, None] * model.E - model.A
-    inner = np.linalg.solve(pencil, np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape)))
-    return np.asarray(-model.C @ np.linalg.solve(pencil, model.E @ inner))
+def _pencil(model: LinearModel, s: Array) -> tuple[Array, Array]:
+    """Return P(s), (points, rows, rows), and F(s), (points, rows, inputs), of G = C P^-1 F + D."""
+    if model.exact is not None:
+        return model.exact.pencil(s)
+    drive = np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape))
+    return s[:, None, None] * model.E - model.A, drive
+
+
+@dataclass(frozen=True, eq=False)
+class _Resolved:
+    """G = C P^-1 F + D at some points, with right = P^-1 F and left = C P^-1: what its derivatives are made of.
+
+    rounding: a bound on G's rounding errors. The solutions are refined once, after which they are those of a matrix within a
+    few eps of P in every entry (Skeel 1980), however its rows and columns are scaled.
+    """
+
+    values: Array
+    left: Array
+    right: Array
+    rounding: Array
+
+    @classmethod
+    def of(cls, model: LinearModel, s: Array) -> _Resolved:
+        pencil, drive = _pencil(model, s)
+        read, through = (model.C, model.D) if model.exact is None else (model.exact.read, model.exact.through)
+        right = _refined(pencil, drive)
+        seen = np.broadcast_to(read.T.astype(complex), (s.size, *read.T.shape))
+        left = np.swapaxes(_refined(np.swapaxes(pencil, 1, 2), seen), 1, 2)
+        terms = np.abs(left) @ np.abs(pencil) @ np.abs(right) + np.abs(read) @ np.abs(right) + np.abs(through)
+        return cls(read @ right + through, left, right, pencil.shape[1] * np.finfo(float).eps * terms)
+
+    def along(
+        self, pencil: Array, drive: Array | float, read: Array | None = None, through: Array | float = 0.0
+    ) -> Array:
+        """Return the derivative of G for derivatives of P, F, C and D."""
+        inner = self.left @ (drive - pencil @ self.right) + through
+        return np.asarray(inner if read is None else inner + read @ self.right)
+
+
+def _refined(matrix: Array, given: Array) -> Array:
+    found = np.linalg.solve(matrix, given)
+    return np.asarray(found + np.linalg.solve(matrix, given - matrix @ found))
 
 
 VISIBLE = 0.01
@@ -231,68 +260,93 @@ def _visible(model: LinearModel, poles: Array) -> Array:
 
 
 TURN = 0.5
-"""Largest difference in rad between what a phase's slopes at both ends of a step give for it: far below half a turn."""
-ROUNDS = 60
-"""Times that steps are parted where slopes differ: enough for any two numbers to be neighbours."""
+"""Largest difference of two estimates of the change of ln G over a step: with one root r near, G'/G = 1/(s - r), and the slopes at
+the ends of a step of length h differ by h^2/|(s1 - r)(s2 - r)|. Below 0.5 a root beside the middle is 1.3 h away or more, where it
+turns the phase by 0.73 rad, far below the half turn at which an angle could be taken the wrong way round."""
+NARROWEST = 1e-9
+"""Share of its frequency to which a step is halved: a root nearer to the axis lies on either side of it, as rounding has it."""
+MOST = 200_000
+"""Frequencies after which steps are halved no more: what is left then has more turns than anyone looks at, or is rounding noise."""
 
-PER_DECADE = 60
-"""Frequencies that are looked at beside the given ones: two resonances that turn by 180 degrees each hide between two others."""
+
+Sloped = Callable[[Array], tuple[Array, Array, Array]]
+"""A function of complex frequencies, its derivative by s and a bound on its rounding errors, each (points, outputs, inputs)."""
 
 
-def followed_phase(model: LinearModel, omega: Array) -> Array:
-    """Return (n, outputs, inputs) degrees at rising omega, rad/s, turns between the frequencies counted.
+def by_s(model: LinearModel, s: Array) -> tuple[Array, Array, Array]:
+    """Return the response at complex frequencies, its derivative by s and a bound on its rounding errors; delays exact."""
+    found = []
+    for part in np.array_split(s, 1 + s.size * model.A.size // 2_000_000):
+        at = _Resolved.of(model, part)
+        slope = at.along(model.E, 0.0) if model.exact is None else at.along(*model.exact.pencil_by_s(part))
+        found.append((at.values, slope, at.rounding))
+    values, slopes, rounding = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return values, slopes, rounding
 
-    The angles alone leave whole turns open, of which a delay makes many in one step. The phase's slopes Re(G'/G) at both
-    ends tell how many; where they do not agree to `TURN`, the step is parted. A channel that is 0 has 0.
+
+def followed(at: Sloped, s: Array) -> tuple[Array, Array]:
+    """Return complex frequencies from each of s straight to the next, and the changes of ln G over the steps between them.
+
+    The angles alone leave whole turns open, of which a delay makes many in one step, and a damped root hides one. The
+    slopes G'/G of ln G at both ends of a step tell how many, and by the modulus whether a root lies between: where what they
+    give for the step's change of ln G differs by `TURN` among them, or from the change itself, the step is halved. A
+    channel that is not above its rounding errors somewhere is not followed there.
     """
-    if omega.size < 2:
-        return np.degrees(np.angle(transfer(model, 1j * omega)))
-    between = _resonances(approximate_poles(model), omega[0], omega[-1])
-    first = omega[omega > 0.0][0]
-    fill = np.geomspace(first, omega[-1], 2 + round(PER_DECADE * np.log10(omega[-1] / first)))
-    w = np.unique(np.concatenate([omega, between, fill[1:-1]]))
-    values, slopes = _with_slopes(model, w)
-    for _ in range(ROUNDS):
-        change, apart = _turned(w, values, slopes)
-        wide = (apart > TURN).any(axis=(1, 2)) & (np.diff(w) > 1e-9 * w[1:])
-        if not wide.any():
-            break
-        low, high = w[:-1][wide], w[1:][wide]
-        middle = np.where(high > 4.0 * low, np.sqrt(np.maximum(low, 1e-3 * high) * high), 0.5 * (low + high))
-        order = np.argsort(np.concatenate([w, middle]), kind="stable")
-        more, more_slopes = _with_slopes(model, middle)
-        w, values, slopes = (
-            np.concatenate(pair)[order] for pair in ((w, middle), (values, more), (slopes, more_slopes))
+    values, slopes, known = _logarithmic(at, s)
+    while True:
+        step = np.diff(s)[:, None, None]
+        expected = 0.5 * (slopes[1:] + slopes[:-1]) * step
+        change = np.log(values[1:] / values[:-1])
+        change += 2j * np.pi * np.round((expected - change).imag / (2 * np.pi))
+        apart = np.maximum(np.abs(change - expected), np.abs((slopes[1:] - slopes[:-1]) * step))
+        wide = ((apart > TURN) & known[1:] & known[:-1]).any(axis=(1, 2)) & (
+            np.abs(np.diff(s)) > NARROWEST * np.abs(s[1:])
         )
-    change, _ = _turned(w, values, slopes)
-    phase = np.concatenate([np.angle(values[:1]), np.angle(values[:1]) + np.cumsum(change, axis=0)])
-    return np.asarray(np.degrees(phase[np.searchsorted(w, omega)]))
+        if not wide.any() or s.size > MOST:
+            return s, change
+        k = np.flatnonzero(wide)
+        low, high = s[k], s[k + 1]
+        share = np.sqrt(np.maximum(np.abs(low / high), 1e-3))
+        middle = np.where(share < 0.5, share * high, 0.5 * (low + high))
+        added = (middle, *_logarithmic(at, middle))
+        s, values, slopes, known = (
+            np.insert(old, k + 1, new, axis=0) for old, new in zip((s, values, slopes, known), added, strict=True)
+        )
 
 
-def _with_slopes(model: LinearModel, w: Array) -> tuple[Array, Array]:
-    """Return the response, 1 where it is 0, and the slopes of its phase, rad per rad/s."""
-    values = transfer(model, 1j * w)
-    values = np.where(values == 0.0, 1.0, values)
-    return values, (transfer_slope(model, 1j * w) / values).real
+def _logarithmic(at: Sloped, s: Array) -> tuple[Array, Array, Array]:
+    """Return values, the derivative of their logarithm by s, and where they are above their rounding errors; elsewhere 1 and 0."""
+    values, slopes, rounding = at(s)
+    known = np.abs(values) > rounding
+    values = np.where(known, values, 1.0)
+    return values, np.where(known, slopes / values, 0.0), known
 
 
-def _turned(w: Array, values: Array, slopes: Array) -> tuple[Array, Array]:
-    """Return by how much the phase changes over each step, rad, and how far apart are that and what the slopes at its ends give."""
-    step = np.diff(w)[:, None, None]
-    expected = 0.5 * (slopes[1:] + slopes[:-1]) * step
-    change = np.angle(values[1:] / values[:-1])
-    change += 2 * np.pi * np.round((expected - change) / (2 * np.pi))
-    return change, np.maximum(np.abs(change - expected), np.abs(slopes[1:] - slopes[:-1]) * step)
+def followed_phase(at: Sloped, model: LinearModel, omega: Array) -> Array:
+    """Return (n, outputs, inputs) degrees of a response at frequencies in rad/s, turns between them counted.
+
+    model: the one it is made of, whose resonances are looked at. A channel that is 0 has 0.
+    """
+    rising, place = np.unique(omega, return_inverse=True)
+    w = np.unique(np.concatenate([rising, _resonances(approximate_poles(model), rising[0], rising[-1])]))
+    s, change = followed(at, 1j * w)
+    angle = np.angle(at(1j * rising)[0])
+    turned = np.concatenate([angle[:1], angle[:1] + np.cumsum(change.imag, axis=0)])[np.searchsorted(s.imag, rising)]
+    return np.asarray(np.degrees(angle + 2 * np.pi * np.round((turned - angle) / (2 * np.pi))))[place]
+
+
+def phase_of(model: LinearModel, omega: Array) -> Array:
+    """Return (n, outputs, inputs) degrees of a model's response at frequencies in rad/s, as `followed_phase`."""
+    return followed_phase(lambda s: by_s(model, s), model, omega)
 
 
 def frequency_response(model: LinearModel, omega: Array | Sequence[float] | None = None) -> FrequencyResponse:
     """Return the response of every channel at omega in rad/s (default: around the poles)."""
     w = default_omega(model) if omega is None else _checked(omega)
-    rising, place = np.unique(w, return_inverse=True)
     units = tuple((o, i) for o in model.output_units for i in model.input_units)
     return FrequencyResponse(
         w, transfer(model, 1j * w), model.output_names, model.input_names, units,
-        phase=followed_phase(model, rising)[place],
+        phase=phase_of(model, w),
     )  # fmt: skip
 
 
@@ -316,22 +370,14 @@ def sensitivity(
     w = _checked(omega)
     s = 1j * w
     names = list(model.gradients) if parameters is None else list(parameters)
+    at = _Resolved.of(model, s)
     found = {}
     for name in names:
         g = gradient_of(model, name)
-        if model.delay_free is not None and g.delay_free is not None:
-            found[name] = model.delay_free.response_along(s, g.delay_free, g.times)
-            continue
-        pencil = s[:, None, None] * model.E - model.A
-        right = np.linalg.solve(pencil, np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape)))
-        left = np.swapaxes(
-            np.linalg.solve(
-                np.swapaxes(pencil, 1, 2), np.broadcast_to(model.C.T.astype(complex), (s.size, *model.C.T.shape))
-            ),
-            1,
-            2,
-        )
-        found[name] = np.asarray(g.C @ right + left @ (g.A @ right) + left @ g.B + g.D)
+        if model.exact is not None and g.exact is not None:
+            found[name] = at.along(*model.exact.pencil_along(s, g.exact), g.exact.read, g.exact.through)
+        else:
+            found[name] = at.along(-g.A, g.B, g.C, g.D)
     return found
 
 

@@ -6,6 +6,7 @@ Which of these crossings loses stability is decided by counting the roots on eit
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,10 +22,10 @@ from hvdc_ident.linearize.zeros import zeros
 
 @dataclass(frozen=True)
 class Crossing:
-    """A frequency in rad/s and the margin there."""
+    """A frequency in rad/s and the margin there; without limit, both are infinite."""
 
-    omega: float
-    value: float
+    omega: float = math.inf
+    value: float = math.inf
 
 
 NONE = Crossing(float("nan"), float("nan"))

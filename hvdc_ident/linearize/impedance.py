@@ -17,7 +17,7 @@ from hvdc_ident.data import Experiment
 from hvdc_ident.errors import LinearizationError, WaveformError, unknown_name
 from hvdc_ident.expression import TIME, parse, symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.frequency import FrequencyResponse, sensitivity
+from hvdc_ident.linearize.frequency import FrequencyResponse, by_s, followed_phase, phase_of, sensitivity
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.linearisation import linearize
 from hvdc_ident.linearize.operating_point import find_operating_point
@@ -82,26 +82,42 @@ def port_admittance(
     return port_response(port_model(model, port, point), port, omega, "admittance")
 
 
-def port_model(
-    model: Model, port: Port, point: OperatingPoint | None = None, sensitivities: Sequence[str] = ()
-) -> LinearModel:
+def port_model(model: Model, port: Port, point: OperatingPoint | None = None) -> LinearModel:
     """Return the linear model from the disturbances of a port's source to its voltages, then its currents."""
     disturbed, inputs, outputs = disturbed_model(model, port)
     given = {} if point is None else {**point.inputs, **point.parameters}
     guess = {} if point is None else {**point.states, **point.unknowns, **point.extras}
     at = find_operating_point(disturbed, given, guess=guess)
-    return linearize(disturbed, at, inputs=inputs, outputs=outputs, sensitivities=sensitivities)
+    return linearize(disturbed, at, inputs=inputs, outputs=outputs)
 
 
-def port_response(linear: LinearModel, port: Port, omega: Sequence[float] | Array, kind: str) -> FrequencyResponse:
-    """Return the "impedance" or "admittance" that a port's linear model (`port_model`) shows."""
-    top, bottom = _parts(linear.response(np.asarray(omega, dtype=float)), port, kind)
+def port_values(linear: LinearModel, port: Port, w: Array, kind: str) -> Array:
+    """Return (n, k, k) values of the "impedance" or "admittance" that a port's linear model (`port_model`) shows at w, rad/s."""
+    top, bottom = _parts(linear.response(w), port, kind)
     if (np.linalg.cond(bottom) > 1e14).any():
         hint = "choose a source on the other side of the port"
         moved = "both axes of the port" if len(port.axes) == 2 else "the port"
         raise LinearizationError(f"the {kind} does not exist: the disturbance does not move {moved}", hint=hint)
-    values = top @ np.linalg.inv(bottom)
-    return FrequencyResponse(np.atleast_1d(np.asarray(omega, dtype=float)), values, port.axes, port.axes, source=kind)
+    return np.asarray(top @ np.linalg.inv(bottom))
+
+
+def port_phase(linear: LinearModel, port: Port, w: Array, kind: str) -> Array:
+    """Return (n, k, k) degrees of the same, turns between the frequencies counted."""
+
+    def sloped(s: Array) -> tuple[Array, Array, Array]:
+        (top, bottom), (d_top, d_bottom), (off_top, off_bottom) = (_parts(x, port, kind) for x in by_s(linear, s))
+        inverse = np.linalg.inv(bottom)
+        ratio = top @ inverse
+        return ratio, (d_top - ratio @ d_bottom) @ inverse, (off_top + np.abs(ratio) @ off_bottom) @ np.abs(inverse)
+
+    return followed_phase(sloped, linear, w)
+
+
+def port_response(linear: LinearModel, port: Port, omega: Sequence[float] | Array, kind: str) -> FrequencyResponse:
+    """Return the "impedance" or "admittance" that a port's linear model (`port_model`) shows, with its phase."""
+    w = np.atleast_1d(np.asarray(omega, dtype=float))
+    values, phase = port_values(linear, port, w, kind), port_phase(linear, port, w, kind)
+    return FrequencyResponse(w, values, port.axes, port.axes, source=kind, phase=phase)
 
 
 def port_sensitivity(linear: LinearModel, port: Port, omega: Array, kind: str, names: Sequence[str]) -> Array:
@@ -231,14 +247,28 @@ class MeasuredResponse:
     def seen(self, linear: LinearModel, names: Sequence[str] = ()) -> tuple[Array, Array]:
         """Return the same of a linear model that `linear` gave."""
         if self.port is None:
-            rows, columns = list(linear.output_names), list(linear.input_names)
             found = linear.response(self.omega)
-            slopes = [sensitivity(linear, self.omega, names)[n] for n in names] if names else []
+            slopes = np.zeros((*found.shape, 0), dtype=complex)
+            if names:
+                slopes = np.stack([*sensitivity(linear, self.omega, names).values()], axis=-1)
         else:
-            rows = columns = list(self.port.axes)
-            found = port_response(linear, self.port, self.omega, self.kind).values
-            slopes = list(np.moveaxis(port_sensitivity(linear, self.port, self.omega, self.kind, names), -1, 0))
-        return self._picked(found, slopes, [(rows.index(o), columns.index(i)) for o, i in self.channels])
+            found = port_values(linear, self.port, self.omega, self.kind)
+            slopes = port_sensitivity(linear, self.port, self.omega, self.kind, names)
+        return self._channels_of(linear, found), self._channels_of(linear, slopes)
+
+    def phase(self, linear: LinearModel) -> Array:
+        """Return (n, channels) degrees of the response of a linear model that `linear` gave, turns between frequencies counted."""
+        if self.port is None:
+            found = phase_of(linear, self.omega)
+        else:
+            found = port_phase(linear, self.port, self.omega, self.kind)
+        return self._channels_of(linear, found)
+
+    def _channels_of(self, linear: LinearModel, values: Array) -> Array:
+        """Return the measured channels, (n, channels, ...), of (n, outputs, inputs, ...)."""
+        names = (linear.output_names, linear.input_names) if self.port is None else (self.port.axes, self.port.axes)
+        rows, columns = ([n.index(c[k]) for c in self.channels] for k, n in enumerate(names))
+        return np.asarray(values[:, rows, columns])
 
     def _disturbed(self, model: Model) -> tuple[Model, list[str], list[str]]:
         """Return the model with the port's disturbances, made once for a model."""
@@ -256,16 +286,6 @@ class MeasuredResponse:
     def __getstate__(self) -> dict[str, Any]:
         """Return the data alone, which travel to another process."""
         return {k: v for k, v in self.__dict__.items() if k in self.__dataclass_fields__}
-
-    def _picked(self, values: Array, slopes: Sequence[Array], places: Sequence[tuple[int, int]]) -> tuple[Array, Array]:
-        picked = np.stack([values[:, i, j] for i, j in places], axis=1)
-        shape = (*picked.shape, 0)
-        derivatives = (
-            np.stack([np.stack([s[:, i, j] for i, j in places], axis=1) for s in slopes], axis=-1)
-            if len(slopes)
-            else np.zeros(shape, dtype=complex)
-        )
-        return picked, derivatives
 
     def errors(self, model_values: Array) -> list[dict[str, Any]]:
         """Return the distance of a model's response from the measured one, by channel.

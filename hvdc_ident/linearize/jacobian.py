@@ -3,39 +3,105 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.errors import LinearizationError, require_known
+from hvdc_ident.errors import LinearizationError, SteadyStateError, require_known
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.delays import Blocks, DelayFreePart, SchurComplement
-from hvdc_ident.linearize.derivatives import WELL_POSED, Side, eliminated
+from hvdc_ident.linearize.delays import Blocks, SchurComplement, without_unknowns_along
+from hvdc_ident.linearize.derivatives import PADE_ORDER, WELL_POSED, Side, constants, eliminated
+from hvdc_ident.linearize.equilibrium import EquilibriumSearch, Root, solved, weights
+from hvdc_ident.linearize.kinds import LinearOptions, PointOptions
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.point import Branch, OperatingPoint
+from hvdc_ident.linearize.stability import Change, Characteristic, quartered
 from hvdc_ident.linearize.system import Array, CompiledSystem, system
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import Model
+from hvdc_ident.simulate import equilibria, resting
 
 
-def linear_at(
-    model: AnyModel,
-    at: OperatingPoint,
-    inputs: Sequence[str] | None = None,
-    outputs: Sequence[str] | None = None,
-    pade_order: int = 5,
-    sensitivities: Sequence[str] = (),
-    side: Side = "refuse",
-    descriptor: bool = False,
-) -> LinearModel:
-    """Return the linear model at an operating point; arguments and errors as in `linearize`, states that never move among its states."""
-    if not isinstance(model, Model):
-        from hvdc_ident.linearize.fmu_linear import linear_model
+@dataclass(frozen=True)
+class EquationModel:
+    """A model with equations, as `kinds.Kind` has it: its points on its graph, its linear model by exact derivatives."""
 
-        return linear_model(model, at, inputs, outputs, sensitivities)
-    s = system(model, outputs)
-    chosen = _chosen(s, inputs, model.name)
-    require_known("parameter", sensitivities, s.parameters, f"model '{model.name}'")
-    modes, jac, parts, reduced = eliminated(model, s, at.y, at.w, at.p, side, pade_order)
-    keep = descriptor or reduced.condition > WELL_POSED
+    model: Model
+
+    def point(self, asked: PointOptions) -> OperatingPoint:
+        """Return an operating point: of inputs and parameters alone the steady state that a simulation starts from."""
+        model = self.model
+        search = EquilibriumSearch.of_model(
+            model, asked.fixed, asked.free, asked.bounds, at=asked.at, moving=asked.moving, time=asked.time
+        )
+        if search.is_plain and not asked.guess:
+            return OperatingPoint.of(model, search, *steady(model, search))
+        own = _own(model, search)
+        root = solved(model.name, search, asked.guess, own)
+        if not search.is_plain:
+            return OperatingPoint.of(model, search, root, "trimmed")
+        same = own is not None and np.allclose(
+            root.v, own, rtol=1e-6, atol=1e-6 * max(1.0, float(np.abs(own).max(initial=0.0)))
+        )
+        return OperatingPoint.of(model, search, root, "own" if own is None or same else "other")
+
+    def linear(self, point: OperatingPoint, asked: LinearOptions) -> LinearModel:
+        """Return the linear model at a point, states that never move as inputs: a reference that the start is found with is no mode."""
+        fixed = constants(self.model)
+        if not fixed:
+            return _linear_at(self.model, point, asked)
+        held = self.model.with_values({**point.parameters, **point.inputs}).driven(fixed)
+        held = held.with_values({n: point.states[n] for n in fixed})
+        guess = {n: v for n, v in (point.states | point.unknowns).items() if n not in fixed}
+        return _linear_at(held, EquationModel(held).point(PointOptions(guess=guess)), asked)
+
+    def jacobian_error(self, point: OperatingPoint, outputs: Sequence[str] | None) -> float:
+        """Return the largest difference from the Jacobian by complex steps, relative to each row's largest entry."""
+        s = system(self.model, outputs)
+        y, w, p = point.y, point.w, point.p
+        exact = s.jacobian(y, w, p, s.modes(y, w, p))[: s.layout.main]
+        scale = np.maximum(np.abs(exact).max(axis=1, initial=0.0), 1e-300)
+        return float((np.abs(exact - s.complex_step(y, w, p)) / scale[:, None]).max(initial=0.0))
+
+
+def steady(model: Model, search: EquilibriumSearch) -> tuple[Root, Branch]:
+    """Return the steady state that a simulation of the same inputs and parameters starts from, and its branch."""
+    free = model if search.at == "start" else resting(model)
+    try:
+        at = equilibria(free)
+        found = at.start(free, search.p, search.u, search.time)
+    except SteadyStateError as e:
+        raise SteadyStateError(
+            e.what,
+            where=e.where,
+            expected=e.expected,
+            got=e.got,
+            hint=f"{e.hint}; states that need not rest can be named in `moving`",
+        ) from None
+    v = found.v
+    with np.errstate(all="ignore"):
+        r, jac = search.equations(v)
+        shares = np.abs(r) / weights(jac, v)
+    return Root(v, r, shares, 0, "newton"), found.branch
+
+
+def _own(model: Model, search: EquilibriumSearch) -> Array | None:
+    """Return the model's own steady state at the search's inputs and parameters; None where it has none there."""
+    free = model if search.at == "start" else resting(model)
+    at = equilibria(free)
+    try:
+        return at.start(free, search.p, search.u, search.time).v
+    except SteadyStateError:
+        return None
+
+
+def _linear_at(model: Model, at: OperatingPoint, asked: LinearOptions) -> LinearModel:
+    """Return the linear model at a point, states that never move among its states."""
+    s = system(model, asked.outputs)
+    chosen = _chosen(s, asked.inputs, model.name)
+    require_known("parameter", asked.sensitivities, s.parameters, f"model '{model.name}'")
+    order = PADE_ORDER if asked.pade_order is None else asked.pade_order
+    modes, jac, parts, reduced = eliminated(model, s, at.y, at.w, at.p, asked.side, order)
+    keep = asked.descriptor or reduced.condition > WELL_POSED
     if keep and parts.channels:
         raise LinearizationError(
             "the algebraic loop through a delay's direct part is ill-posed",
@@ -43,10 +109,10 @@ def linear_at(
             got=f"condition number {reduced.condition:.2g}",
             hint="choose another pade_order, or open the loop at a signal in it",
         )
-    names = sensitivities if not keep else ()
+    names = asked.sensitivities if not keep else ()
     closed = _closed(s, at.p, parts, names)
     gradient = _gradient(s, at, parts, jac, modes, reduced, names, chosen, closed) if names else {}
-    return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, side, closed)
+    return _model(model, s, at, parts, jac, reduced, chosen, keep, gradient, asked.side, closed)
 
 
 def _closed(s: CompiledSystem, p: Array, parts: Blocks, names: Sequence[str]) -> tuple[int, ...]:
@@ -80,12 +146,15 @@ def _gradient(
     r, c = parts.rows, parts.columns
     changes = reduced.derivative(along[:, :r, :c], along[:, :r, c:], along[:, r:, :c], along[:, r:, c:])
     kept = [ch for k, ch in enumerate(parts.channels) if k not in closed]
-    core = DelayFreePart.derivative(s.layout, jac, djac, chosen, closed) if kept else None
+    exact = without_unknowns_along(s.layout, jac, djac, chosen, closed) if kept else None
     found = {}
     for k, name in enumerate(names):
         a, b, c_, d = parts.split(changes[k], chosen)
-        free = None if core is None else core[k]
-        found[name] = Gradient(a, b, c_, d, free, tuple(by_p[list(ch.places), k] for ch in kept))
+        change = None
+        if exact is not None:
+            times = tuple(by_p[list(ch.places), k] for ch in kept)
+            change = Change(*quartered(exact[k], s.layout.nx + len(kept)), times)
+        found[name] = Gradient(a, b, c_, d, change)
     return found
 
 
@@ -172,7 +241,7 @@ def _model(
         name=model.name,
         provenance=FrozenMap(notes),
         gradients=FrozenMap(gradient),
-        delay_free=DelayFreePart.of(s.layout, jac, chosen, parts.channels, closed)
+        exact=Characteristic.of(s.layout, jac, chosen, parts.channels, closed)
         if len(parts.channels) > len(closed)
         else None,
     )  # fmt: skip

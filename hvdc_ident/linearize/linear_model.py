@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import scipy.linalg
@@ -14,9 +14,9 @@ from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, ModelError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.lazy import method
-from hvdc_ident.linearize.delays import DelayFreePart, eliminate
+from hvdc_ident.linearize.delays import eliminate
 from hvdc_ident.linearize.point import OperatingPoint
-from hvdc_ident.linearize.stability import Characteristic
+from hvdc_ident.linearize.stability import Change, Characteristic
 from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from hvdc_ident.linearize import export, frequency, loops, modal, plot, reduction, transfer_function, zeros
 
 
+Exact = TypeVar("Exact", Change, Characteristic)
 SCHEMA = 1
 KINDS = ("state", "input", "output")
 """What has names and units."""
@@ -32,22 +33,21 @@ KINDS = ("state", "input", "output")
 
 @dataclass(frozen=True, eq=False)
 class Gradient:
-    """The derivatives of A, B, C, D by one parameter; delay_free and times: those of the exact delayed model."""
+    """The derivatives of A, B, C, D by one parameter; exact: those of the equation with exact delays."""
 
     A: Array
     B: Array
     C: Array
     D: Array
-    delay_free: Array | None = None
-    times: tuple[Array, ...] = ()
+    exact: Change | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearModel(Shown):
     """E x' = A x + B u, y = C x + D u: deviations from the operating point, in the model's units, time in s.
 
-    E is the identity unless the algebraic part had to stay. gradients: derivatives by parameter name. delay_free: the
-    model before its delays were approximated, where it has any: what frequency responses are exact with.
+    E is the identity unless the algebraic part had to stay. gradients: derivatives by parameter name. exact: the model
+    before its delays were approximated, where it has any: what frequency responses and stability rest on.
 
     Raises LinearizationError where the matrices' sizes do not fit, or an entry is not finite.
     """
@@ -67,7 +67,7 @@ class LinearModel(Shown):
     name: str = "model"
     provenance: FrozenMap[str] = field(default_factory=FrozenMap)
     gradients: FrozenMap[Gradient] = field(default_factory=FrozenMap)
-    delay_free: DelayFreePart | None = None
+    exact: Characteristic | None = None
     x0: tuple[float, ...] = ()
     u0: tuple[float, ...] = ()
     y0: tuple[float, ...] = ()
@@ -165,31 +165,21 @@ class LinearModel(Shown):
 
     def _rewired(self, columns: Callable[[Array], Array], rows: Callable[[Array], Array], **fields: Any) -> LinearModel:
         """Return the model with the columns of its inputs and the rows of its outputs changed, in every matrix it has."""
-        core = self.delay_free
 
-        def whole(m: Array) -> Array:
-            assert core is not None
-            n, u, y = core.nx, core.nx + core.nu, core.nx + core.no
-            m = np.concatenate([m[:, :n], columns(m[:, n:u]), m[:, u:]], axis=1)
-            return np.concatenate([m[:n], rows(m[n:y]), m[y:]])
+        def exact(m: Exact) -> Exact:
+            return replace(m, given=columns(m.given), read=rows(m.read), through=rows(columns(m.through)))
 
-        gradients = {
-            k: Gradient(
-                g.A, columns(g.B), rows(g.C), rows(columns(g.D)),
-                None if g.delay_free is None else whole(g.delay_free), g.times,
-            )
-            for k, g in self.gradients.items()
-        }  # fmt: skip
-        d = rows(columns(self.D))
-        if core is not None:
-            core = replace(core, matrix=whole(core.matrix), no=d.shape[0], nu=d.shape[1])
+        def slope(g: Gradient) -> Gradient:
+            change = None if g.exact is None else exact(g.exact)
+            return Gradient(g.A, columns(g.B), rows(g.C), rows(columns(g.D)), change)
+
         return replace(
             self,
             B=columns(self.B),
             C=rows(self.C),
-            D=d,
-            gradients=FrozenMap(gradients),
-            delay_free=core,
+            D=rows(columns(self.D)),
+            gradients=FrozenMap({k: slope(g) for k, g in self.gradients.items()}),
+            exact=None if self.exact is None else exact(self.exact),
             **fields,
         )
 
@@ -198,7 +188,7 @@ class LinearModel(Shown):
         n = a.shape[0]
         return replace(
             self, A=a, B=b, C=c, D=d, E=np.eye(n), x0=(0.0,) * n, state_units=(),
-            state_names=tuple(f"{prefix}{k + 1}" for k in range(n)), delay_free=None, gradients=FrozenMap(), **fields,
+            state_names=tuple(f"{prefix}{k + 1}" for k in range(n)), exact=None, gradients=FrozenMap(), **fields,
         )  # fmt: skip
 
     def _index(self, kind: str, name: str) -> int:
@@ -247,8 +237,8 @@ class LinearModel(Shown):
     @cached_property
     def characteristic(self) -> Characteristic:
         """The exact characteristic equation of a model with delays; poles, modes and stability rest on one search for its roots."""
-        assert self.delay_free is not None
-        return Characteristic.of(self.delay_free.without_zero_delays())
+        assert self.exact is not None
+        return self.exact.without_zero_delays()
 
     # --- analysis: functions of other modules, bound when they are first asked for ---
 
@@ -311,7 +301,7 @@ class LinearModel(Shown):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> LinearModel:
-        """Return the model that `to_dict` wrote, without its operating point. Raises ModelError for anything else."""
+        """Return the model that `to_dict` wrote, its delays in their Pade form. Raises ModelError or InputError for anything else."""
         if not isinstance(data, Mapping) or data.get("schema") != SCHEMA or "A" not in data:
             raise ModelError(
                 "this is no linear model",
@@ -322,6 +312,8 @@ class LinearModel(Shown):
             fields: dict[str, Any] = {k: data[k] for k in "ABCDE"}
             fields |= {f"{k}_{w}": tuple(data[f"{k}_{w}"]) for k in KINDS for w in ("names", "units")}
             fields |= {k: tuple(data[k]) for k in ("x0", "u0", "y0")}
+            if "operating_point" in data:
+                fields["point"] = OperatingPoint.from_dict(data["operating_point"])
             return cls(**fields, name=data["model"], provenance=FrozenMap(data.get("provenance", {})))
         except (KeyError, TypeError, ValueError) as e:
             raise ModelError(

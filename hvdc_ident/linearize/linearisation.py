@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from hvdc_ident.linearize.derivatives import Side
-from hvdc_ident.linearize.jacobian import linear_at
+from hvdc_ident.linearize.kinds import LinearOptions, PointOptions
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.operating_point import find_operating_point, with_constants_as_inputs
+from hvdc_ident.linearize.operating_point import kind_of
 from hvdc_ident.linearize.point import OperatingPoint
-from hvdc_ident.linearize.system import system
 from hvdc_ident.model import AnyModel, Model
 
 
@@ -21,19 +18,20 @@ def linearize(
     *,
     inputs: Sequence[str] | str | None = None,
     outputs: Sequence[str] | str | None = None,
-    pade_order: int = 5,
+    pade_order: int | None = None,
     sensitivities: Sequence[str] = (),
     side: Side = "refuse",
     descriptor: bool = False,
 ) -> LinearModel:
     """Return the linear model between inputs and outputs (of outputs or named signals; default all) at an operating point.
 
-    point: default, the steady state found from the model's values. pade_order: of every delay in the state space (the
-    frequency response takes the delays exactly). sensitivities: parameters whose exact total derivatives of A, B, C, D
+    point: default, the steady state found from the model's values. pade_order: of every delay in the state space, 5 where
+    none is given (the frequency response takes the delays exactly). sensitivities: parameters whose exact total derivatives of A, B, C, D
     come along, the shift of the operating point included. side: what to do where the point lies on a kink: "refuse",
     or the Jacobian "below" or "above" the limit. descriptor: keep the algebraic unknowns as states, with E.
 
-    Raises UnknownNameError, and LinearizationError on a kink, for an ill-posed loop, or Jacobian entries not finite.
+    Raises UnknownNameError, and LinearizationError on a kink, for an ill-posed loop, Jacobian entries not finite, or an option
+    that an FMU cannot answer: it shows neither delays nor limits nor algebraic unknowns.
 
     >>> from hvdc_ident import linearize, load_model
     >>> linear = linearize(load_model("vsc-hvdc-link"), inputs="Vdcref1", outputs="Irorder1")
@@ -42,11 +40,11 @@ def linearize(
     >>> [round(mode.frequency_hz, 2) for mode in linear.modes() if mode.frequency_hz > 0.1]
     [4.87, 4.87]
     """
-    at = find_operating_point(model) if point is None else point
-    model, at = with_constants_as_inputs(model, at)
     inputs = [inputs] if isinstance(inputs, str) else inputs
     outputs = [outputs] if isinstance(outputs, str) else outputs
-    return linear_at(model, at, inputs, outputs, pade_order, sensitivities, side, descriptor)
+    kind = kind_of(model)
+    at = kind.point(PointOptions()) if point is None else point
+    return kind.linear(at, LinearOptions(inputs, outputs, pade_order, sensitivities, side, descriptor))
 
 
 def one_sided(
@@ -55,7 +53,7 @@ def one_sided(
     *,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
-    pade_order: int = 5,
+    pade_order: int | None = None,
     sensitivities: Sequence[str] = (),
     descriptor: bool = False,
 ) -> tuple[LinearModel, LinearModel]:
@@ -77,14 +75,9 @@ def one_sided(
 
 
 def jacobian_error(model: AnyModel, point: OperatingPoint, outputs: Sequence[str] | None = None) -> float:
-    """Return the largest difference between the Jacobian and one by complex steps, relative to each row's largest entry."""
-    if not isinstance(model, Model):
-        from hvdc_ident.linearize.fmu_linear import error_of
+    """Return the largest difference between the Jacobian and an independent one, relative to each row's largest entry.
 
-        return error_of(model, point, outputs)
-    s = system(model, outputs)
-    y, w, p = point.y, point.w, point.p
-    exact = s.jacobian(y, w, p, s.modes(y, w, p))[: s.layout.main]
-    other = s.complex_step(y, w, p)
-    scale = np.maximum(np.abs(exact).max(axis=1, initial=0.0), 1e-300)
-    return float((np.abs(exact - other) / scale[:, None]).max(initial=0.0))
+    Of a model with equations that is one by complex steps; of an FMU one by central differences, or where differences are the
+    Jacobian one by differences of another step.
+    """
+    return kind_of(model).jacobian_error(point, outputs)

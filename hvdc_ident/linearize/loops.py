@@ -7,14 +7,15 @@ Slycot's bound for the disk margin of several loops is up to 1e-3 above this one
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from scipy.optimize import brentq, minimize, minimize_scalar
 from scipy.sparse.csgraph import connected_components
 
+from hvdc_ident.codec import Coded, plain, stored_as
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
@@ -114,7 +115,7 @@ def loop(
     point: OperatingPoint | None = None,
     *,
     sensitivities: Sequence[str] = (),
-    pade_order: int = 5,
+    pade_order: int | None = None,
 ) -> Loop:
     """Return the loop opened at a named signal, unknown or state, or several opened together, at the operating point.
 
@@ -190,7 +191,7 @@ Curves = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
-class Margins:
+class Margins(Coded):
     """Margins of 1 + L = 0. Infinite where the curve has no such crossing, nan where the closed loop is not stable.
 
     gain: factors on L that reach -1, nearest to 1 first, those at 0 and infinite frequency among them. gain_margin: the
@@ -200,14 +201,15 @@ class Margins:
     |(S - T)/2| < 1/alpha, with the gain and phase it guarantees together. stability: of the closed loop, delays exact.
     """
 
-    gain: tuple[Crossing, ...]
+    gain: tuple[Crossing, ...] = field(metadata=stored_as("gain_crossings"))
     gain_margin: Crossing
     lower_gain_margin: Crossing
-    phase: tuple[Crossing, ...]
-    delay: Crossing
-    modulus: Crossing
-    disk: Crossing
+    phase: tuple[Crossing, ...] = field(metadata=stored_as("phase_crossings_deg"))
+    delay: Crossing = field(metadata=stored_as("delay_margin_s"))
+    modulus: Crossing = field(metadata=stored_as("modulus_margin"))
+    disk: Crossing = field(metadata=stored_as("disk_margin"))
     stability: Stability
+    stored_properties: ClassVar[tuple[str, ...]] = ("stable",)
 
     @property
     def stable(self) -> bool | None:
@@ -219,7 +221,7 @@ class Margins:
         """The phase margin of the smallest size, degrees; negative where a phase lead is what the loop stands least."""
         if not self.stable:
             return NONE
-        return min(self.phase, key=lambda c: abs(c.value), default=Crossing(float("inf"), float("inf")))
+        return min(self.phase, key=lambda c: abs(c.value), default=Crossing())
 
     @property
     def disk_gain(self) -> float:
@@ -232,20 +234,16 @@ class Margins:
         return disk_phase(self.disk.value)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the margins as plain numbers; all of them nan where the closed loop is not stable."""
+        """Return the margins as JSON holds them, the phase margin among them; None where there is no limit, or no stability."""
+        return {**super().to_dict(), "phase_margin_deg": plain(self.phase_margin), "disk_margin": _disk_json(self.disk)}
 
-        def pair(c: Crossing) -> dict[str, float]:
-            return {"value": c.value, "omega": c.omega} if self.stable else {"value": NONE.value, "omega": NONE.omega}
-
-        return {
-            "gain_margin": pair(self.gain_margin),
-            "lower_gain_margin": pair(self.lower_gain_margin),
-            "phase_margin_deg": pair(self.phase_margin),
-            "delay_margin_s": pair(self.delay),
-            "modulus_margin": pair(self.modulus),
-            "disk_margin": {**pair(self.disk), "gain": self.disk_gain, "phase_deg": self.disk_phase},
-            "stable": self.stable,
-        }
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Return the margins that `to_dict` wrote. Raises InputError for anything else."""
+        found = super().from_dict(data)
+        if found.stable:
+            return found
+        return replace(found, gain_margin=NONE, lower_gain_margin=NONE, delay=NONE, modulus=NONE, disk=NONE)
 
     def __str__(self) -> str:
         if not self.stable:
@@ -282,16 +280,17 @@ def _without_margins(found: Stability, what: str) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class LoopMargins:
+class LoopMargins(Coded):
     """Margins of several loops of one plant. each: of every loop alone, by signal, the others closed.
 
     disk: alpha of the balanced disk in which every loop's gain and phase may vary at once, independently of each other
     (multi-loop disk margin); a bound from below, exact for up to three loops. stability: of the closed loops, delays exact.
     """
 
-    each: FrozenMap[Margins]
-    disk: Crossing
+    each: FrozenMap[Margins] = field(metadata=stored_as("loops"))
+    disk: Crossing = field(metadata=stored_as("disk_margin"))
     stability: Stability
+    stored_properties: ClassVar[tuple[str, ...]] = ("stable",)
 
     @property
     def stable(self) -> bool | None:
@@ -309,19 +308,14 @@ class LoopMargins:
         return disk_phase(self.disk.value)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the margins as plain numbers."""
-        disk = {
-            "value": self.disk.value,
-            "omega": self.disk.omega,
-            "gain": self.disk_gain,
-            "phase_deg": self.disk_phase,
-        }
-        return {
-            "loops": {n: m.to_dict() for n, m in self.each.items()},
-            "disk_margin": disk,
-            "stable": self.stable,
-            "stability": self.stability.to_dict(),
-        }
+        """Return the margins as JSON holds them."""
+        return {**super().to_dict(), "disk_margin": _disk_json(self.disk)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Self:
+        """Return the margins that `to_dict` wrote. Raises InputError for anything else."""
+        found = super().from_dict(data)
+        return found if found.stable else replace(found, disk=NONE)
 
     def __str__(self) -> str:
         if not self.stable:
@@ -346,6 +340,14 @@ def disk_phase(alpha: float) -> float:
     if np.isnan(alpha):
         return alpha
     return float(2.0 * np.degrees(np.arctan(alpha / 2.0))) if alpha < 2.0 else 90.0
+
+
+def _disk_json(disk: Crossing) -> dict[str, Any]:
+    """Return a disk margin with the gain and the phase that it allows, as JSON holds them."""
+    found: dict[str, Any] = plain(
+        {"value": disk.value, "omega": disk.omega, "gain": disk_gain(disk.value), "phase_deg": disk_phase(disk.value)}
+    )
+    return found
 
 
 def _disk_text(disk: Crossing) -> str:
@@ -396,7 +398,7 @@ def open_equation(model: LinearModel) -> Characteristic:
 
     Raises LinearizationError where the direct part is -1.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         found = model.characteristic
     else:
         a, b, c, d = without_sliding_means(model)
@@ -443,7 +445,7 @@ def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMa
 def _sensitivity(model: LinearModel) -> Curves:
     """S = (1 + L)^-1 over rad/s; from the closed loops' state space where there is one, which poles of L do not disturb."""
     eye = np.eye(len(model.input_names))
-    if model.delay_free is not None:
+    if model.exact is not None:
         return lambda w: np.linalg.inv(eye + transfer(model, 1j * w))
     a, b, c, d = model.standard()
     direct = np.linalg.inv(eye + d)
@@ -495,10 +497,10 @@ def _of_curve(values_at: Curves, grid: Array, closing: Closing) -> Margins:
         _gains(grid, values, curve, FLOOR if closing.open.channels else 0.0),
         tuple(_phases(grid, values, curve)),
     )
-    modulus = _smallest(grid, np.abs(1 + values), lambda w: abs(1 + curve(w)))
     if found.verdict != "stable":
-        return Margins(_nearest(gain), NONE, NONE, phase, NONE, modulus, NONE, found)
+        return Margins(_nearest(gain), NONE, NONE, phase, NONE, NONE, NONE, found)
     gain += closing.ends()
+    modulus = _smallest(grid, np.abs(1 + values), lambda w: abs(1 + curve(w)))
     disk = _smallest(grid, _disk(values), lambda w: float(_disk(np.array([curve(w)]))[0]))
     upper, lower = closing.limit(gain, 1), closing.limit(gain, -1)
     return Margins(_nearest(gain), upper, lower, phase, _delay(phase, closing), modulus, disk, found)
@@ -514,7 +516,7 @@ def _delay(phase: Sequence[Crossing], closing: Closing) -> Crossing:
     if abs(t) >= abs(1.0 - t):  # |L| = |T/(1 - T)|
         return Crossing(float("inf"), 0.0)
     delays = [Crossing(c.omega, float(np.radians(c.value % 360.0) / c.omega)) for c in phase if c.omega > 0]
-    return min(delays, key=lambda c: c.value, default=Crossing(float("inf"), float("inf")))
+    return min(delays, key=lambda c: c.value, default=Crossing())
 
 
 def _common_disk(sensitivity: Curves, grid: Array) -> Crossing:

@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from hvdc_ident.codec import Coded, stored_as
+from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import delayed_modes
 from hvdc_ident.linearize.delayed_locus import crossings, followed
 from hvdc_ident.linearize.derivatives import characteristic, state_matrix
 from hvdc_ident.linearize.equilibrium import EquilibriumSearch
+from hvdc_ident.linearize.jacobian import steady
 from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles
 from hvdc_ident.linearize.mode import Mode
-from hvdc_ident.linearize.operating_point import steady
 from hvdc_ident.linearize.plot import locus
 from hvdc_ident.linearize.stability import ZERO, Characteristic, Stability, stability
 from hvdc_ident.linearize.system import Array, CompiledSystem
@@ -38,14 +38,14 @@ def poles(model: LinearModel) -> Array:
 
     Of a model with delays the rightmost roots of its exact characteristic equation, by falling real part.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         return model.characteristic.roots.values
     return approximate_poles(model)
 
 
 def stability_of(model: LinearModel) -> Stability:
     """Return whether a model is stable: with delays by its characteristic equation, else by its eigenvalues."""
-    if model.delay_free is not None:
+    if model.exact is not None:
         return stability(model.characteristic)
     values = approximate_poles(model)
     if not values.size:
@@ -78,7 +78,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
 
     A model with delays has infinitely many; these are the rightmost ones, at least as many as it has states.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         return delayed_modes.modes(model)
     names = model.state_names
     if model.is_descriptor:
@@ -169,7 +169,7 @@ SHARE = 0.5
 class NamedMode:
     """A mode, the parts that name it joined by " + ", and the participation of each part (they sum to 1)."""
 
-    mode: Mode
+    mode: Mode = field(metadata=INLINE)
     name: str
     parts: FrozenMap[float]
 

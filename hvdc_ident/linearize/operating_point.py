@@ -7,16 +7,23 @@ from collections.abc import Collection, Mapping, Sequence
 import numpy as np
 
 from hvdc_ident.errors import SteadyStateError, require_known, unknown_name
-from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.derivatives import constants
-from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root, solved, weights
-from hvdc_ident.linearize.jacobian import linear_at
-from hvdc_ident.linearize.point import Branch, OperatingPoint
+from hvdc_ident.linearize.equilibrium import At
+from hvdc_ident.linearize.jacobian import EquationModel
+from hvdc_ident.linearize.kinds import Kind, LinearOptions, PointOptions
+from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.system import Array, system
 from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate import equilibria, resting
 
 Bounds = Mapping[str, tuple[float, float]]
+
+
+def kind_of(model: AnyModel) -> Kind:
+    """Return what finds a model's points and linearises it there. Raises ModelError for one that shows no derivatives."""
+    if isinstance(model, Model):
+        return EquationModel(model)
+    from hvdc_ident.linearize.fmu_linear import LinearFmu
+
+    return LinearFmu.of(model)
 
 
 def find_operating_point(
@@ -60,90 +67,7 @@ def find_operating_point(
             free = freed_inputs(model, base, outputs, fixed)
             guess = {**base.states, **base.unknowns, **base.extras, **(guess or {})}
         fixed = {**fixed, **(outputs or {})}
-    if isinstance(model, Model):
-        search = EquilibriumSearch.of_model(model, fixed or {}, free, bounds or {}, at=at, moving=moving, time=time)
-        return solve(model, search, guess or {})
-    from hvdc_ident.linearize.fmu_linear import fmu_search
-
-    recorded, search = fmu_search(model, fixed or {}, free, bounds or {}, guess or {}, at=at, moving=moving, time=time)
-    return point_of(recorded, search, solved(recorded.name, search, guess or {}), "trimmed")
-
-
-def solve(model: Model, search: EquilibriumSearch, guess: Mapping[str, float] | None = None) -> OperatingPoint:
-    """Return the point a search leads to; SteadyStateError with the worst equation where it leads to none."""
-    if search.is_plain and not guess:
-        return point_of(model, search, *steady(model, search))
-    own = _own(model, search)
-    root = solved(model.name, search, guess or {}, own)
-    if not search.is_plain:
-        return point_of(model, search, root, "trimmed")
-    same = own is not None and np.allclose(
-        root.v, own, rtol=1e-6, atol=1e-6 * max(1.0, float(np.abs(own).max(initial=0.0)))
-    )
-    return point_of(model, search, root, "own" if own is None or same else "other")
-
-
-def steady(model: Model, search: EquilibriumSearch) -> tuple[Root, Branch]:
-    """Return the steady state that a simulation of the same inputs and parameters starts from, and its branch."""
-    free = model if search.at == "start" else resting(model)
-    try:
-        at = equilibria(free)
-        found = at.start(free, search.p, search.u, search.time)
-    except SteadyStateError as e:
-        raise SteadyStateError(
-            e.what,
-            where=e.where,
-            expected=e.expected,
-            got=e.got,
-            hint=f"{e.hint}; states that need not rest can be named in `moving`",
-        ) from None
-    v = found.v
-    with np.errstate(all="ignore"):
-        r, jac = search.equations(v)
-        shares = np.abs(r) / weights(jac, v)
-    return Root(v, r, shares, 0, "newton"), found.branch
-
-
-def _own(model: Model, search: EquilibriumSearch) -> Array | None:
-    """Return the model's own steady state at the search's inputs and parameters; None where it has none there."""
-    free = model if search.at == "start" else resting(model)
-    at = equilibria(free)
-    try:
-        return at.start(free, search.p, search.u, search.time).v
-    except SteadyStateError:
-        return None
-
-
-def point_of(model: AnyModel, search: EquilibriumSearch, root: Root, branch: Branch = "own") -> OperatingPoint:
-    """Return the point of a solved search."""
-    y, w, p = search.vectors(root.v)
-    s, size = search.system, search.system.layout
-    values, _ = s.evaluate(y, w, p)
-    shown = values[size.n + size.ne : size.main]
-    wanted = {n: float(v) for n, v in zip(s.outputs, shown, strict=True) if n in model.outputs}
-    n_extra = 1 + size.nu
-    method = root.method + (", least norm" if len(search.rows) < len(search.variables) else "")
-    return OperatingPoint(
-        model,
-        _named(s.states, y[: size.nx]),
-        _named(s.unknowns, y[size.nx :]),
-        _named(s.extras, w[n_extra:]),
-        _named(s.inputs, w[1:n_extra]),
-        FrozenMap(wanted),
-        _named(s.parameters, p),
-        float(root.shares.max(initial=0.0)),
-        s.limits(y, w, p),
-        root.iterations,
-        method,
-        search.at,
-        search.time,
-        search,
-        branch,
-    )
-
-
-def _named(names: Sequence[str], values: Array) -> FrozenMap[float]:
-    return FrozenMap(zip(names, (float(v) for v in values), strict=True))
+    return kind_of(model).point(PointOptions(fixed or {}, free, bounds or {}, guess or {}, at, moving, time))
 
 
 def point_at(
@@ -222,19 +146,6 @@ def signal_values(model: Model, point: OperatingPoint, names: Sequence[str]) -> 
         shown = s.values(point.y, point.w, point.p, s.modes(point.y, point.w, point.p))[s.layout.n + s.layout.ne :]
         found |= {n: float(v) for n, v in zip(s.outputs, shown, strict=False)}
     return found
-
-
-def with_constants_as_inputs(model: AnyModel, at: OperatingPoint) -> tuple[AnyModel, OperatingPoint]:
-    """Return the model and its point with states that never move as inputs: a reference that the start is found with is no mode."""
-    if not isinstance(model, Model):
-        return model, at
-    fixed = constants(model)
-    if not fixed:
-        return model, at
-    held = model.with_values({**at.parameters, **at.inputs}).driven(fixed)
-    values = {n: at.states[n] for n in fixed}
-    guess = {n: v for n, v in (at.states | at.unknowns).items() if n not in fixed}
-    return held.with_values(values), find_operating_point(held.with_values(values), guess=guess)
 
 
 # --- trim: inputs that are set so that outputs have given values ---
@@ -317,7 +228,7 @@ def _independent(model: AnyModel, outputs: list[str], gains: Array) -> None:
 
 def _dc_gains(model: AnyModel, point: OperatingPoint, outputs: Collection[str]) -> Array:
     """Return (outputs, all inputs) gains at rest; 0 for an input that drives an integrator: there is no rest with another value."""
-    a, b, c, d = linear_at(*with_constants_as_inputs(model, point), outputs=list(outputs)).standard()
+    a, b, c, d = kind_of(model).linear(point, LinearOptions(outputs=list(outputs))).standard()
     if not a.shape[0]:
         return d
     x = np.linalg.lstsq(a, -b, rcond=1e-13)[0]

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from hvdc_ident.codec import NOT_STORED, Coded, read_fields, stored_as
 from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, SteadyStateError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.derivatives import characteristic
-from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch
+from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.stability import ZERO, Characteristic, stability
 from hvdc_ident.linearize.system import Array, CompiledSystem
@@ -24,9 +25,19 @@ from hvdc_ident.simulate import Equilibria, equilibria, resting
 Branch = Literal["own", "unconnected", "other", "trimmed"]
 
 
+@dataclass(frozen=True)
+class _Judged:
+    """What the JSON of a point has of its limits, and what only its model tells."""
+
+    active_limits: tuple[Limit, ...]
+    margins: tuple[Limit, ...]
+    stable: bool | None
+    notes: tuple[str, ...]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class OperatingPoint(Shown):
-    """A point of a model: values by name, in the model's units.
+class OperatingPoint(Shown, Coded):
+    """A point of a model: values by name, in the model's units. name: of the model; one read from JSON does not have the model itself.
 
     extras: values of delays and sampled blocks. residual: the largest scaled residual of the equations that define it.
     limits: every limiter in use with its margin. at: "steady", or "start" where states stand at their given start.
@@ -36,7 +47,7 @@ class OperatingPoint(Shown):
     a given guess led; "trimmed" where outputs or states are fixed, something is free, or states stand at their start.
     """
 
-    model: AnyModel
+    name: str = field(metadata=stored_as("model"))
     states: FrozenMap[float]
     unknowns: FrozenMap[float]
     extras: FrozenMap[float]
@@ -44,16 +55,58 @@ class OperatingPoint(Shown):
     outputs: FrozenMap[float]
     parameters: FrozenMap[float]
     residual: float
-    limits: tuple[Limit, ...]
     iterations: int
     method: str
     at: At = "steady"
     time: float = 0.0
-    search: EquilibriumSearch | None = field(default=None, repr=False)
     branch: Branch = "own"
+    limits: tuple[Limit, ...] = field(default=(), metadata=NOT_STORED)
+    model: AnyModel | None = field(default=None, metadata=NOT_STORED)
+    search: EquilibriumSearch | None = field(default=None, metadata=NOT_STORED)
+    stored_properties: ClassVar[tuple[str, ...]] = ("active_limits", "margins", "stable", "notes")
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> OperatingPoint:
+        """Return the point that `to_dict` wrote, without its model and without conditions that are no limiters.
+
+        Raises InputError for anything else.
+        """
+        judged = read_fields(_Judged, data)
+        point = replace(read_fields(cls, data), limits=(*judged.active_limits, *judged.margins))
+        vars(point).update(stable=judged.stable, notes=judged.notes)  # the cached properties, which need the model
+        return point
+
+    @classmethod
+    def of(cls, model: AnyModel, search: EquilibriumSearch, root: Root, branch: Branch) -> OperatingPoint:
+        """Return the point of a solved search."""
+        y, w, p = search.vectors(root.v)
+        s, size = search.system, search.system.layout
+        values, _ = s.evaluate(y, w, p)
+        shown = values[size.n + size.ne : size.main]
+        wanted = {n: float(v) for n, v in zip(s.outputs, shown, strict=True) if n in model.outputs}
+        n_extra = 1 + size.nu
+        method = root.method + (", least norm" if len(search.rows) < len(search.variables) else "")
+        return cls(
+            model.name,
+            _named(s.states, y[: size.nx]),
+            _named(s.unknowns, y[size.nx :]),
+            _named(s.extras, w[n_extra:]),
+            _named(s.inputs, w[1:n_extra]),
+            FrozenMap(wanted),
+            _named(s.parameters, p),
+            float(root.shares.max(initial=0.0)),
+            root.iterations,
+            method,
+            search.at,
+            search.time,
+            branch,
+            s.limits(y, w, p),
+            model,
+            search,
+        )
 
     def _screen(self) -> Iterator[str | Table]:
-        yield f"Operating point of {self.model.name} ({self.at}, {self.method}), residual {self.residual:.2g}"
+        yield f"Operating point of {self.name} ({self.at}, {self.method}), residual {self.residual:.2g}"
         parts = (("state", self.states), ("input", self.inputs), ("output", self.outputs))
         rows = tuple((n, kind, v) for kind, values in parts for n, v in values.items())
         yield from first_rows(("name", "kind", "value"), rows)
@@ -64,6 +117,11 @@ class OperatingPoint(Shown):
     def active_limits(self) -> tuple[Limit, ...]:
         """The limiters that hold their signal here."""
         return tuple(x for x in self.limits if x.active)
+
+    @property
+    def margins(self) -> tuple[Limit, ...]:
+        """The limiters that do not hold their signal here."""
+        return tuple(x for x in self.limits if not x.active and x.kind != "branch")
 
     @cached_property
     def stable(self) -> bool | None:
@@ -93,24 +151,9 @@ class OperatingPoint(Shown):
         """(parameters,) as the machine code takes them."""
         return np.array([*self.parameters.values()], dtype=float)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return the point as plain numbers; active limits with what is limited, by what, and the margin."""
-        return {
-            "states": dict(self.states),
-            "unknowns": dict(self.unknowns),
-            "inputs": dict(self.inputs),
-            "outputs": dict(self.outputs),
-            "parameters": dict(self.parameters),
-            "residual": self.residual,
-            "active_limits": [x.to_dict() for x in self.active_limits],
-            "margins": [x.to_dict() for x in self.limits if not x.active and x.kind != "branch"],
-            "at": self.at,
-            "method": self.method,
-            "iterations": self.iterations,
-            "branch": self.branch,
-            "stable": self.stable,
-            "notes": list(self.notes),
-        }
+
+def _named(names: Sequence[str], values: Array) -> FrozenMap[float]:
+    return FrozenMap(zip(names, (float(v) for v in values), strict=True))
 
 
 def _notes(point: OperatingPoint) -> tuple[str, ...]:

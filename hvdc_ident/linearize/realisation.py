@@ -65,7 +65,7 @@ def without_sliding_means(model: LinearModel) -> tuple[Array, Array, Array, Arra
     is the difference between y and the mean, which is 0 for ever. Models without delays are left as they are.
     """
     a, b, c, d = model.standard()
-    if model.delay_free is None or a.shape[0] == 0:
+    if model.exact is None or a.shape[0] == 0:
         return a, b, c, d
     a, b, c = scaled_states(a, b, c)
     rows = scipy.linalg.null_space(a.T, rcond=1e-13).T

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.linalg
 from scipy.optimize import minimize_scalar
 
-from hvdc_ident.codec import Coded
+from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
@@ -25,20 +25,28 @@ from hvdc_ident.linearize.system import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Reduction:
+class Reduction(Coded):
     """A smaller model. removed: eigenvalues that went; hankel: singular values of the whole; bound: on max |G - Gr|.
 
     kept: how many states carry modes that are not stable; these are never reduced. match_dc: whether the dc gain is the
     whole's. stable: the stable part before and after.
     """
 
-    model: LinearModel
+    model: LinearModel = field(metadata=INLINE)
     removed: tuple[complex, ...]
     hankel: tuple[float, ...]
     bound: float
-    kept: int = 0
+    kept: int = field(default=0, metadata=stored_as("not_stable_states_kept"))
     match_dc: bool = False
-    stable: tuple[LinearModel, LinearModel] | None = field(default=None, repr=False)
+    stable: tuple[LinearModel, LinearModel] | None = field(
+        default=None, repr=False, metadata=stored_as("stable_parts", optional=True)
+    )
+    stored_properties: ClassVar[tuple[str, ...]] = ("order",)
+
+    @property
+    def order(self) -> int:
+        """The number of states that stay."""
+        return len(self.model.state_names)
 
     @property
     def error(self) -> Peak:
@@ -46,26 +54,9 @@ class Reduction:
         return Peak(0.0, 0.0) if self.stable is None else linf_norm(difference(*self.stable))
 
     def __str__(self) -> str:
-        order = len(self.model.state_names)
         dc = ", with the dc gain kept" if self.match_dc else ""
-        listed = ", ".join(f"{v:.3g}" for v in self.hankel[: order + 3])
-        return f"{order} states{dc}; the gain is off by {self.bound:.4g} at most\nHankel singular values {listed}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the reduced model as plain numbers."""
-        m = self.model
-        return {
-            "order": len(m.state_names),
-            "A": m.A.tolist(),
-            "B": m.B.tolist(),
-            "C": m.C.tolist(),
-            "D": m.D.tolist(),
-            "bound": self.bound,
-            "hankel": list(self.hankel),
-            "removed": [[v.real, v.imag] for v in self.removed],
-            "not_stable_states_kept": self.kept,
-            "match_dc": self.match_dc,
-        }
+        listed = ", ".join(f"{v:.3g}" for v in self.hankel[: self.order + 3])
+        return f"{self.order} states{dc}; the gain is off by {self.bound:.4g} at most\nHankel singular values {listed}"
 
 
 def minimal(model: LinearModel, tolerance: float = TOLERANCE) -> Reduction:
@@ -247,7 +238,7 @@ class Peak(Coded):
     """The largest singular value over all frequencies and where it is, rad/s (0 and infinity are places)."""
 
     value: float
-    omega: float
+    omega: float = float("inf")
 
 
 def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
@@ -257,7 +248,7 @@ def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     Steinbuch 1990), which needs no stability; a model with delays is searched on its exact response instead. Raises
     LinearizationError where a pole that the inputs reach and the outputs see lies on the imaginary axis: the norm is infinite.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         return _linf_of_delays(model)
     a, b, c, d = _clear_of_axis(model)
 
@@ -318,7 +309,7 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
 
     Raises LinearizationError where a pole that inputs reach and outputs see is not stable.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         _refuse_unstable(model, "an unstable model has no H-infinity norm")
         return linf_norm(model, tolerance)
     a = visible(model)[0]
@@ -335,7 +326,7 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
 
 def _refuse_unstable(model: LinearModel, what: str) -> None:
     """Raise LinearizationError where a model with delays is not stable, or cannot be told to be, between inputs and outputs."""
-    assert model.delay_free is not None
+    assert model.exact is not None
     found = stability(model.characteristic.visible())
     if found.verdict != "stable":
         raise LinearizationError(
@@ -345,7 +336,7 @@ def _refuse_unstable(model: LinearModel, what: str) -> None:
 
 def _linf_of_delays(model: LinearModel) -> Peak:
     """Return the L-infinity norm of a model with delays, on a grid of its exact response and beside the largest value."""
-    assert model.delay_free is not None
+    assert model.exact is not None
     equation = model.characteristic.visible()
     if equation.roots.axis > sliding_means(equation):
         raise LinearizationError(
@@ -360,7 +351,7 @@ def h2_norm(model: LinearModel) -> float:
 
     Delays stand as their Pade approximants in the value, not in the verdict on stability.
     """
-    if model.delay_free is not None:
+    if model.exact is not None:
         _refuse_unstable(model, "the H2 norm is infinite: the model is not stable")
     a, b, c, d = visible(model)
     if np.any(d):
@@ -371,7 +362,7 @@ def h2_norm(model: LinearModel) -> float:
     if ((poles.real >= 0) | on_axis(poles, a)).any():
         raise LinearizationError(
             "the H2 norm is infinite: the model is not stable"
-            if model.delay_free is None
+            if model.exact is None
             else "the H2 norm is not known: the model is stable, and its delays' Pade approximants are not",
             where=f"linear model '{model.name}'",
         )

@@ -15,10 +15,11 @@ import scipy.linalg
 from scipy.sparse.csgraph import connected_components
 
 from hvdc_ident.codec import Coded, stored_as
+from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.characteristic import NEUTRAL, Part, Undecided, spectral_radius
-from hvdc_ident.linearize.delays import Channel, DelayFreePart
+from hvdc_ident.linearize.delays import Channel, eliminate, without_unknowns
 from hvdc_ident.linearize.sampling import multipliers
-from hvdc_ident.linearize.system import Array
+from hvdc_ident.linearize.system import Array, Layout
 
 EIGENVALUES = "eigenvalues of A"
 COUNTED = "roots of the exact characteristic equation, counted by the argument principle"
@@ -58,8 +59,19 @@ class Roots:
 
 
 @dataclass(frozen=True, eq=False)
+class Change:
+    """The derivative of a characteristic equation's matrices by a parameter, and of each delay's times, s."""
+
+    matrix: Array
+    given: Array
+    read: Array
+    through: Array
+    times: tuple[Array, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class Characteristic:
-    """The characteristic equation of a model.
+    """The characteristic equation of a model, delays exact, with its inputs and outputs.
 
     matrix: as in `Part`, whole. given: (rows, inputs) what the inputs add to its rows; read: (outputs, columns) and
     through: (outputs, inputs) the outputs.
@@ -73,13 +85,39 @@ class Characteristic:
     through: Array
 
     @classmethod
-    def of(cls, core: DelayFreePart) -> Characteristic:
-        """Return the equation of a linear model before its delays are approximated."""
-        n, o, u, m = core.nx, core.no, core.nu, core.matrix
-        rows = [*range(n), *range(n + o, m.shape[0])]
-        columns = [*range(n), *range(n + u, m.shape[1])]
-        outputs, inputs = slice(n, n + o), slice(n, n + u)
-        return cls(m[np.ix_(rows, columns)], n, core.channels, m[rows, inputs], m[outputs, columns], m[outputs, inputs])
+    def of(
+        cls, size: Layout, jac: Array, inputs: list[int], found: tuple[Channel, ...], closed: Sequence[int]
+    ) -> Characteristic:
+        """Return the equation of a Jacobian (main rows, columns). closed: delays of 0 s by their place, which are none.
+
+        Raises LinearizationError where its algebraic unknowns have no solution.
+        """
+        reduced = without_unknowns(size, jac, inputs, closed)
+        if not np.isfinite(reduced.condition):
+            raise LinearizationError("the algebraic part is singular", got="no solution for its unknowns")
+        kept = tuple(c for k, c in enumerate(found) if k not in closed)
+        matrix, given, read, through = quartered(reduced.result, size.nx + len(kept))
+        return cls(matrix, size.nx, kept, given, read, through)
+
+    def without_zero_delays(self) -> Characteristic:
+        """Return the equation in which what a delay of 0 s gives is what it gets. Raises LinearizationError for a loop of gain 1."""
+        closed = [self.nx + k for k, c in enumerate(self.channels) if c.total == 0.0]
+        if not closed:
+            return self
+        rows = self.matrix.shape[0]
+        kept = [k for k in range(rows) if k not in closed]
+        whole = np.block([[self.matrix, self.given], [self.read, self.through]])
+        whole[closed, closed] -= 1.0
+        order = (
+            [*kept, *range(rows, whole.shape[0]), *closed],
+            [*kept, *range(rows, whole.shape[1]), *closed],
+        )
+        reduced = eliminate(whole[np.ix_(*order)], whole.shape[0] - len(closed), whole.shape[1] - len(closed))
+        if not np.isfinite(reduced.condition):
+            raise LinearizationError("the loop through a delay of 0 s is singular", got="no solution for its signals")
+        matrix, given, read, through = quartered(reduced.result, len(kept))
+        channels = tuple(c for c in self.channels if c.total > 0.0)
+        return Characteristic(matrix, self.nx, channels, given, read, through)
 
     def closed(self, gains: Array) -> Characteristic:
         """Return the equation with every output fed back to the input of its place, with a gain and negative sign."""
@@ -130,8 +168,29 @@ class Characteristic:
             # A sliding mean is 0/0 at 0: the even part of the response beside it is its limit there, to 1e-10.
             beside = self.response(np.where(s == 0, 1e-5j / float(part.lengths.max()), s))
             return np.where((s == 0)[:, None, None], beside.real, beside)
-        factors = np.concatenate([np.ones((s.size, self.nx)), part.factors(s)], axis=1)
-        return np.asarray(self.through + self.read @ np.linalg.solve(part.pencil(s), factors[:, :, None] * self.given))
+        return np.asarray(self.through + self.read @ np.linalg.solve(*self.pencil(s)))
+
+    def response_by_s(self, s: Array) -> tuple[Array, Array]:
+        """Return the transfer matrix at complex frequencies s, rad/s, and its derivative by s."""
+        pencil, drive = self.pencil(s)
+        d_pencil, d_drive = self.pencil_by_s(s)
+        right = np.linalg.solve(pencil, drive)
+        slope = self.read @ np.linalg.solve(pencil, d_drive - d_pencil @ right)
+        return np.asarray(self.through + self.read @ right), np.asarray(slope)
+
+    def pencil(self, s: Array) -> tuple[Array, Array]:
+        """Return the pencil and what the inputs add to its rows, (frequencies, rows, inputs)."""
+        return self.whole.pencil(s), self.whole.factors(s)[:, :, None] * self.given
+
+    def pencil_by_s(self, s: Array) -> tuple[Array, Array]:
+        """Return the derivatives of both by s."""
+        return self.whole.pencil_by_s(s), self.whole.factors_by_s(s)[:, :, None] * self.given
+
+    def pencil_along(self, s: Array, change: Change) -> tuple[Array, Array]:
+        """Return the derivatives of both by a parameter."""
+        factors, moved = self.whole.factors(s), self.whole.factors_along(s, change.times)
+        drive = factors[:, :, None] * change.given + moved[:, :, None] * self.given
+        return self.whole.pencil_along(s, change.matrix, change.times), drive
 
     @property
     def whole(self) -> Part:
@@ -188,6 +247,11 @@ class Characteristic:
         """Return whether `stability` says "stable", without looking for the roots."""
         unstable, axis = self.counts()
         return unstable == 0 and axis <= sliding_means(self)
+
+
+def quartered(matrix: Array, size: int) -> tuple[Array, Array, Array, Array]:
+    """Return the blocks of a matrix, or of a stack of them, after so many rows and columns: its corners, row by row."""
+    return matrix[..., :size, :size], matrix[..., :size, size:], matrix[..., size:, :size], matrix[..., size:, size:]
 
 
 def _first(values: list[Array], least: int | None) -> Array:
@@ -333,7 +397,7 @@ class Stability(Coded):
     """The verdict on a model's stability: without delays by its eigenvalues, with delays by its characteristic equation.
 
     verdict: "stable", "on the limit of stability", "unstable" or "not decided". unstable: roots right of the axis, None
-    where not decided, infinite where there are infinitely many; from below where there is a reason. rightmost: the first
+    where not decided, infinite (None in JSON) where there are infinitely many; from below where there is a reason. rightmost: the first
     root, None where there is none or none was found.
     """
 
@@ -346,9 +410,9 @@ class Stability(Coded):
     @property
     def count_text(self) -> str:
         """How many roots lie right of the imaginary axis, in words."""
-        if self.unstable is None:
+        if self.verdict == "not decided":
             return "an unknown number of roots right of the imaginary axis"
-        if np.isinf(self.unstable):
+        if self.unstable is None or np.isinf(self.unstable):
             return "infinitely many roots right of the imaginary axis"
         number = f"{self.unstable:.0f} root{'' if self.unstable == 1 else 's'} right of the imaginary axis"
         return f"at least {number}" if self.reason else number

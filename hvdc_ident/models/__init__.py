@@ -14,9 +14,10 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from hvdc_ident.errors import ModelError, unknown_name
+from hvdc_ident.errors import ModelError, in_python, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.next_step import NextStep
 
 if TYPE_CHECKING:
     from hvdc_ident.fmu import Limits
@@ -67,6 +68,7 @@ def _of_a_family(name: str) -> Model | None:
     return None
 
 
+@in_python
 def load_model(
     source: str | Path,
     *,
@@ -130,7 +132,8 @@ def _from_python(path: Path, trust: bool) -> Model:
         raise ModelError(
             "a Python model runs its code",
             where=str(path),
-            hint="read the file, then give --trust (or trust=True); a model card needs no trust",
+            hint="read the file first; a model card needs no trust",
+            next=(NextStep("option", "trust = True", "then runs it"),),
         )
     if not path.is_file():
         raise ModelError("the model file is not there", where=str(path))

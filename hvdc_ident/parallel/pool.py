@@ -27,6 +27,7 @@ from typing import Any, Protocol
 
 from hvdc_ident.errors import ComputationError, InputError, one_line
 from hvdc_ident.executor import Outcome, attempted, in_order
+from hvdc_ident.next_step import IN_THIS_PROCESS, ON_DASK
 from hvdc_ident.parallel import one_thread
 from hvdc_ident.parallel.child import Ending
 
@@ -127,7 +128,8 @@ def _cannot_begin(reason: str) -> ComputationError:
     return ComputationError(
         "workers cannot be started",
         got=reason,
-        hint="--workers 1; a script that starts workers needs `if __name__ == '__main__':`",
+        hint="a script that starts workers needs `if __name__ == '__main__':`",
+        next=(IN_THIS_PROCESS,),
     )
 
 
@@ -292,10 +294,10 @@ def _server() -> Any:
     if sys.platform != "linux":
         raise InputError(
             "this system has no workers",
-            where="--workers",
+            where="workers",
             expected="Linux",
             got=sys.platform,
-            hint="--workers 1, or --executor dask://HOST:PORT",
+            next=(IN_THIS_PROCESS, ON_DASK),
         )
     from multiprocessing import forkserver
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hvdc_ident.errors import ModelError
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.plants.unit import UnitPart, part_name, parts_of, shelf_model
 from hvdc_ident.psse import DyrFile, DyrRecord
 from hvdc_ident.shelf import components, record_of, source_of
@@ -29,7 +30,7 @@ def machine_records(file: DyrFile, bus: int, machine: str | None) -> tuple[DyrRe
             f"bus {bus} has several machines",
             where=file.path,
             expected=f"one of {listed(machines)}",
-            hint="--machine ID",
+            next=(NextStep("option", f"machine = {machines[0]}", "takes one of them"),),
         )
     return records
 

@@ -77,29 +77,20 @@ def draw_response(
     pair: tuple[Axes, Axes],
     omega: Array,
     values: NDArray[np.complex128],
+    phase: Array,
     label: str | None = None,
-    phase: Array | None = None,
     **style: Any,
 ) -> bool:
-    """Return whether a response over frequency, rad/s, was drawn as gain and phase: one that is 0 everywhere is not.
-
-    phase: degrees; without, the angle, from each frequency to the next by the shorter way.
-    """
+    """Return whether a response over frequency, rad/s, was drawn as gain and phase, degrees: one that is 0 everywhere is not."""
     keep = (omega > 0) & (np.abs(values) > 0)
     if not keep.any():
         return False
     hertz = omega[keep] / (2 * np.pi)
     pair[0].semilogx(hertz, 20 * np.log10(np.abs(values[keep])), label=label, **style)
-    degrees = np.degrees(np.unwrap(np.angle(values[keep]))) if phase is None else phase[keep]
-    pair[1].semilogx(hertz, degrees, **style)
+    pair[1].semilogx(hertz, phase[keep], **style)
     for axes in pair:
         axes.minorticks_off()  # over three decades nobody reads them, and they take half of the time to draw
     return True
-
-
-def complex_of(real: Any, imaginary: Any) -> NDArray[np.complex128]:
-    """The complex numbers of two lists of a JSON."""
-    return np.asarray(np.array(real, dtype=float) + 1j * np.array(imaginary, dtype=float))
 
 
 def svg(fig: Figure, label: str) -> str:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from markupsafe import Markup
 
 from hvdc_ident.fit.uncertainty import MOVED
 from hvdc_ident.next_step import Door, NextStep, next_phrase, next_sentence
-from hvdc_ident.report.html import badge, estimate, number, prose, table, table_of, text, typeset
+from hvdc_ident.report.html import badge, estimate, number, prose, rows_of, table_of, text, typeset
 from hvdc_ident.report.overlay import Sheet, worst_signal
 from hvdc_ident.summary import Results, RunSummary
 from hvdc_ident.summary.phrases import (
@@ -76,9 +79,9 @@ def _warnings(results: Results, s: RunSummary) -> list[str]:
     """Stages that failed, experiments without a run, and results of an earlier state of the study."""
     lines = [f"<strong>{text(n)} failed</strong>: {prose(why.rstrip('.'))}." for n, why in s.failures.items()]
     lines += [
-        f"Experiment <strong>{text(n)}</strong> could not be simulated: {prose(str(e.get('reason', '')).rstrip('.'))}."
+        f"Experiment <strong>{text(n)}</strong> could not be simulated: {prose(e.reason.rstrip('.'))}."
         for n, e in results.experiments.items()
-        if e.get("status") == "failed"
+        if e.status == "failed"
     ]
     for name, data in results.stages.items():
         if data.get("sources") != results.heading.get("sources"):
@@ -138,23 +141,23 @@ def _values(s: RunSummary, door: Door) -> tuple[str, str]:
     name = interval_name(s, "effect" if s.counting.name == "effect" else "fitted")
     header = ["parameter, unit", "given", "value", name, "change", ""]
     if not any(p.interval for p in s.parameters):  # none is given where the model lacks something
-        header, rows = [header[k] for k in (0, 1, 2, 4, 5)], [[row[k] for k in (0, 1, 2, 4, 5)] for row in rows]
+        rows = [(*row[:3], "", *row[4:]) for row in rows]
     not_fitted = prose(f"Not fitted: {next_phrase(NextStep('fit'), door)}.")
     which = " ".join(t for t in (text(which_values(s)) or not_fitted, text(condition(s))) if t)
     placed = [p for p in s.parameters if p.by_place]
     depend = "".join(f"<p>{text(p.name)} depends on the place: it is {text(by_place(p))}.</p>" for p in placed)
-    return which, f"{table(header, rows, words=(0, len(header) - 1))}{depend}{more}{_moved(s)}"
+    return which, f"{rows_of(header, rows)}{depend}{more}{_moved(s)}"
 
 
-def _value_row(p: ParameterSummary) -> list[str]:
-    shown, interval = estimate(p.value, p.interval)
-    name = f"<strong>{text(p.name)}</strong>" + (f", {text(p.unit)}" if p.unit else "")
+def _value_row(p: ParameterSummary) -> tuple[Any, ...]:
+    shown, interval = map(Markup, estimate(p.value, p.interval))
+    name = Markup(f"<strong>{text(p.name)}</strong>" + (f", {text(p.unit)}" if p.unit else ""))
     if p.by_place:
-        return [name, number(p.given), "by place", "–", "", ""]
+        return name, p.given, "by place", "–", "", ""
     note = AT_BOUND if p.at_bound else "held" if p.reason else ""
-    about = f"<span class='about' title='{text(p.reason)}'>{note}</span>" if note else ""
-    value = f"<strong>{shown}</strong>" if p.value is not None else shown
-    return [name, number(p.given), value, interval, typeset(change_text(p.value, p.given)), about]
+    about = Markup(f"<span class='about' title='{text(p.reason)}'>{note}</span>" if note else "")
+    value = Markup(f"<strong>{shown}</strong>") if p.value is not None else shown
+    return name, p.given, value, interval, change_text(p.value, p.given), about
 
 
 def _moved(s: RunSummary) -> str:

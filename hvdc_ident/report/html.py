@@ -9,12 +9,16 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from markupsafe import Markup
+
 from hvdc_ident.display import Table
 from hvdc_ident.summary import Results
 from hvdc_ident.text import estimate_texts, figures, interval_text
 
 _POWER = re.compile(r"(?<=\d)e([-+]\d+)\b")
 _MINUS = re.compile(r"(?<![\w.])-(?=\d)|(?<=<sup>)-")
+_RAISED = re.compile(r"·10<sup>(.*?)</sup>")
+_TAG = re.compile(r"<[^>]*>")
 _BADGE = re.compile(r"\b(PASS|FAIL)\b")
 
 
@@ -28,11 +32,15 @@ def prose(value: Any) -> str:
     return re.sub(r"`([^`]+)`", r"<code>\1</code>", text(value))
 
 
+def shown(value: Any, digits: int = 4) -> str:
+    """Return a number with so many significant digits as text; a dash where there is none."""
+    known = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return figures(value, digits) if known else "–"
+
+
 def number(value: Any, digits: int = 4) -> str:
-    """A number with so many significant digits; a dash where there is none."""
-    if not isinstance(value, int | float) or isinstance(value, bool) or not math.isfinite(value):
-        return "–"
-    return typeset(figures(value, digits))
+    """Return a number with so many significant digits as HTML; a dash where there is none."""
+    return typeset(shown(value, digits))
 
 
 def typeset(shown: str) -> str:
@@ -66,36 +74,32 @@ def badge(passed: bool | None) -> str:
 
 
 def table_of(found: Table) -> str:
-    """Return a table of text and numbers as HTML; a number has four digits, and None is a dash."""
-    words = [k for k, numbers in enumerate(found.numeric) if not numbers]
-    rows = [[typeset(c) if isinstance(c, str) else number(c) for c in row] for row in found.rows]
-    return table([typeset(h) for h in found.header], rows, words=words)
+    """Return a table of text, numbers and markup as HTML; a number has four digits, and None is a dash.
+
+    A column without anything in it is left out.
+    """
+    plain = Table(found.header, tuple(tuple(_plain(c) if isinstance(c, Markup) else c for c in row) for row in found.rows))
+    kinds = ["" if not numbers else ' class="n"' for numbers in plain.numeric]
+    rows = [[_cell(c) for c in row] for row in found.rows]
+    kept = [k for k in range(len(found.header)) if not rows or any(row[k] for row in rows)]
+    head = "".join(f"<th{kinds[k]}>{typeset(found.header[k])}</th>" for k in kept)
+    body = "\n".join("<tr>" + "".join(f"<td{kinds[k]}>{row[k]}</td>" for k in kept) + "</tr>" for row in rows)
+    return f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>'
 
 
 def rows_of(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return a table of text and numbers as HTML; "" without rows."""
+    """Return a table of text, numbers and markup as HTML; "" without rows."""
     cells = tuple(tuple(row) for row in rows)
     return table_of(Table(tuple(header), cells)) if cells else ""
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, words: Sequence[int] = (0,)) -> str:
-    """A table. header and cells are HTML already; `words` are the columns of text, the others are numbers.
-
-    A column without anything in it is left out.
-    """
-    rows = [list(row) for row in rows]
-    keep = [i for i in range(len(header)) if not rows or any(row[i] for row in rows)]
-    header, rows = [header[i] for i in keep], [[row[i] for i in keep] for row in rows]
-    words = [new for new, old in enumerate(keep) if old in words]
-    head = "".join(f"<th{_kind(i, words)}>{h}</th>" for i, h in enumerate(header))
-    body = "\n".join(
-        "<tr>" + "".join(f"<td{_kind(i, words)}>{c}</td>" for i, c in enumerate(row)) + "</tr>" for row in rows
-    )
-    return f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>'
+def _plain(value: Markup) -> str:
+    """Return what a cell says, with powers of ten as numbers have them."""
+    return html.unescape(_TAG.sub("", _RAISED.sub(r"e\1", value))).replace("−", "-")
 
 
-def _kind(column: int, words: Sequence[int]) -> str:
-    return "" if column in words else ' class="n"'
+def _cell(value: Any) -> str:
+    return value if isinstance(value, Markup) else typeset(value) if isinstance(value, str) else number(value)
 
 
 @dataclass(frozen=True)

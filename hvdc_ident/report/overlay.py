@@ -12,8 +12,9 @@ from hvdc_ident.colours import EFFECT, FITTED, GIVEN, MARK, RECORDED
 from hvdc_ident.data import Array, Trajectory
 from hvdc_ident.report.drawing import PlottedCurve, figure, svg, visible, visible_rows, zoomable
 from hvdc_ident.summary import Results
+from hvdc_ident.summary.decisions import STAGES
 from hvdc_ident.summary.phrases import WORDS
-from hvdc_ident.summary.summarise import STAGES
+from hvdc_ident.summary.stage_results import ExperimentContext
 from hvdc_ident.text import with_unit
 
 if TYPE_CHECKING:
@@ -101,10 +102,8 @@ def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[st
             runs[name] = table
     if not runs:
         return None
-    about = results.experiments.get(experiment) or {}
-    window = about.get("window")
-    unit = str(results.units.get(output, ""))
-    return Overlay(experiment, output, unit, runs, about.get("event"), (window[0], window[1]) if window else None)
+    about = results.experiments.get(experiment) or ExperimentContext()
+    return Overlay(experiment, output, str(results.units.get(output, "")), runs, about.event, about.window)
 
 
 def worst_signal(results: Results, name: str | None, sets: Sequence[str]) -> Overlay | None:

@@ -50,7 +50,7 @@ def page(folder: Path) -> str:
 def _compared(results: Results) -> str:
     """What was compared with what, as HTML."""
     heading, experiments = results.heading, results.experiments
-    held_out = sum(1 for e in experiments.values() if e.get("role") == "holdout")
+    held_out = sum(1 for e in experiments.values() if e.role == "holdout")
     kept = f", {held_out} of them held out" if held_out else ""
     words = [f"model <strong>{text(heading.get('model', ''))}</strong>"]
     words += [f"{len(experiments)} recording{'s' if len(experiments) > 1 else ''}{kept}"] if experiments else []

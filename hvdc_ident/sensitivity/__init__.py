@@ -37,7 +37,7 @@ if TYPE_CHECKING:
         structural_identifiability,
     )
     from hvdc_ident.sensitivity.sweep_points import Points, Quantities, Samples, grid, latin_hypercube, listed, log_grid
-    from hvdc_ident.sensitivity.sweep_run import SweepResult, sweep
+    from hvdc_ident.sensitivity.sweep_run import SweepResult, SweepSummary, sweep
 else:
     __getattr__ = offered(
         __name__,
@@ -49,7 +49,7 @@ else:
             "global_screening": "ScreeningResult morris sobol",
             "structural": "Combination StructuralResult identifiable_subset structural_identifiability",
             "sweep_points": "Points Quantities Samples grid latin_hypercube listed log_grid",
-            "sweep_run": "SweepResult sweep",
+            "sweep_run": "SweepResult SweepSummary sweep",
         },
     )
 
@@ -69,6 +69,7 @@ __all__ = [
     "SteadySensitivities",
     "StructuralResult",
     "SweepResult",
+    "SweepSummary",
     "collinear_subsets",
     "grid",
     "identifiable_subset",

@@ -211,10 +211,10 @@ class PointTask:
             runs,
         )
 
-    def __call__(self, point: Array) -> tuple[Array, Complex, Complex] | str:
-        """Return RMSE (references,), poles (modes,) in 1/s and response (frequencies, outputs, inputs) at a point, (k,).
+    def __call__(self, point: Array) -> tuple[Array, Complex, Complex, Array] | str:
+        """Return RMSE (references,), poles (modes,) in 1/s, response and phase in degrees (frequencies, outputs, inputs).
 
-        The reason where a run fails.
+        point: (k,). The reason where a run fails.
         """
         given = FrozenMap({**self.values, **dict(zip(self.names, map(float, point), strict=True))})
         try:
@@ -236,18 +236,19 @@ class PointTask:
                 found[i] = np.sqrt(np.mean(difference * difference))
         return found
 
-    def _linear(self, given: FrozenMap[float]) -> tuple[Complex, Complex]:
-        """Return the poles, sorted, and the response; each empty where it is not wanted."""
+    def _linear(self, given: FrozenMap[float]) -> tuple[Complex, Complex, Array]:
+        """Return the poles, sorted, the response and its phase; each empty where it is not wanted."""
         poles, response = (np.empty(shape, dtype=complex) for shape in (0, (0, len(self.outputs), len(self.inputs))))
+        phase = np.empty(response.shape)
         if not self.poles and not self.omega.size:
-            return poles, response
+            return poles, response, phase
         from hvdc_ident.linearize import find_operating_point, linearize
 
         at = find_operating_point(self.model, given)
         linear = linearize(self.model, at, inputs=self.inputs or None, outputs=self.outputs or None)
         if self.poles:
             poles = np.asarray(linear.poles(), dtype=complex)
-            if linear.delay_free is not None:  # infinitely many: the rightmost ones
+            if linear.exact is not None:  # infinitely many: the rightmost ones
                 poles = poles[: self.poles]
             if poles.size != self.poles:
                 raise SimulationError(
@@ -255,8 +256,9 @@ class PointTask:
                 )  # e.g. a loop that becomes ill-posed
             poles = poles[np.lexsort((poles.imag, poles.real))]
         if self.omega.size:
-            response = np.asarray(linear.response(self.omega), dtype=complex)
-        return poles, response
+            found = linear.bode(self.omega)
+            response, phase = found.values, found.phase_deg
+        return poles, response, phase
 
 
 def simulated(model: AnyModel, experiment: Experiment, given: Any, outputs: tuple[str, ...], method: Method) -> Array:
@@ -350,7 +352,7 @@ def task_of(
             ) from None
         at = linearize(model, point, inputs=quantities.inputs, outputs=quantities.outputs)
         if "poles" in want:
-            poles = int(np.size(at.poles())) if at.delay_free is None else at.delay_free.nx
+            poles = int(np.size(at.poles())) if at.exact is None else at.exact.nx
         channels = tuple(at.input_names), tuple(at.output_names)
         if "bode" in want:
             frequencies = np.asarray(omega if omega is not None else at.bode().omega, dtype=float)

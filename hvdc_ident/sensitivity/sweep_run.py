@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.codec import Coded, read_fields
+from hvdc_ident.codec import Coded, plain, read_fields
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.errors import ComputationError, require_known, unknown_name
@@ -65,6 +65,43 @@ class _Point:
     reason: str = ""
     poles: NDArray[np.complex128] | None = None
     bode: Mapping[str, Mapping[str, NDArray[np.complex128]]] | None = None
+    phase_deg: Mapping[str, Mapping[str, Array]] | None = None
+
+
+@dataclass(frozen=True)
+class SeriesBest:
+    """The smallest and the largest RMSE of an output in an experiment, in its unit; at: the parameters' values at the smallest."""
+
+    output: str
+    experiment: str
+    unit: str
+    smallest: float
+    largest: float
+    at: Mapping[str, float]
+
+    @property
+    def text(self) -> str:
+        """The smallest RMSE and where it is, in words; of a flat line none is the best."""
+        size = f"{self.smallest:.4g} {self.unit}".rstrip()
+        at = ", ".join(f"{n} = {v:.6g}" for n, v in self.at.items())
+        flat = f"{self.smallest:.3g}" == f"{self.largest:.3g}"
+        return f"{self.output} in {self.experiment}: " + (f"RMSE {size} at every point" if flat else f"smallest RMSE {size}, at {at}")
+
+
+@dataclass(frozen=True)
+class SweepSummary(Coded):
+    """A sweep without its points. count, failed: points; failure: the reason of the first that failed. best: by series."""
+
+    parameters: Mapping[str, _Swept]
+    count: int
+    failed: int
+    failure: str = ""
+    best: tuple[SeriesBest, ...] = ()
+
+    @property
+    def text(self) -> str:
+        """How many points of which parameters."""
+        return f"{self.count} points of {', '.join(self.parameters)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +140,7 @@ class SweepResult(Coded, Shown):
     axes: of the product. units: by parameter. series: (output, experiment) of the columns of rmse, with series_units.
     against: "data", "base" or the name of the other model. base: where the axes' parameters stand without a sweep.
     rmse: (n, series) in the outputs' units; poles: (n, modes) 1/s; response: (n, frequencies, outputs, inputs) at
-    omega rad/s; rows of failed points are not numbers. failed: reason by row.
+    omega rad/s, with its phase in degrees; rows of failed points are not numbers. failed: reason by row.
     """
 
     model: str
@@ -117,12 +154,13 @@ class SweepResult(Coded, Shown):
     poles: np.ndarray[Any, np.dtype[np.complex128]]
     omega: Array
     response: np.ndarray[Any, np.dtype[np.complex128]]
+    phase_deg: Array
     channels: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
     failed: Mapping[int, str] = field(default_factory=dict)
     wanted: tuple[str, ...] = ("rmse",)
 
     def __post_init__(self) -> None:
-        for name in ("rmse", "poles", "omega", "response"):
+        for name in ("rmse", "poles", "omega", "response", "phase_deg"):
             getattr(self, name).setflags(write=False)
 
     @cached_property
@@ -157,8 +195,19 @@ class SweepResult(Coded, Shown):
         row = int(np.nanargmin(errors))
         return dict(zip(self.parameters, self.points.rows(row, row + 1)[0].tolist(), strict=True))
 
+    @property
+    def bests(self) -> tuple[SeriesBest, ...]:
+        """The smallest and the largest error of each series; none of one without an error."""
+        found = []
+        for (output, experiment), unit in zip(self.series, self.series_units, strict=True):
+            errors = self.error(output, experiment)
+            if np.isfinite(errors).any():
+                low, high = float(np.nanmin(errors)), float(np.nanmax(errors))
+                found.append(SeriesBest(output, experiment, unit, low, high, self.best(output, experiment)))
+        return tuple(found)
+
     def row(self, index: int) -> dict[str, Any]:
-        """One point as sweep.json has it: values, rmse, status, reason, poles and bode where wanted."""
+        """One point as sweep.json has it: values, rmse, status, reason, poles, bode and its phase where wanted."""
         return self._row(index, self.points.rows(index, index + 1)[0].tolist())
 
     def rows(self) -> Iterator[dict[str, Any]]:
@@ -181,15 +230,15 @@ class SweepResult(Coded, Shown):
         if "poles" in self.wanted:
             found["poles"] = None if bad is not None else [[p.real, p.imag] for p in self.poles[index].tolist()]
         if "bode" in self.wanted:
-            found["bode"] = None if bad is not None else self._response(index)
+            pairs = np.stack([self.response[index].real, self.response[index].imag], axis=-1)
+            found["bode"] = None if bad is not None else self._by_channel(pairs)
+            found["phase_deg"] = None if bad is not None else self._by_channel(self.phase_deg[index])
         return found
 
-    def _response(self, index: int) -> dict[str, dict[str, list[list[float]]]]:
+    def _by_channel(self, numbers: Array) -> dict[str, dict[str, list[Any]]]:
+        """Return lists over the frequencies by output and input of (frequencies, outputs, inputs, ...)."""
         inputs, outputs = self.channels
-        return {
-            o: {i: [[z.real, z.imag] for z in self.response[index, :, b, a].tolist()] for a, i in enumerate(inputs)}
-            for b, o in enumerate(outputs)
-        }
+        return {o: {i: numbers[:, b, a].tolist() for a, i in enumerate(inputs)} for b, o in enumerate(outputs)}
 
     @property
     def heading(self) -> dict[str, Any]:
@@ -206,6 +255,8 @@ class SweepResult(Coded, Shown):
             **({"omega": self.omega.tolist()} if "bode" in self.wanted else {}),
             "count": len(self),
             "failed": len(self.failed),
+            "failure": self.failed[min(self.failed)] if self.failed else "",
+            "best": plain(self.bests),
         }
 
     def to_dict(self) -> dict[str, Any]:
@@ -225,12 +276,12 @@ class SweepResult(Coded, Shown):
         modes = max((p.poles.size for p in rows if p.poles is not None), default=0)
         shape = (told.omega.size, len(channels[1]), len(channels[0]))
         poles = [p.poles if p.poles is not None else np.full(modes, np.nan) for p in rows]
-        response = [
-            np.full(shape, np.nan)
-            if p.bode is None
-            else np.array([[p.bode[o][i] for i in channels[0]] for o in channels[1]]).transpose(2, 0, 1)
-            for p in rows
-        ]
+
+        def table(found: Mapping[str, Mapping[str, Any]] | None) -> Array:
+            if found is None:
+                return np.full(shape, np.nan)
+            return np.array([[found[o][i] for i in channels[0]] for o in channels[1]]).transpose(2, 0, 1)
+
         rmse = [[np.nan if (v := p.rmse[o][e]) is None else v for o, e in series] for p in rows]
         return cls(
             str(data.get("model", "")),
@@ -243,7 +294,8 @@ class SweepResult(Coded, Shown):
             np.array(rmse, dtype=float).reshape(len(rows), len(series)),
             np.array(poles, dtype=complex).reshape(len(rows), modes),
             told.omega,
-            np.array(response, dtype=complex).reshape(len(rows), *shape),
+            np.array([table(p.bode) for p in rows], dtype=complex).reshape(len(rows), *shape),
+            np.array([table(p.phase_deg) for p in rows], dtype=float).reshape(len(rows), *shape),
             channels,
             {k: p.reason for k, p in enumerate(rows) if p.status == "failed"},
             told.wanted,
@@ -270,7 +322,7 @@ class SweepResult(Coded, Shown):
         return stream.getvalue()
 
     def to_xarray(self) -> xarray.Dataset:
-        """A dataset over the axes (a hypercube's rows are one axis): rmse, status, reason, poles and response."""
+        """A dataset over the axes (a hypercube's rows are one axis): rmse, status, reason, poles, response and phase."""
         import xarray
 
         dims = [a.names[0] if len(a.names) == 1 else f"point{k or ''}" for k, a in enumerate(self.axes)]
@@ -297,6 +349,7 @@ class SweepResult(Coded, Shown):
             coords["response_output"] = list(self.channels[1])
             axes = (*dims, "omega", "response_output", "response_input")
             data["response"] = (axes, self.response.reshape(*shape, *self.response.shape[1:]))
+            data["phase"] = (axes, self.phase_deg.reshape(*shape, *self.response.shape[1:]), {"units": "degrees"})
         return xarray.Dataset(data, coords=coords, attrs={"model": self.model, "against": self.against})
 
     def plot(self, ax: Any = None) -> Any:
@@ -331,11 +384,9 @@ class SweepResult(Coded, Shown):
     def _screen(self) -> Iterator[str | Table]:
         yield f"Sweep of {', '.join(self.parameters)}: {len(self)} points, {len(self.failed)} failed"
         rows = []
-        for k, ((o, e), unit) in enumerate(zip(self.series, self.series_units, strict=True)):
-            if np.isfinite(self.rmse[:, k]).any():
-                at = ", ".join(f"{n} = {v:.6g} {self.units[n]}".rstrip() for n, v in self.best(o, e).items())
-                low, high = float(np.nanmin(self.rmse[:, k])), float(np.nanmax(self.rmse[:, k]))
-                rows.append((o, e, unit, low, at, high))
+        for line in self.bests:
+            at = ", ".join(f"{n} = {v:.6g} {self.units[n]}".rstrip() for n, v in line.at.items())
+            rows.append((line.output, line.experiment, line.unit, line.smallest, at, line.largest))
         yield Table(("output", "experiment", "unit", "smallest RMSE", "at", "largest"), tuple(rows)) if rows else ""
         if "poles" in self.wanted and np.isfinite(self.poles).any():
             right = self.poles.real[np.isfinite(self.poles).all(axis=1)].max(axis=1)
@@ -384,6 +435,7 @@ def sweep(
     rmse = np.full((count, len(task.references)), np.nan)
     poles = np.full((count, task.poles), np.nan, dtype=complex)
     response = np.full((count, task.omega.size, len(task.outputs), len(task.inputs)), np.nan, dtype=complex)
+    phase = np.full(response.shape, np.nan)
     failed: dict[int, str] = {}
     items = Made(partial(_row, points), range(count))
     found = map(Outcome, itertools.count(), map(task, items)) if executor is None else outcomes(executor, task, items)
@@ -392,7 +444,7 @@ def sweep(
         if outcome.failure or isinstance(value, str):
             failed[k] = outcome.failure or value
         else:
-            rmse[k], poles[k], response[k] = value
+            rmse[k], poles[k], response[k], phase[k] = value
         if progress:
             progress(done, count, "points")
     known: dict[str, Any] = {**model.inputs, **model.parameters}
@@ -408,6 +460,7 @@ def sweep(
         poles=poles,
         omega=task.omega,
         response=response,
+        phase_deg=phase,
         channels=(task.inputs, task.outputs) if task.omega.size else ((), ()),
         failed=dict(sorted(failed.items())),
         wanted=tuple(quantities.names),

@@ -49,6 +49,14 @@ class Function:
     hot: bool = False  # called in every step: worth the compiler's full effort
 
 
+def arguments(graph: Graph, node: int, live: bool) -> tuple[int, ...]:
+    """Return the nodes that a generated function computes a node from. live: conditions by comparison, not by frozen mode."""
+    key = graph.nodes[node]
+    if key[0] == "switch":
+        return (graph.switches[key[1]],) if live else ()
+    return graph.arguments(node)
+
+
 def declarations() -> list[str]:
     lines = ["declare double @llvm.fabs.f64(double)", "declare double @llvm.pow.f64(double, double)"]
     lines += [f"declare <{LANES} x double> @llvm.sqrt.v{LANES}f64(<{LANES} x double>)"]
@@ -156,19 +164,13 @@ class _Emitter:
             if n in names:
                 stack.pop()
                 continue
-            missing = [a for a in self._arguments(n) if a not in names]
+            missing = [a for a in arguments(self.graph, n, self.function.live) if a not in names]
             if missing:
                 stack.extend(reversed(missing))
             else:
                 names[n] = self._instruction(n)
                 stack.pop()
         return names[node]
-
-    def _arguments(self, n: int) -> tuple[int, ...]:
-        key = self.graph.nodes[n]
-        if key[0] == "switch":
-            return (self.graph.switches[key[1]],) if self.function.live else ()
-        return self.graph.arguments(n)
 
     def _constant(self, value: float) -> str:
         return _number(value)

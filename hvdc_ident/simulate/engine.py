@@ -16,8 +16,8 @@ from hvdc_ident.errors import ModelError, SimulationError, TimingError
 from hvdc_ident.model import Model
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.core import GIVEN, GIVEN_INSTANTS, HEAD_FIELDS, PLACE, RUN_FIELDS, address, integrate, room
-from hvdc_ident.simulate.equations import ModelEquations, by_structure, padded
-from hvdc_ident.simulate.object_code import Code, evaluate
+from hvdc_ident.simulate.equations import ModelEquations, by_structure
+from hvdc_ident.simulate.machine_code import Code, evaluate
 from hvdc_ident.simulate.simulation import HINTS, Statistics
 from hvdc_ident.simulate.steady_state import Equilibria
 
@@ -88,24 +88,13 @@ class _Equations:
                 self.address[NAMES.index(name)] = start
             second = self.structure.second
             self._second = [np.array([found[k] for found in second], dtype=np.int64) for k in (0, 1)]
-        s, m = self.structure.sizes, self.structure
-        n, address = s.nx + s.nz, dict(zip(NAMES, self.address.tolist(), strict=True))
+        width, address = self.structure.sizes.width, dict(zip(NAMES, self.address.tolist(), strict=True))
         given: dict[str, int] = {
-            **{k: getattr(s, k) for k in ("nx", "nz", "nu", "nd", "nq", "ns", "no", "np", "width")},
-            "n": n,
-            "size": n * (1 + s.width),
-            "stride": padded(n * (1 + s.width)),
-            "nw": 1 + s.nu + s.nd + s.nq,
-            "hessians": self._second[0].size if rosenbrock else 0,
-            "factors": m.elimination.count if rosenbrock and m.elimination else 0,
-            "timed": m.moves_by_itself,
-            "rosenbrock": rosenbrock,
-            "sliding": -1 if m.switch is None else m.switch,
-            "twin": m.twin,
+            **self.structure.head(rosenbrock),
             **{f"do_{k}": v for k, v in address.items()},
-            "do_rhs": address["fs" if s.width else "f"],
-            "do_observe": address["outs" if s.width else "out"],
-            "do_sources": address["srcs" if s.width else "src"],
+            "do_rhs": address["fs" if width else "f"],
+            "do_observe": address["outs" if width else "out"],
+            "do_sources": address["srcs" if width else "src"],
             "hess_row": self._second[0].ctypes.data,
             "hess_column": self._second[1].ctypes.data,
         }
@@ -231,6 +220,11 @@ class Engine:
                 hint=HINTS[status],
             )
         return out, statistics
+
+    @property
+    def slides(self) -> tuple[int, ...]:
+        """The switches along whose surfaces runs have slid so far."""
+        return tuple(sorted(self._slides))
 
     def _compile_slide(self, switch: int) -> None:
         """Make the equations of the slide on a switch known to later runs."""

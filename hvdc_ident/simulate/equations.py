@@ -22,7 +22,7 @@ from hvdc_ident.model import Model, dependency_order, reached
 from hvdc_ident.simulate.codegen import Elimination, Function, Row, eliminate, function_text, solve_text
 from hvdc_ident.simulate.core import NUMBERS
 from hvdc_ident.simulate.graph import Graph
-from hvdc_ident.simulate.object_code import Code
+from hvdc_ident.simulate.machine_code import Code
 from hvdc_ident.simulate.sliding_equations import sliding
 
 ACCURACY, SHORTEST, TINY = (NUMBERS[n] for n in ("ACCURACY", "SHORTEST", "TINY"))
@@ -169,6 +169,24 @@ class ModelEquations:
             n,
             width,
         )
+
+    def head(self, rosenbrock: bool) -> dict[str, int]:
+        """Return what a run's record states of these equations, but for addresses: {field of the core's head: number}."""
+        s, e = self.sizes, self.elimination if rosenbrock else None
+        n = s.nx + s.nz
+        return {
+            **{k: getattr(s, k) for k in ("nx", "nz", "nu", "nd", "nq", "ns", "no", "np", "width")},
+            "n": n,
+            "size": n * (1 + s.width),
+            "stride": padded(n * (1 + s.width)),
+            "nw": 1 + s.nu + s.nd + s.nq,
+            "hessians": len(self.second) if rosenbrock else 0,
+            "factors": e.count if e else 0,
+            "timed": self.moves_by_itself,
+            "rosenbrock": rosenbrock,
+            "sliding": -1 if self.switch is None else self.switch,
+            "twin": self.twin,
+        }
 
     # --- derivatives ---
 

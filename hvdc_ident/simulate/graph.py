@@ -277,7 +277,7 @@ class Graph:
         raise ModelError(
             f"the function '{kind.__name__}' has no machine code",
             expected="a function of the expression grammar",
-            hint="write it with the functions that `hvdc-ident` model cards know",
+            hint="write it with the functions that model cards know",
         )
 
     def _sum(self, terms: Iterable[sp.Basic], sub: Convert) -> int:

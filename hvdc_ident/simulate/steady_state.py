@@ -24,7 +24,7 @@ from hvdc_ident.model import Model, State, blended
 from hvdc_ident.simulate.codegen import NAMES
 from hvdc_ident.simulate.core import SteadyEquations
 from hvdc_ident.simulate.equations import ACCURACY, SHORTEST, TINY, ModelEquations, by_structure
-from hvdc_ident.simulate.object_code import Code, evaluate
+from hvdc_ident.simulate.machine_code import Code, evaluate
 
 Branch = Literal["own", "unconnected"]
 

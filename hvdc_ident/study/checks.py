@@ -1,15 +1,11 @@
-"""Checks of what a study holds before a stage runs, and of what a result holds before it is told.
-
-Names that its questions use, the preconditions of each stage, remarks on the steady states its runs begin at; and the one
-place that decides whether a stage's JSON is plausible.
-"""
+"""Checks of what a study holds before a stage runs: names that its questions use, the preconditions of each stage, and remarks on
+the steady states its runs begin at."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import (
     ComputationError,
@@ -130,14 +126,14 @@ def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str
 
 def _check_kind_of_model(asked: schema.LinearizeTable, model: AnyModel, place: str) -> None:
     """Raise StudyError where [linearize] asks for what only equations tell."""
-    of_equations = (asked.break_at, asked.plant, asked.port, asked.formula, asked.locus)
+    of_equations = (asked.break_at, asked.plant, asked.port, asked.formula, asked.locus, asked.side != "refuse")
     if not isinstance(model, Model) and any(of_equations):
         raise StudyError(
-            "loops, ports, loci and formulas need the model's equations",
+            "loops, ports, loci, formulas and a side of a limit need the model's equations",
             where=place,
             expected="a model card or a shipped model",
             got="an FMU",
-            hint="leave break_at, plant, port, locus and formula out",
+            hint="leave break_at, plant, port, locus, formula and side out",
         )
 
 
@@ -291,125 +287,3 @@ def _notes(model: Model, values: Mapping[str, float], inputs: Mapping[str, float
         return find_operating_point(model, known).notes
     except HvdcIdentError as error:  # the stage that needs a steady state ends with it
         return (str(error),)
-
-
-Check = Callable[[Mapping[str, Any]], Iterator[str]]
-"""From a stage's JSON to the violations in it, in words."""
-
-ROUNDING = 1e-9
-"""An interval may miss its estimate by this share of the two: they went through different arithmetic."""
-FINISHED = ("converged", "at-bound", "two-optima")
-"""Statuses of a fit that call its values estimates."""
-
-
-def violations(stage: str, data: Mapping[str, Any]) -> list[str]:
-    """Return what keeps a stage's JSON from being told as a result, in words; empty where nothing does.
-
-    stage: its name. A stage without checks of its own has those that hold for every result.
-    """
-    return [words for check in (*EVERY, *OWN.get(stage, ())) for words in check(data)]
-
-
-def intervals_contain(data: Mapping[str, Any]) -> Iterator[str]:
-    """Every value told with a 95 % interval lies in it."""
-    for place, entry in _with_intervals(data, ()):
-        for key in ("ci95", "ci95_independent"):
-            low, high = entry.get(key) or (None, None)
-            value = entry["value"]
-            slack = ROUNDING * max(abs(value), *(abs(end) for end in (low, high) if end is not None), 0.0)
-            if (low is not None and low > value + slack) or (high is not None and value - slack > high):
-                ends = " to ".join("open" if end is None else f"{end:.6g}" for end in (low, high))
-                yield f"{place} = {value:.6g} lies outside its own interval {ends}"
-
-
-def best_cost_is_told(data: Mapping[str, Any]) -> Iterator[str]:
-    """No start of a fit reached a cost lower than the one told, by more than two costs that are as good may differ.
-
-    Costs of groups fitted one after the other are not comparable with that of all together. Of a rough cost the optimum of
-    its trend is told, not its lowest point: local minima within the intervals are lower, and elsewhere by luck.
-    """
-    starts = [s for s in data.get("starts") or () if s.get("cost") is not None and s.get("group") is None]
-    rough = (data.get("roughness") or {}).get("delta_chi2", 0.0) / 2.0
-    costs = [s["cost"] for s in starts if not (rough and _within_intervals(s.get("end") or {}, data))]
-    cost = data.get("cost")
-    if data.get("status") not in FINISHED or cost is None or not costs:
-        return
-    from hvdc_ident.fit.nonsmooth import LUCK
-    from hvdc_ident.fit.search import DISTINCT, TIE
-
-    rows = sum(t["n"] for line in (data.get("residual_tests") or {}).values() for t in line.values())
-    effective = sum((data.get("effective_samples") or {}).values())
-    worth = min(1.0, effective / rows) if rows and effective > 0 else 1.0
-    fall = cost - min(costs)
-    if fall > max(TIE * cost, DISTINCT / worth) + LUCK * rough:
-        yield f"a start reached a cost {fall:.3g} below the one told ({cost:.6g}): the estimates are not the best that was seen"
-
-
-def _within_intervals(end: Mapping[str, float], data: Mapping[str, Any]) -> bool:
-    """Return whether the end of a start lies in the 95 % interval of every estimate; not where one has none."""
-    for name, estimate in (data.get("estimates") or {}).items():
-        low, high = estimate.get("ci95") or (None, None)
-        if name not in end or low is None or high is None or not low <= end[name] <= high:
-            return False
-    return True
-
-
-def fit_is_judged(data: Mapping[str, Any]) -> Iterator[str]:
-    """Beside the intervals of a fit stands chi2/dof, or that the noise is the residual's own, and what a misfit means."""
-    stated = [n for n, e in (data.get("estimates") or {}).items() if e.get("ci95")]
-    if not stated or data.get("status") not in FINISHED:
-        return
-    judged = data.get("adequacy") or {}
-    sources = (data.get("noise_source") or {}).values()
-    stated_noise = any(not str(s).startswith("misfit") for s in sources)
-    if not judged.get("verdict"):
-        yield f"the intervals of {', '.join(stated)} stand without a verdict on the residuals"
-    elif stated_noise and not _finite(judged.get("chi2_per_dof")) and judged["verdict"] != "not-judged":
-        yield f"the intervals of {', '.join(stated)} stand without chi2/dof"
-    elif judged["verdict"] == "does-not-fit" and not (judged.get("text") and judged.get("next")):
-        yield "the model does not fit, and neither by how much nor what to do is said"
-
-
-def pilot_is_judged(data: Mapping[str, Any]) -> Iterator[str]:
-    """Beside the verdicts of `identify` stands the size of the pilot fit's residuals, of each group's where there are groups."""
-    known = data.get("parameters") or {}
-    stated = [n for n in data.get("identifiable") or () if any(e is not None for e in known[n].get("ci95") or ())]
-    pilot = data.get("pilot") or {}
-    if stated and not all(_finite(p.get("chi2_per_dof")) for p in pilot.get("groups") or [pilot]):
-        yield f"the intervals of {', '.join(stated)} stand without chi2/dof of the pilot fit"
-
-
-def branch_is_told(data: Mapping[str, Any]) -> Iterator[str]:
-    """An operating point on another branch of steady states than the model's own says so."""
-    point = data.get("operating_point") or {}
-    branch = point.get("branch", "own")
-    if branch in ("unconnected", "other") and not point.get("notes"):
-        yield f"the operating point lies on another branch of steady states ('{branch}') than the model's own, and does not say so"
-
-
-EVERY: tuple[Check, ...] = (intervals_contain, branch_is_told)
-OWN: Mapping[str, tuple[Check, ...]] = {
-    "fit": (best_cost_is_told, fit_is_judged),
-    "identify": (pilot_is_judged,),
-}
-
-
-def _with_intervals(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield the place, in words, of every mapping inside that has a number `value` and a `ci95`, and the mapping.
-
-    A parameter that `identify` holds is told at the value it is held at, with what the data say of it: not an estimate.
-    """
-    if isinstance(value, Mapping):
-        held = value.get("verdict") not in (None, "identifiable", "locally-identifiable", "weak", "at-bound")
-        if _finite(value.get("value")) and value.get("ci95") and not held:
-            yield " ".join(path), value
-        for key, inner in value.items():
-            yield from _with_intervals(inner, (*path, str(key)))
-    elif isinstance(value, list | tuple):
-        for inner in value:
-            if isinstance(inner, Mapping | list | tuple):
-                yield from _with_intervals(inner, path)
-
-
-def _finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -60,7 +60,7 @@ def dask_executor(address: str) -> Iterator[DaskExecutor]:
         import distributed
     except ImportError:
         raise InputError(
-            "dask is not installed", where="--executor", hint="pip install 'hvdc_ident[distributed]'"
+            "dask is not installed", where="executor", hint="pip install 'hvdc_ident[distributed]'"
         ) from None
     secure = address.startswith("dask+tls://")
     place = ("tls://" if secure else "tcp://") + address.split("://", 1)[1]

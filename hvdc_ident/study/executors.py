@@ -7,6 +7,7 @@ from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 from hvdc_ident.errors import InputError
+from hvdc_ident.next_step import ON_DASK, NextStep
 from hvdc_ident.parallel import LocalPool, OpenPool, PatientPool, available_cores, can_start
 from hvdc_ident.parallel.patient import beginning
 
@@ -24,10 +25,10 @@ def check_executor(name: str) -> None:
     if name not in ("", LOCAL) and not any(name.startswith(kind) and name != kind for kind in DASK):
         raise InputError(
             "no such executor: work is done on this machine or by a dask scheduler",
-            where="--executor",
+            where="executor",
             expected=f"{LOCAL}, {' or '.join(f'{kind}HOST:PORT' for kind in DASK)}",
             got=repr(name),
-            hint="--workers 2 for this machine, or --executor dask://127.0.0.1:8786 once `dask scheduler` runs",
+            next=(NextStep("option", "workers = 2", "does the work on this machine"), ON_DASK),
         )
 
 

@@ -61,18 +61,18 @@ def fmu_options(fmi: str | None, kind: str | None, source_only: bool) -> FmuOpti
     if fmi is not None and fmi not in versions:
         raise StudyError(
             "no FMU is written in this version of FMI",
-            where="--fmi",
+            where="fmi",
             expected="2 or 3",
             got=repr(fmi),
-            hint="--fmi 2, which most tools read",
+            next=(NextStep("option", "fmi = 2", "writes what most tools read"),),
         )
     if kind is not None and kind not in kinds:
         raise StudyError(
             "an FMU is of no such kind",
-            where="--kind",
+            where="kind",
             expected="me or cs",
             got=repr(kind),
-            hint="--kind me for model exchange, --kind cs for co-simulation; without it the FMU has both",
+            hint="me for model exchange, cs for co-simulation; without it the FMU has both",
         )
     default = FmuOptions()
     return FmuOptions(
@@ -109,10 +109,10 @@ def write(
     nonlinear = isinstance(source, Study | Model) and not linear and not reduced
     if fmu is not None and ending != ".fmu":
         raise StudyError(
-            "--fmi, --kind and --source-only are about an FMU, and this ending is another format's",
+            "options of an FMU are given, and this ending is another format's",
             where=str(path),
             expected="a file *.fmu",
-            hint=f"--to {path.with_suffix('.fmu')}, or leave them out",
+            hint=f"{path.with_suffix('.fmu')}, or leave out the version, the kind and the sources",
         )
     if ending not in FORMATS and not (nonlinear and ending in _WRITERS):
         known = sorted({*FORMATS, *(_WRITERS if nonlinear else ())})
@@ -146,7 +146,7 @@ def _reduced(source: Study | Model | LinearModel, whole: LinearModel) -> LinearM
     if asked is None or asked.reduce is None:
         hint = "reduce = {order = 4}, or {tolerance = 0.01}, in [linearize]"
         raise StudyError(
-            "the study asks for no reduced model", where="--reduced", expected="[linearize] reduce", hint=hint
+            "the study asks for no reduced model", where="reduced", expected="[linearize] reduce", hint=hint
         )
     r = asked.reduce
     small = whole.scaled(asked.scale).reduce(r.order, r.tolerance, match_dc=r.match_dc).model
@@ -164,8 +164,8 @@ def _card(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOp
 def _fmu(source: Study | Model, selected: ValueSet | None, path: Path, options: FmuOptions) -> Written:
     from hvdc_ident.fmu.export import export_fmu
 
-    ends = [float(e.time[-1]) for e in source.experiments] if isinstance(source, Study) else []
-    stop = max((t for t in ends if t > 0.0), default=1.0)
+    experiments = source.experiments if isinstance(source, Study) else ()
+    stop = max((t for e in experiments if (t := float(e.time[-1])) > 0.0), default=1.0)
     found = export_fmu(
         _described(source, selected),
         path,
@@ -173,6 +173,7 @@ def _fmu(source: Study | Model, selected: ValueSet | None, path: Path, options: 
         kinds=options.kinds,
         binary=options.binary,
         stop=stop,
+        experiments=experiments,
     )
     return Written(found.path, f"FMI {found.version}, {' and '.join(found.kinds)}; {found.note}")
 

@@ -25,6 +25,7 @@ from hvdc_ident.study.checks import need_candidates, need_experiments, need_star
 from hvdc_ident.study.recorded_inputs import fitted_records
 from hvdc_ident.study.schema import FitTable
 from hvdc_ident.study.study import priors
+from hvdc_ident.summary.stage_results import Derived, ExperimentContext
 
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment, Trajectory
@@ -243,8 +244,13 @@ def curves_csv(experiment: Experiment, found: Mapping[str, Curve]) -> str:
     return csv_columns(columns)
 
 
-def derived(study: Study, result: FitResult) -> dict[str, dict[str, Any]]:
-    """The parameters that follow from the fitted ones, by a tie or a parameterisation: {value, std, unit, expression}.
+def context_of(e: Experiment, status: str = "", reason: str = "") -> ExperimentContext:
+    """Return an experiment as the results hold it. status, reason: of a run at the given values."""
+    return ExperimentContext(e.role, e.event, e.window, e.recording, status, reason)
+
+
+def derived(study: Study, result: FitResult) -> dict[str, Derived]:
+    """Return the parameters that follow from the fitted ones, by a tie or a parameterisation.
 
     std by the derivative of the expression and the covariance of the estimates; None where one of them has none.
     """
@@ -262,15 +268,12 @@ def derived(study: Study, result: FitResult) -> dict[str, dict[str, Any]]:
     table = {}
     for name in names:
         expression = model.signals[name].value
-        table[name] = {
-            **_value(expression, model, result),
-            "unit": model.signals[name].unit,
-            "expression": str(expression),
-        }
+        value, std = _value(expression, model, result)
+        table[name] = Derived(value, std, model.signals[name].unit, str(expression))
     return table
 
 
-def _value(expression: sp.Expr, model: Model, result: FitResult) -> dict[str, float | None]:
+def _value(expression: sp.Expr, model: Model, result: FitResult) -> tuple[float, float | None]:
     values = {**model.values, **result.values}
     at = {s: values[s.name] for s in expression.free_symbols}
     value = float(expression.subs(at))
@@ -281,7 +284,7 @@ def _value(expression: sp.Expr, model: Model, result: FitResult) -> dict[str, fl
         or known is None
         or any(result.estimates[s.name].std is None or s.name not in known.names for s in moved)
     ):
-        return {"value": value, "std": None}
+        return value, None
     slope = np.array([float(sp.diff(expression, s).subs(at)) for s in moved])
     place = [known.names.index(s.name) for s in moved]
-    return {"value": value, "std": float(np.sqrt(slope @ known.matrix[np.ix_(place, place)] @ slope))}
+    return value, float(np.sqrt(slope @ known.matrix[np.ix_(place, place)] @ slope))

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,13 +40,12 @@ from hvdc_ident.study.conversions import (
     conversions,
     suggest_conversion,
 )
+from hvdc_ident.summary.levels import PLAIN, InitialValue
 from hvdc_ident.text import figures, listed
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
-PLAIN = ("offset", "difference")
-"""Suggestions where nothing more is known than that the levels differ."""
 FALSE_ALARMS = 1e-3
 """Probability that noise alone makes one of a study's levels differ."""
 SMALLEST_FACTOR = math.sqrt(2.0)
@@ -55,42 +54,6 @@ NEWTON = 6
 """Evaluations with a difference that find another set-point."""
 TIMES = ((1e-3, "ms"), (1e-6, "us"), (60.0, "min"), (3600.0, "h"))
 """Units of time other than s that a recording may be in."""
-
-
-@dataclass(frozen=True)
-class InitialValue:
-    """One output of one experiment before the event, in the output's unit; None where it is not known.
-
-    recorded: the mean of the recorded rows before the event; error: its standard error. model: the model's at its given
-    values; low, high: what it can be with the candidates within their bounds. difference: recorded - model;
-    noise_units: the same over the noise of a single row. slope: the recorded movement over the simulated.
-    channel: what the suggestion is about: the output, two outputs ("P, Q"), "input NAME" or "time". factor: what the
-    recording seems to be multiplied by; suggestion: what that is, in a few words; text: in a sentence, empty where there
-    is nothing to say.
-    """
-
-    experiment: str
-    output: str
-    unit: str = ""
-    recorded: float | None = None
-    error: float | None = None
-    model: float | None = None
-    low: float | None = None
-    high: float | None = None
-    difference: float | None = None
-    noise_units: float | None = None
-    slope: float | None = None
-    channel: str = ""
-    factor: float | None = None
-    suggestion: str | None = None
-    text: str = ""
-
-    @property
-    def is_mistake(self) -> bool:
-        """True where the recording seems wrong, not the model: a positive factor may as well be a gain of the model."""
-        if self.suggestion is None or self.suggestion in PLAIN:
-            return False
-        return self.suggestion != "factor" or (self.factor or 0.0) < 0.0
 
 
 @dataclass(frozen=True)
@@ -124,10 +87,10 @@ class InitialValues:
             shown = listed(others[:3]) if len(others) <= 3 else f"{len(others)} more experiments"
             yield first, f"{first.experiment}: {first.text}" + (f" (and so in {shown})" if others else "")
 
-    def to_list(self) -> list[dict[str, Any]]:
-        """Return one table an output and experiment, as the results keep them; failures are tables without an output."""
-        failed = [{"experiment": None, "output": None, "text": t} for t in (*self.failures, *self.remarks)]
-        return [*(asdict(value) for value in self.values), *failed]
+    @property
+    def all(self) -> tuple[InitialValue, ...]:
+        """The values as the results keep them; failures and remarks are values without an output."""
+        return (*self.values, *(InitialValue("", "", text=text) for text in (*self.failures, *self.remarks)))
 
 
 @dataclass(frozen=True, eq=False)

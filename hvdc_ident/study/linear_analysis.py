@@ -8,12 +8,34 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError
-from hvdc_ident.model import Model
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.linearize import (
+    LinearModel,
+    OperatingPoint,
+    RootLocus,
+    compare,
+    find_operating_point,
+    linearize,
+    loop,
+    loop_margins,
+    named,
+    ncf_margin,
+    parts_of,
+    plant_and_controller,
+    port_impedance,
+    root_locus,
+    symbolic_transfer,
+)
+from hvdc_ident.linearize.distance import ModelDistance
+from hvdc_ident.linearize.export import csv_of_response
+from hvdc_ident.linearize.gain_limits import Crossing
+from hvdc_ident.linearize.modal import NamedMode
+from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.study import schema
 from hvdc_ident.study.measured_responses import port_of
+from hvdc_ident.summary.linear import CoprimeMargin, Formula, PortImpedance, StudyMargins, StudyReduction, Trim
 
 if TYPE_CHECKING:
-    from hvdc_ident.linearize import LinearModel, OperatingPoint
     from hvdc_ident.study.study import Study
 
 
@@ -27,8 +49,6 @@ def operating_point(study: Study, values: Mapping[str, float] | None = None) -> 
     values: of the parameters; left out, the given ones. Raises SteadyStateError, with what a study can do
     about it, where there is none.
     """
-    from hvdc_ident.linearize import find_operating_point
-
     asked = study.settings.linearize
     at = asked.at if asked else "steady"
     fixed = dict(study.given if values is None else values)
@@ -53,40 +73,31 @@ def operating_point(study: Study, values: Mapping[str, float] | None = None) -> 
     )
 
 
-def modes_of(study: Study, linear: LinearModel) -> list[dict[str, Any]]:
-    """Return every mode as plain numbers, with a name from the parts of the plant that take part in it where these are known."""
-    from hvdc_ident.linearize import named, parts_of
-
+def modes_of(study: Study, linear: LinearModel) -> list[NamedMode]:
+    """Return every mode, with a name from the parts of the plant that take part in it where these are known."""
     if not isinstance(study.model, Model):
-        return [m.to_dict() for m in linear.modes()]
+        return [NamedMode(m, "", FrozenMap()) for m in linear.modes()]
     parts = parts_of(study.model)
-    modes = [named(m, parts) for m in linear.modes()]
-    return [{**m.mode.to_dict(), "name": m.name, "parts": dict(m.parts)} for m in modes]
+    return [named(m, parts) for m in linear.modes()]
 
 
 def analyses(study: Study, linear: LinearModel) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return what is asked for beside the linear model, by key of the JSON, and the files to write beside it by name."""
+    """Return what is asked for beside the linear model, by field of `LinearResult`, and the files to write beside it by name."""
     asked = study.settings.linearize or schema.LinearizeTable()
     scaled = linear.scaled(asked.scale)
-    data: dict[str, Any] = {"norms": _norms(scaled)}
-    files: dict[str, str] = {}
-    if asked.scale:
-        data["scale"] = dict(asked.scale)
-    if asked.trim is not None:
-        data["trim"] = _trimmed(asked.trim, linear)
-    if asked.break_at or asked.plant:
-        data["margins"] = _margins(asked, linear)
-    if asked.reduce is not None:
-        data["reduced"] = _reduced(asked.reduce, scaled)
-    if study.compared is not None:
-        data["comparison"] = _compared(study, scaled)
-    if asked.formula:
-        data["formulas"] = _formulas(study, linear, asked.formula)
-    if asked.locus:
-        data["locus"] = _locus(asked.locus, linear)
-    if asked.port:
-        data["ports"], files = _ports(asked.port, linear)
-    return data, files
+    ports, files = _ports(asked.port, linear)
+    found = {
+        "norms": _norms(scaled),
+        "scale": asked.scale,
+        "trim": None if asked.trim is None else _trimmed(study.model, asked.trim, linear),
+        "margins": _margins(asked, linear) if asked.break_at or asked.plant else None,
+        "reduced": None if asked.reduce is None else _reduced(asked.reduce, scaled),
+        "comparison": None if study.compared is None else _compared(study, scaled),
+        "formulas": _formulas(study, linear, asked.formula) if asked.formula else (),
+        "locus": None if asked.locus is None else _locus(asked.locus, linear),
+        "ports": ports,
+    }
+    return found, files
 
 
 def _norms(linear: LinearModel) -> dict[str, Any]:
@@ -98,108 +109,87 @@ def _norms(linear: LinearModel) -> dict[str, Any]:
     return found
 
 
-def _trimmed(trim: schema.TrimTable, linear: LinearModel) -> dict[str, Any]:
+def _trimmed(model: AnyModel, trim: schema.TrimTable, linear: LinearModel) -> Trim:
     point = linear.point
     assert point is not None
     free = trim.free
     if free is None:
         search = point.search
-        moved = [n for n, i in point.model.inputs.items() if n not in trim.inputs and point.inputs[n] != i.value]
+        moved = [n for n, i in model.inputs.items() if n not in trim.inputs and point.inputs[n] != i.value]
         free = moved if search is None else [search.system.inputs[k] for k in search.freed_u]
     found = {**point.inputs, **point.parameters}
-    return {"outputs": dict(trim.outputs), "inputs": dict(trim.inputs), "found": {n: found[n] for n in free}}
+    return Trim(dict(trim.outputs), dict(trim.inputs), {n: found[n] for n in free})
 
 
-def _margins(asked: schema.LinearizeTable, linear: LinearModel) -> dict[str, Any]:
-    from hvdc_ident.linearize import loop, loop_margins, ncf_margin, plant_and_controller
-
+def _equations(linear: LinearModel) -> tuple[Model, OperatingPoint]:
+    """Return the model with equations that was linearised, and its point."""
     point = linear.point
     assert point is not None and isinstance(point.model, Model)
-    found: dict[str, Any] = {}
-    if asked.break_at:
-        found = loop_margins(loop(point.model, asked.break_at, point)).to_dict()
-    if asked.plant:
-        plant, controller = plant_and_controller(point.model, asked.plant.inputs, asked.plant.outputs, point)
-        found["ncf_margin"] = {
-            **ncf_margin(plant, controller).to_dict(),
-            "attainable": ncf_margin(plant).value,
-            "inputs": asked.plant.inputs,
-            "outputs": asked.plant.outputs,
-        }
-    return found
+    return point.model, point
 
 
-def _reduced(asked: schema.ReduceTable, linear: LinearModel) -> dict[str, Any]:
+def _margins(asked: schema.LinearizeTable, linear: LinearModel) -> StudyMargins:
+    model, point = _equations(linear)
+    loops = loop_margins(loop(model, asked.break_at, point)) if asked.break_at else None
+    if not asked.plant:
+        return StudyMargins(loops)
+    inputs, outputs = asked.plant.inputs, asked.plant.outputs
+    plant, controller = plant_and_controller(model, inputs, outputs, point)
+    margin = CoprimeMargin(ncf_margin(plant, controller), ncf_margin(plant).value, tuple(inputs), tuple(outputs))
+    return StudyMargins(loops, margin)
+
+
+def _reduced(asked: schema.ReduceTable, linear: LinearModel) -> StudyReduction:
     """The reduced model with the error it has and the bound that was known beforehand."""
     found = linear.reduce(asked.order, asked.tolerance, match_dc=asked.match_dc)
-    return {**found.to_dict(), "error": found.error.to_dict(), "states_before": len(linear.state_names)}
+    return StudyReduction(found, found.error, len(linear.state_names))
 
 
-def _compared(study: Study, linear: LinearModel) -> dict[str, Any]:
+def _compared(study: Study, linear: LinearModel) -> ModelDistance:
     """The other model's linear model at the same inputs and, by name, parameters, against this one's."""
-    from hvdc_ident.linearize import compare, find_operating_point, linearize
-
     point, other = linear.point, study.compared
     assert point is not None and other is not None
     same = {n: v for n, v in point.inputs.items() if n in other.inputs}
     at = find_operating_point(other, same)
     second = linearize(other, at, inputs=linear.input_names, outputs=linear.output_names)
     asked = study.settings.linearize
-    return compare(linear, second.scaled(asked.scale if asked else {})).to_dict()
+    return compare(linear, second.scaled(asked.scale if asked else {}))
 
 
-def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> list[dict[str, Any]]:
+def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> tuple[Formula, ...]:
     """Each transfer function with some parameters as symbols; where there is none, the reason."""
-    from hvdc_ident.linearize import symbolic_transfer
-
     model = study.model
     assert isinstance(model, Model)
-    found: list[dict[str, Any]] = []
+    found = []
     for o in linear.output_names:
         for i in linear.input_names:
             try:
                 f = symbolic_transfer(model, i, o, parameters, linear.point)
             except LinearizationError as e:
-                found.append({"input": i, "output": o, "reason": e.what})
+                found.append(Formula(i, o, reason=e.what))
             else:
-                top, bottom = f.rounded()
-                found.append({"input": i, "output": o, "numerator": top, "denominator": bottom, "latex": f.latex()})
-    return found
+                found.append(Formula(i, o, *f.rounded(), f.latex()))
+    return tuple(found)
 
 
-def _locus(asked: schema.LocusTable, linear: LinearModel) -> dict[str, Any]:
+def _locus(asked: schema.LocusTable, linear: LinearModel) -> RootLocus:
     """The eigenvalues along the parameter, all else as at the operating point."""
-
-    from hvdc_ident.linearize import root_locus
-
-    point = linear.point
-    assert point is not None and isinstance(point.model, Model)
+    model, point = _equations(linear)
     spread = np.geomspace if asked.scale == "log" else np.linspace
     values = np.asarray(spread(asked.min, asked.max, asked.points), dtype=float)
     fixed = {n: v for n, v in {**point.inputs, **point.parameters}.items() if n != asked.parameter}
-    return root_locus(point.model, asked.parameter, values, fixed).to_dict()
+    return root_locus(model, asked.parameter, values, fixed)
 
 
-def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[list[dict[str, Any]], dict[str, str]]:
+def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[tuple[PortImpedance, ...], dict[str, str]]:
     """The impedance of each port, and a file of each."""
-
-    from hvdc_ident.linearize import port_impedance
-    from hvdc_ident.linearize.export import csv_of_response
-
-    point = linear.point
-    assert point is not None and isinstance(point.model, Model)
     found, files = [], {}
     for table in tables:
+        model, point = _equations(linear)
         omega = 2 * np.pi * np.geomspace(table.band[0], table.band[1], table.points)
-        z = port_impedance(point.model, port_of(table), omega, point)
+        z = port_impedance(model, port_of(table), omega, point)
         passive = np.linalg.eigvalsh(z.values + np.conj(np.swapaxes(z.values, 1, 2)))[:, 0] / 2
         k = int(np.argmin(passive))
-        found.append(
-            {
-                "name": table.name,
-                **z.to_dict(),
-                "least_real_part": {"value": float(passive[k]), "omega": float(omega[k])},
-            }
-        )
+        found.append(PortImpedance(table.name, z, Crossing(float(omega[k]), float(passive[k]))))
         files[f"impedance.{table.name}.csv"] = csv_of_response(z)
-    return found, files
+    return tuple(found), files

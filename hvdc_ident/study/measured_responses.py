@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hvdc_ident.codec import read_fields
 from hvdc_ident.data import Array
 from hvdc_ident.errors import LinearizationError, SteadyStateError, StudyError, located, unknown_name
 from hvdc_ident.files import digest
@@ -27,7 +27,13 @@ from hvdc_ident.linearize import (
 from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
 from hvdc_ident.study.checks import names_of_model
-from hvdc_ident.text import figures
+from hvdc_ident.summary.compared_responses import (
+    ChannelError,
+    ComparedResponse,
+    Curves,
+    DescribedResponse,
+    ModelResponse,
+)
 from hvdc_ident.toml_tables import check_names
 
 if TYPE_CHECKING:
@@ -182,80 +188,55 @@ def _waveforms(table: schema.ResponseTable, path: Path) -> ResponseFile:
     return ResponseFile(found.omega[order], channels, FrozenMap({name: found.std[order, 0, 0]}))
 
 
-def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Return every measured response beside the model's at some sets of values, with the errors of each, as plain numbers.
+def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[ComparedResponse]:
+    """Return every measured response beside the model's at some sets of values, with the errors of each.
 
     sets: values of parameters by the set's name ("given", "fitted"). A set for which there is no response has the reason.
+    Phases are degrees; the measured one has, as every other, the whole turns that bring it nearest to the first model's.
     """
-    found = []
-    for r in study.responses:
-        line: dict[str, Any] = {
-            "name": r.name,
-            **described(r),
-            "omega": r.omega.tolist(),
-            "measured": _parts(r.values),
-            "std": None if r.std is None else r.std.tolist(),
-            "models": {},
-        }
-        for name, values in sets.items():
-            try:
-                linear = r.linear(study.model, values)
-                curve = r.seen(linear)[0]
-            except (SteadyStateError, LinearizationError) as e:
-                line["models"][name] = {"reason": str(e)}
-            else:
-                stable = linear.stability().verdict in ("stable", "on the limit of stability")
-                line["models"][name] = {**_parts(curve), "errors": r.errors(curve), "stable": stable}
-        found.append(line)
-    return found
+    return [_compared(study, r, sets) for r in study.responses]
 
 
-def _parts(values: Array) -> dict[str, Any]:
-    return {"real": values.real.tolist(), "imag": values.imag.tolist()}
-
-
-def response_lines(responses: Iterable[Mapping[str, Any]], of: str) -> list[str]:
-    """Return a line for each channel of the compared responses: how far the model with one set of values is from it."""
-    lines = []
-    for r in responses:
-        model = r["models"].get(of)
-        if model is None:
+def _compared(study: Study, r: MeasuredResponse, sets: Mapping[str, Mapping[str, float]]) -> ComparedResponse:
+    models: dict[str, ModelResponse] = {}
+    first: Array | None = None
+    for name, values in sets.items():
+        try:
+            linear = r.linear(study.model, values)
+            curve = r.seen(linear)[0]
+        except (SteadyStateError, LinearizationError) as e:
+            models[name] = ModelResponse(reason=str(e))
             continue
-        if "reason" in model:
-            lines.append(f"response {r['name']}: the {of} model has none: {model['reason']}")
-        if model.get("stable") is False:
-            lines.append(f"response {r['name']}, {of}: the model is unstable where it was measured")
-        for e in model.get("errors", ()):
-            share = "" if e["relative"] is None else f" off by {100 * e['relative']:.3g} %,"
-            chi2 = (
-                "" if e["chi2_per_point"] is None else f"; {figures(math.sqrt(e['chi2_per_point']), 3)} times the noise"
-            )
-            lines.append(
-                f"response {r['name']}, {e['channel']}, {of}:{share} gain by up to {e['gain_db']['value']:+.3g} dB at "
-                f"{e['gain_db']['omega'] / math.tau:.4g} Hz, phase by up to {e['phase_deg']['value']:+.3g} degrees at "
-                f"{e['phase_deg']['omega'] / math.tau:.4g} Hz{chi2}"
-            )
-            if e["factor"] is not None:
-                lines.append(
-                    f"response {r['name']}, {e['channel']}: the measured one is {e['factor']:.4g} times the model's: sign, "
-                    "unit or base? `scale` in [[response]] multiplies it"
-                )
-    return lines
+        phase = r.phase(linear)
+        first = phase if first is None else first
+        phase = phase + _turns(first[:1] - phase[:1])
+        errors = tuple(read_fields(ChannelError, e) for e in r.errors(curve))
+        stable = linear.stability().verdict in ("stable", "on the limit of stability")
+        models[name] = ModelResponse(curve.real, curve.imag, phase, errors, stable)
+    angle = np.degrees(np.angle(r.values))
+    phase = np.degrees(np.unwrap(np.radians(angle), axis=0)) if first is None else angle + _turns(first - angle)
+    measured = Curves(r.values.real, r.values.imag, phase)
+    return ComparedResponse(r.name, described(r), r.omega, measured, r.std, models)
 
 
-def described(response: MeasuredResponse) -> dict[str, object]:
-    """Return what `check` tells of a measured response."""
+def _turns(degrees: Array) -> Array:
+    """Return the whole turns next to some angles, degrees."""
+    return np.asarray(360.0 * np.round(degrees / 360.0))
+
+
+def described(response: MeasuredResponse) -> DescribedResponse:
+    """Return a measured response in short."""
     hertz = response.omega / (2 * np.pi)
     noise: float | None = None
     if response.std is not None:
         noise = float(np.sqrt(np.mean(response.std**2) / np.mean(np.abs(response.values) ** 2)))
-    return {
-        "role": response.role,
-        "kind": response.kind,
-        "channels": list(response.labels),
-        "points": int(hertz.size),
-        "band_hz": [float(hertz[0]), float(hertz[-1])],
-        "unit": response.unit,
-        "relative_noise": noise,
-        "noise_source": "misfit" if response.std is None else "estimated" if np.isfinite(response.dof) else "given",
-    }
+    return DescribedResponse(
+        response.role,
+        response.kind,
+        tuple(response.labels),
+        int(hertz.size),
+        (float(hertz[0]), float(hertz[-1])),
+        response.unit,
+        noise,
+        "misfit" if response.std is None else "estimated" if np.isfinite(response.dof) else "given",
+    )

@@ -15,12 +15,13 @@ import numpy as np
 from hvdc_ident.data import Array, Experiment, Trajectory, event_time, input_signal, scaled
 from hvdc_ident.data.three_phase import PHASE_QUANTITIES
 from hvdc_ident.display import Shown
-from hvdc_ident.errors import ComputationError, InputError, located
+from hvdc_ident.errors import ComputationError, InputError, in_python, located
 from hvdc_ident.files import write_text
 from hvdc_ident.formats import read_waveforms
 from hvdc_ident.model import AnyModel
 from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.models import is_shipped, load_model
+from hvdc_ident.next_step import Door, NextStep, next_phrase
 from hvdc_ident.plants import LEVELS
 from hvdc_ident.study import schema
 from hvdc_ident.study.column_matching import (
@@ -36,7 +37,8 @@ from hvdc_ident.study.column_matching import (
 )
 from hvdc_ident.study.json_schema import SCHEMA_LINE, write_schemas
 from hvdc_ident.study.phase_columns import of_use, phases_text, proposed_phases, ways_to_count, without_phases
-from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments, smoothed, with_derived
+from hvdc_ident.study.recordings import Recordings, read_experiments, smoothed, with_derived
+from hvdc_ident.summary.levels import NoiseNote
 from hvdc_ident.text import listed, quantity
 
 MOST_LISTED = 40
@@ -80,12 +82,16 @@ class Mapped:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NewStudy(Shown):
-    """A study that was written. path: its file. model: of the study. recordings: one for each experiment. dyr: where its unit is from."""
+    """A study that was written. path: its file. model: of the study. recordings: one for each experiment. dyr: where its unit is from.
+
+    door: where its screen is read.
+    """
 
     path: Path
     model: AnyModel
     recordings: tuple[Mapped, ...]
     dyr: DyrOfStudy | None = None
+    door: Door = "python"
 
     def to_dict(self) -> dict[str, Any]:
         """Return by experiment which column is which signal, the candidates of the others, and what is not used."""
@@ -118,9 +124,10 @@ class NewStudy(Shown):
             yield "\n".join([*used, *_open_lines(r)])
         proposed = any(r.columns.proposed for r in self.recordings)
         first = f"take out the # before the candidates that are right in {self.path}, then " if proposed else ""
-        yield f"Next: {first}hvdc-ident check {self.path}"
+        yield f"Next: {first}{next_phrase(NextStep('check', str(self.path)), self.door)}."
 
 
+@in_python
 def new_study(
     folder: str | Path,
     recordings: str | Path | Sequence[str | Path],
@@ -184,13 +191,22 @@ def matched(
     return matching(columns_of(record, event, ways), targets_of(model, levels), model.parameters), why
 
 
-def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
-    record = read_waveforms(file)
+def proposal(
+    record: Trajectory, model: AnyModel, name: str
+) -> tuple[Matching, str, tuple[schema.PhasesTable, ...]]:
+    """Return what a recording may be of a model: the columns by signal, those among them that are made of three phases, and of which.
+
+    The text says why the model's levels are not known; empty where they are. name: of the experiment.
+    """
     phases = proposed_phases(record)
     made = with_derived(phases, (), record, name)
     found, why = matched(without_phases(made, phases), model, phases)
     phases = of_use(phases, [m.column.name for m in (*found.mapped, *found.proposed)])
-    found = replace(found, unused=tuple(c for c in found.unused if c in record))
+    return replace(found, unused=tuple(c for c in found.unused if c in record)), why, phases
+
+
+def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
+    found, why, phases = proposal(read_waveforms(file), model, name)
     data = _relative(file, folder)
     by_kind = {
         kind: {m.target.name: m.column.name for m in found.mapped if m.target.kind == kind}

@@ -10,6 +10,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import read_card
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.plants import (
     LEVELS,
     MACHINE,
@@ -69,7 +70,10 @@ def new_unit_study(folder: str | Path, recordings: str | Path | Sequence[str | P
             "the base of the machine is not known",
             where=str(asked.dyr),
             expected="its MVA, which a .dyr file does not have",
-            hint="--raw FILE, the power flow (MBASE), or --base MVA",
+            next=(
+                NextStep("option", "raw = FILE", "reads it from the power flow (MBASE)"),
+                NextStep("option", "base = MVA", "states it"),
+            ),
         )
     frequency = asked.frequency or (raw.frequency if raw is not None else 50.0)
     unit = recorded_unit(records, base)

@@ -16,14 +16,16 @@ from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.executor import Progress, StageProgress
 from hvdc_ident.files import digest, json_pieces, json_text, write_text
 from hvdc_ident.model import Model
-from hvdc_ident.study.checks import steady_notes, violations
+from hvdc_ident.study.checks import steady_notes
 from hvdc_ident.study.executors import open_executor
 from hvdc_ident.study.initial_values import initial_values
+from hvdc_ident.study.plausibility import violations
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult, stage, stages
 from hvdc_ident.study.store import CachingExecutor, Store, exclusive, source_hash
 from hvdc_ident.study.study import Study
 from hvdc_ident.summary import Results, RunSummary, summarise
-from hvdc_ident.summary.summarise import SUMMARISED
+from hvdc_ident.summary.decisions import SUMMARISED
+from hvdc_ident.summary.levels import InitialValue
 
 if TYPE_CHECKING:
     from hvdc_ident.parallel import OpenPool, PatientPool
@@ -134,7 +136,7 @@ def write_summary(folder: Path, heading: Mapping[str, Any]) -> RunSummary:
     return summary
 
 
-Rest = Callable[[], list[dict[str, Any]]]
+Rest = Callable[[], tuple[InitialValue, ...]]
 
 
 def _rest_of(study: Study, options: StageOptions) -> Rest:
@@ -144,10 +146,10 @@ def _rest_of(study: Study, options: StageOptions) -> Rest:
     """
 
     @cache
-    def rest() -> list[dict[str, Any]]:
+    def rest() -> tuple[InitialValue, ...]:
         found = initial_values(study)
         options.announce(found.lines)
-        return found.to_list()
+        return found.all
 
     return rest
 
@@ -183,7 +185,7 @@ def _failed(error: HvdcIdentError) -> StageResult:
 
 
 def _written(
-    study: Study, wanted: Stage, folder: Path, options: StageOptions, outcome: StageResult, levels: list[dict[str, Any]]
+    study: Study, wanted: Stage, folder: Path, options: StageOptions, outcome: StageResult, levels: tuple[InitialValue, ...]
 ) -> Done:
     heading = heading_of(study, options.seed)
     wrong = [] if outcome.failed else violations(wanted.name, plain(outcome.data))

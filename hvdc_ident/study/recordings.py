@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,25 +42,12 @@ from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
+from hvdc_ident.summary.levels import NoiseNote
 from hvdc_ident.toml_tables import check_names
 
 TIME_SHIFT = "time-shift"
 SETTLED = 3.0
 """Time constants after which a low pass has forgotten 95 %."""
-
-
-@dataclass(frozen=True)
-class NoiseNote:
-    """The standard deviation an output's noise is taken to have, in its unit, and where that comes from.
-
-    source: "given"; "estimated", from the rows before the event; "floor": those rows show no noise, and weights come from
-    the misfit of the fit; "residual": no rows lie before an event, so that the fit's own residual has to tell, std being
-    the least it may be. by_row: whether rows differ; std is then their root mean square.
-    """
-
-    std: float
-    source: Literal["given", "estimated", "floor", "residual"]
-    by_row: bool = False
 
 
 @dataclass

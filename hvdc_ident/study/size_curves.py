@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.result import Diagnosis, FoundEffect
-from hvdc_ident.effects import EffectUse, apply_effects, effects
+from hvdc_ident.effects import apply_effects, effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import simulate
+from hvdc_ident.study.augmented import use_of
 from hvdc_ident.text import quantity
 
 SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
@@ -107,12 +109,9 @@ def _with(model: Model, found: Diagnosis, value: float | None) -> Model:
     first = found.effects[0]
     for effect in found.effects:
         if effect is not first:
-            model = apply_effects(model, [_use(effect, {}).within(model)])
+            model = apply_effects(model, [use_of(effect).within(model)])
         elif value is not None:
-            model = apply_effects(model, [_use(first, {next(iter(first.parameters)): value})])
+            use = use_of(first)
+            sizes = use.parameters | {next(iter(first.parameters)): value}
+            model = apply_effects(model, [replace(use, parameters=FrozenMap(sizes))])
     return model
-
-
-def _use(effect: FoundEffect, other: Mapping[str, float]) -> EffectUse:
-    sizes: dict[str, float | str] = {n: s.value for n, s in effect.parameters.items()}
-    return EffectUse(effect.effect, effect.at, FrozenMap(sizes | dict(other)), source=effect.source)

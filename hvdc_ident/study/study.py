@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +26,9 @@ from hvdc_ident.study import schema
 from hvdc_ident.study.checks import check_questions
 from hvdc_ident.study.measured_responses import read_responses
 from hvdc_ident.study.parse import parse_study
-from hvdc_ident.study.recordings import NoiseNote, Recordings, read_experiments
+from hvdc_ident.study.recordings import Recordings, read_experiments
+from hvdc_ident.summary.candidate import Candidate
+from hvdc_ident.summary.levels import NoiseNote
 
 if TYPE_CHECKING:
     from hvdc_ident.fit.likelihood import Prior
@@ -101,17 +104,15 @@ class Study(Shown):
         return {n: line for n, line in self.settings.parameters.items() if line.tie is None}
 
 
-def candidate_lines(study: Study) -> dict[str, dict[str, Any]]:
+def candidate_lines(study: Study) -> dict[str, Candidate]:
     """Return by candidate its given value, start, bounds, the range that starts are drawn from, and its unit."""
+
+    def end(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    units = {n: study.model.parameters[n].unit for n in study.candidates}
     return {
-        n: {
-            "given": f.given,
-            "start": f.start,
-            "min": f.min,
-            "max": f.max,
-            "searched": f.drawn,
-            "unit": study.model.parameters[n].unit,
-        }
+        n: Candidate(f.given, f.start, end(f.min), end(f.max), (end(f.drawn[0]), end(f.drawn[1])), units[n])
         for n, f in study.candidates.items()
     }
 

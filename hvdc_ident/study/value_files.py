@@ -13,8 +13,8 @@ from hvdc_ident.fit import Estimate
 from hvdc_ident.model import Model
 from hvdc_ident.model.card import toml_key
 from hvdc_ident.study.augmented import augmented_model, use_of
+from hvdc_ident.summary.decisions import counting_of, estimates_that_count
 from hvdc_ident.summary.stage_results import StageResults
-from hvdc_ident.summary.summarise import counting_of, estimates_that_count
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy import Diagnosis

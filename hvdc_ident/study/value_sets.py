@@ -20,9 +20,9 @@ from hvdc_ident.model import AnyModel
 from hvdc_ident.next_step import NextKind, NextStep
 from hvdc_ident.study.augmented import augmented_model
 from hvdc_ident.study.study import Study
+from hvdc_ident.summary.decisions import counting_of
 from hvdc_ident.summary.run_summary import Counting
 from hvdc_ident.summary.stage_results import NO_ESTIMATES, diagnosis_of, fit_of
-from hvdc_ident.summary.summarise import counting_of
 from hvdc_ident.text import figures, listed, percentage
 
 SetName = Literal["given", "start", "fitted", "effect", "fit"]

@@ -4,8 +4,15 @@
 which terminal, report, letter, notebook and workbench are made.
 """
 
-from hvdc_ident.summary.results import Results
-from hvdc_ident.summary.run_summary import RunSummary
-from hvdc_ident.summary.summarise import summarise
+from typing import TYPE_CHECKING
+
+from hvdc_ident.lazy import offered
+
+if TYPE_CHECKING:
+    from hvdc_ident.summary.decisions import summarise
+    from hvdc_ident.summary.results import Results
+    from hvdc_ident.summary.run_summary import RunSummary
+else:
+    __getattr__ = offered(__name__, {"results": "Results", "run_summary": "RunSummary", "decisions": "summarise"})
 
 __all__ = ["Results", "RunSummary", "summarise"]

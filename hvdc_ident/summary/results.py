@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,13 +12,23 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.codec import read_fields
 from hvdc_ident.data import Trajectory
-from hvdc_ident.errors import InputError
+from hvdc_ident.errors import InputError, located
 from hvdc_ident.files import csv_name
+from hvdc_ident.fit.judgement import WindowErrors
 from hvdc_ident.next_step import NextStep
+from hvdc_ident.summary.compared_responses import ComparedResponse
+from hvdc_ident.summary.decisions import STAGES, judgements_of, lines_of, summarise
+from hvdc_ident.summary.levels import InitialValue
+from hvdc_ident.summary.linear import Linearisation
 from hvdc_ident.summary.run_summary import RunSummary
-from hvdc_ident.summary.stage_results import StageResults
-from hvdc_ident.summary.summarise import STAGES, judgements_of, lines_of, summarise
+from hvdc_ident.summary.stage_results import ExperimentContext, StageResults
+
+
+@dataclass(frozen=True)
+class _Levels:
+    rest_levels: tuple[InitialValue, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -68,17 +78,41 @@ class Results:
         """Unit of every recorded output, by its name."""
         return {**self.objects.simulated.units, **self.objects.of_fit.units}
 
+    @cached_property
+    def linear(self) -> Linearisation | None:
+        """The linear models; None where the stage has not run, or failed. Raises InputError for what is no result of this version."""
+        data = self.get("linearization")
+        with located("linearization.json"):
+            return Linearisation.from_dict(data) if "modes" in data else None
+
     @property
-    def experiments(self) -> dict[str, Mapping[str, Any]]:
-        """Role, event, window, recording and status of every experiment, by its name."""
+    def responses(self) -> tuple[ComparedResponse, ...]:
+        """The measured frequency responses beside the model's: of the fit, else of the linear model at the given values."""
+        found = self.objects.of_fit.responses
+        return found or (() if self.linear is None else self.linear.given.responses)
+
+    @property
+    def rest_levels(self) -> tuple[InitialValue, ...]:
+        """The levels before the events, from a stage of the present state of the study where there is one."""
+        found = [s for s in self.stages.values() if s.get("rest_levels")]
+        present = [s for s in found if s.get("sources") == self.heading.get("sources")]
+        return read_fields(_Levels, next(iter([*present, *found]), {})).rest_levels
+
+    def fingerprint(self, stage: str) -> str:
+        """Return the fingerprint of a result; "" where the stage has not come to its end."""
+        return str(self.get(stage).get("fingerprint") or "")
+
+    @property
+    def experiments(self) -> dict[str, ExperimentContext]:
+        """Every experiment by its name, as the fit has it where there is one, with the outcome of its run at the given values."""
         return {**self.objects.simulated.experiments, **self.objects.of_fit.experiments}
 
     def noise(self, experiment: str, output: str) -> float | None:
         """The standard deviation of a recorded output's noise, in its unit, given or from the rows before the event; else None."""
-        for stage in ("fit", "simulation"):
-            note = ((self.get(stage).get("noise") or {}).get(experiment) or {}).get(output) or {}
-            if note.get("source") in ("given", "estimated") and note.get("std"):
-                return float(note["std"])
+        for about in (self.objects.of_fit, self.objects.simulated):
+            note = about.noise.get(experiment, {}).get(output)
+            if note is not None and note.source in ("given", "estimated") and note.std:
+                return note.std
         return None
 
     def outputs_of(self, experiment: str) -> list[str]:
@@ -95,7 +129,7 @@ class Results:
         """Schema, study, model, software, seed and sources of the last run."""
         return self.get("summary") or self.get("run") or self.get("fit") or next(iter(self.stages.values()))
 
-    def windows(self, name: str | None) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    def windows(self, name: str | None) -> Iterator[tuple[str, str, WindowErrors]]:
         """Yield output, experiment and the errors within the windows of the profile, of every signal with a set of values."""
         judgement = judgements_of(self.objects).get(name or "")
         for output, experiment, about in lines_of(judgement) if judgement is not None else ():

@@ -6,12 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from hvdc_ident.codec import Coded
+from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.errors import located
 from hvdc_ident.fit.judgement import Judgements
 from hvdc_ident.fit.result import Estimate, FitResult
 from hvdc_ident.identifiability import IdentifiabilityReport
+from hvdc_ident.summary.candidate import Candidate
+from hvdc_ident.summary.compared_responses import ComparedResponse
+from hvdc_ident.summary.gaps import SignalGap
+from hvdc_ident.summary.levels import NoiseNote
 
 Json = Mapping[str, Any]
 NO_ESTIMATES = ("failed", "not-converged")
@@ -19,30 +23,45 @@ NO_ESTIMATES = ("failed", "not-converged")
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """A line of a study's [parameters]. searched: the range that starts are drawn from. None: not stated, or without an end."""
+class ExperimentContext:
+    """An experiment as the results hold it. event, window: s. recording: `Experiment.recording`. status: of a run at the given values,
+    empty where none was made; reason: why there is none."""
 
-    given: float | None = None
-    start: float | None = None
-    min: float | None = None
-    max: float | None = None
-    searched: tuple[float | None, float | None] | None = None
-    unit: str = ""
+    role: str = "fit"
+    event: float | None = None
+    window: tuple[float, float] | None = None
+    recording: Mapping[str, Any] = field(default_factory=dict)
+    status: str = field(default="", metadata=stored_as("status", optional=True))
+    reason: str = field(default="", metadata=stored_as("reason", optional=True))
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A parameter that follows from the estimates, by an expression; std: None where one of them has none."""
+
+    value: float
+    std: float | None
+    unit: str
+    expression: str
 
 
 @dataclass(frozen=True)
 class Context(Coded):
-    """What the JSON of a simulation, an identifiability analysis or a fit has beside its result, as far as a summary is made of it.
+    """What the JSON of a simulation, an identifiability analysis or a fit has beside its result.
 
-    candidates: by name. units: of the outputs. experiments: role, event, window, recording and status by name. judgement: of the
-    model with each set of values. derived: what follows from the estimates of a fit.
+    candidates: by name. units: of the outputs. experiments: by name. noise: by experiment and output. gaps: of a simulation, the
+    largest first. judgement: of the model with each set of values. derived: what follows from the estimates of a fit. responses:
+    measured ones beside the model's.
     """
 
     candidates: Mapping[str, Candidate] = field(default_factory=dict)
     units: Mapping[str, str] = field(default_factory=dict)
-    experiments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    experiments: Mapping[str, ExperimentContext] = field(default_factory=dict)
+    noise: Mapping[str, Mapping[str, NoiseNote]] = field(default_factory=dict)
+    gaps: tuple[SignalGap, ...] = ()
     judgement: Judgements = field(default_factory=Judgements)
-    derived: Mapping[str, Any] = field(default_factory=dict)
+    derived: Mapping[str, Derived] = field(default_factory=dict)
+    responses: tuple[ComparedResponse, ...] = ()
 
 
 @dataclass(frozen=True)

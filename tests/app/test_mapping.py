@@ -13,7 +13,15 @@ pytest.importorskip("tomlkit", reason="the workbench needs: pip install 'hvdc_id
 
 import hvdc_ident as hi
 from hvdc_ident.app.desk import opened
-from hvdc_ident.app.mapping import RecordingMap, SignalLine, drafted, experiments_in, proposed, write_mapping
+from hvdc_ident.app.mapping import (
+    RecordingMap,
+    SignalLine,
+    columns_with_derived,
+    drafted,
+    experiments_in,
+    proposed,
+    write_mapping,
+)
 from hvdc_ident.app.study_folder import (
     Seen,
     chosen_recording,
@@ -238,3 +246,63 @@ def test_a_recording_is_opened_with_a_study_to_be_made_beside_it(tmp_path: Path)
     broken = found.renewed()
     assert broken.study is found.study and "the study file is not valid TOML" in broken.why
     assert opened(str(tmp_path / "step.csv")).file == tmp_path / "step-study-2" / "study.toml"
+
+
+def three_phases(path: Path) -> Path:
+    """A voltage of 400 kV that falls to 80 % at 0.3 s, and the currents of 100 MW that follow with 50 ms: six columns of waves."""
+    time = np.arange(0.0, 1.0, 1e-3)
+    voltage = np.where(time >= 0.3, 0.8, 1.0) * 400.0 * np.sqrt(2.0 / 3.0)
+    power = np.where(time >= 0.3, 0.8 + 0.2 * np.exp(-(time - 0.3) / 0.05), 1.0) * 1e5
+    waves = [np.cos(2 * np.pi * 50 * time - 2 * np.pi * k / 3) for k in range(3)]
+    sizes = ((f"U{p} [kV]", voltage * w) for p, w in zip("ABC", waves, strict=True)), (
+        (f"I{p} [A]", power / (1.5 * voltage) * w) for p, w in zip("ABC", waves, strict=True)
+    )
+    columns = {"time [s]": time, **dict(sizes[0]), **dict(sizes[1])}
+    np.savetxt(path, np.column_stack([*columns.values()]), delimiter=",", header=",".join(columns), comments="")
+    return path
+
+
+THREE = """schema = 1
+name = "m"
+[parameters]
+T = {value = 0.05, unit = "s", min = 0.01, max = 1}
+[inputs]
+V = {value = 400, unit = "kV"}
+[states]
+x = {derivative = "(V/400 - x)/T", unit = "pu"}
+[outputs]
+P = {value = "100e6*x", unit = "W"}
+"""
+
+
+def test_three_phases_are_proposed_as_a_new_study_proposes_them(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(THREE)
+    data = three_phases(tmp_path / "r.csv")
+    model, record = hi.load_model(tmp_path / "c.toml"), hi.read_waveforms(data)
+    mapping, matching = proposed(record, model, "r", "r.csv")
+    by_new = hi.new_study(tmp_path / "new", data, tmp_path / "c.toml").to_dict()["experiments"]["r"]
+    assert mapping.kept["phases"] == by_new["phases"] and {line.signal: line.column for line in mapping.lines} == {"P": "p"}
+    assert {"v", "v-rms"} <= {m.column.name for m in matching.proposed} == {p["column"] for p in by_new["proposed"]}
+    mapping = mapping.assigned("v-rms", "V", "input")
+    shown = columns_with_derived(mapping, record, "study.toml")
+    assert {"p", "v-rms", "UA"} <= set(shown.names) and "p" not in record
+    draft = drafted(mapping, record, model, None, "", "study.toml")
+    assert draft.experiment.measured["P"][0] == pytest.approx(1e8, rel=1e-2)
+    assert draft.experiment.event == pytest.approx(0.3, abs=0.025)  # a cycle
+    file = tmp_path / "study.toml"
+    write_mapping(Seen.now(file), mapping, "r", str(tmp_path / "c.toml"))
+    (read,) = hi.load_study(file).experiments
+    np.testing.assert_array_equal(read.measured["P"], draft.experiment.measured["P"])
+    assert set(read.inputs) == {"V"}
+
+
+def test_three_phases_of_one_more_experiment_are_written_too(mapped: tuple[Path, RecordingMap], tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(THREE)
+    record = hi.read_waveforms(three_phases(tmp_path / "r.csv"))
+    first = proposed(record, hi.load_model(tmp_path / "c.toml"), "r", "r.csv")[0]
+    file = tmp_path / "study.toml"
+    seen = write_mapping(Seen.now(file), first, "r", str(tmp_path / "c.toml"))
+    write_mapping(seen, replace(first, name="again"), "", "")
+    assert [e.name for e in hi.load_study(file).experiments] == ["r", "again"]
+    tables = parse_study(file.read_bytes(), file).experiment
+    assert tables[0].phases == tables[1].phases != []

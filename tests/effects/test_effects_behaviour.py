@@ -176,6 +176,21 @@ def test_backlash_lets_go_where_a_signal_turns_however_slow_it_is(period, rtol):
     np.testing.assert_allclose(found, expected, atol=1e-7 * speed * 1.7 + 100 * rtol)
 
 
+@pytest.mark.parametrize("signal", [lambda t: np.sin(9 * t) * (1 - 0.3 * t), lambda t: np.sin(9 * t) + 0.3 * np.sin(31 * t)])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-8])
+def test_backlash_lets_go_where_a_recorded_signal_turns(signal, rtol):
+    """A recording's corners are no breaks, so that it turns within steps, twice within one for a short dip."""
+    rows = np.linspace(0.0, 1.0, 801)
+    polygon = InputSignal(rows, signal(rows), np.empty(0))
+    fine = np.linspace(0.0, 1.0, 160_001)
+    expected = play(polygon(fine), 0.2)[::80]
+    stands = np.abs(np.diff(expected)) < 1e-12
+    resting = np.r_[False, stands] & np.r_[stands, False]
+    use = EffectUse("backlash", ("u",), FrozenMap({"width": 0.2}))
+    y = simulate(effect_model(use, False), experiment("bench", T, {"u": polygon}), rtol=rtol)["y"]
+    np.testing.assert_allclose(y[resting], expected[resting], rtol=0, atol=3e-5)
+
+
 def test_quantisation_rounds():
     step = 0.037
     expected = step * np.round(u / step)

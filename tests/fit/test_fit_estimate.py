@@ -264,11 +264,11 @@ def test_residual_tests_tell_noise_from_a_missing_effect():
     noise = 0.1 * RNG(7).normal(size=t.size)
     clean = fit(Problem(simulator, (recorded("e", t, {"y": 0.1}, rest, y=t + noise),), free), starts=1)
     good = clean.residual_tests["y"]["e"]
-    assert min(good["ljung_box"]["p"], good["runs"]["p"], good["inputs"]["u"]["p"]) > 0.01
+    assert min(good.ljung_box.p, good.runs.p, good.inputs["u"].p) > 0.01
     wrong = t + noise + 0.6 * np.exp(-(((t - 1.0) / 0.05) ** 2) * (t > 1.0)) * (t > 1.0)
     bad = fit(Problem(simulator, (recorded("e", t, {"y": 0.1}, rest, y=wrong),), free), starts=1)
     test = bad.residual_tests["y"]["e"]
-    assert test["ljung_box"]["p"] < 1e-3
+    assert test.ljung_box.p < 1e-3
     assert test["inputs"]["u"]["p"] < 1e-3
 
 

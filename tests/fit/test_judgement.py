@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hvdc_ident.codec import plain
 from hvdc_ident.data import InputSignal
 from hvdc_ident.errors import InputError, StudyError, UnknownNameError
 from hvdc_ident.fit import tolerance_profile
@@ -27,12 +28,12 @@ def curve(model, measured, rows=None) -> Curve:
 
 
 def pulse(error, unit="pu", signal=None, event=1.0):
-    """The errors of a model that is off by `error` from a reference of a pulse between 1 s and 2 s."""
+    """The errors of a model that is off by `error` from a reference of a pulse between 1 s and 2 s, as JSON holds them."""
     u = signal or InputSignal.corners([(1.0, 0.0), (1.0, 1.0), (2.0, 1.0), (2.0, 0.0)])
     y = u(T)
     e = recorded("e", T, rest={"inputs": {"u": u}, "event": event}, y=y)
     found = judge({"e": {"y": curve(y + error, y)}}, (e,), {"y": unit}, PROFILE)
-    return found.signals["y"]["e"].windows
+    return plain(found.signals["y"]["e"].windows)
 
 
 def test_the_shipped_limits_are_those_that_were_published():
@@ -87,9 +88,9 @@ def test_what_is_not_judged_is_not_passed():
     units = {"P": "MW", "valve": "p.u.", "spare": "pu", "dumb": "pu"}
     found = judge({"e": curves}, (e,), units, PROFILE, named=True)
     lines = {o: line["e"].windows for o, line in found.signals.items()}
-    assert {o: a["within"] for o, a in lines.items()} == {"P": None, "valve": True, "spare": False, "dumb": None}
-    assert lines["P"]["reason"] == "the limits are in pu, the output is in MW"
-    assert lines["dumb"]["reason"] == "no row in any window" and lines["valve"]["reason"] == ""
+    assert {o: a.within for o, a in lines.items()} == {"P": None, "valve": True, "spare": False, "dumb": None}
+    assert lines["P"].reason == "the limits are in pu, the output is in MW"
+    assert lines["dumb"].reason == "no row in any window" and lines["valve"].reason == ""
     assert found.count("windows") == Count(passed=1, failed=1, not_judged=2)
     assert (found.by, found.follows) == ("windows", False)
     kept = judge({"e": {n: curves[n] for n in ("P", "valve")}}, (e,), units, PROFILE, named=True)
@@ -122,7 +123,7 @@ def test_rows_that_are_not_compared_are_not_counted():
     error = np.where(T < 0.5, 5.0, 0.0)
     rows = np.flatnonzero(T >= 0.5)
     found = judge({"e": {"y": curve(y + error, y, rows)}}, (e,), {"y": "pu"}, PROFILE)
-    assert found.signals["y"]["e"].windows["before"]["max"] == 0.0
+    assert found.signals["y"]["e"].windows.before.max == 0.0
 
 
 def test_a_profile_of_ones_own_is_a_file(tmp_path):

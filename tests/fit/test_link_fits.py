@@ -149,8 +149,8 @@ def test_intervals_of_two_gains_cover_and_the_band_holds_the_samples():
         for n in hits:
             low, high = result.estimates[n].ci95
             hits[n] += low <= TRUTH[n] <= high
-        inside.append(result.goodness["outputs"]["Irorder1"][e.name]["in_band"])
-        inside.append(result.validation[held_out.name]["outputs"]["Irorder1"]["in_band"])
+        inside.append(result.goodness.outputs["Irorder1"][e.name].in_band)
+        inside.append(result.validation[held_out.name].outputs["Irorder1"].quality.in_band)
     assert all(h >= 50 for h in hits.values())  # of 60; by chance 57, fewer than 50 once in 1000
     assert np.mean(inside) == pytest.approx(0.95, abs=0.01)
 

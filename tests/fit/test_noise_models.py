@@ -118,7 +118,7 @@ def test_whitening_makes_better_estimates_and_says_what_it_did():
         white.append(result.estimates["b"].value - 2.0)
     assert np.std(white) <= 1.05 * np.std(plain)
     assert len(result.whitening["y"]) == 1
-    assert result.residual_tests["y"]["e"]["ljung_box"]["p"] > 1e-3
+    assert result.residual_tests["y"]["e"].ljung_box.p > 1e-3
     with pytest.raises(UnknownNameError, match="did you mean 'pre-event'"):
         fit(measured(0.9, 0), whiten="pre-evnt")
 
@@ -150,7 +150,7 @@ def test_a_fit_of_spectra_over_the_whole_band_is_the_fit_in_time():
     for n in ("a", "b"):
         assert two.estimates[n].value == pytest.approx(one.estimates[n].value, rel=1e-6)
         assert two.estimates[n].std_raw == pytest.approx(one.estimates[n].std_raw, rel=1e-9)
-    assert two.residual_tests["y"]["e"]["n"] == T.size
+    assert two.residual_tests["y"]["e"].n == T.size
 
 
 def test_a_band_leaves_a_disturbance_outside_of_it_out():

@@ -90,7 +90,7 @@ def test_a_free_start_is_estimated_in_every_experiment():
     assert result.nuisance["a"]["x_start"].value == pytest.approx(2.0, rel=1e-6)
     assert result.nuisance["b"]["x_start"].value == pytest.approx(-0.5, rel=1e-6)
     held_out = result.validation["c"]
-    assert held_out["nuisance"]["x_start"] == pytest.approx(4.0, rel=1e-5)
+    assert held_out.nuisance["x_start"] == pytest.approx(4.0, rel=1e-5)
     assert result.rmse["y"]["c"] < 1e-5 < 1.0 < result.rmse_start["y"]["c"]
 
 

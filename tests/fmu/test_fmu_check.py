@@ -32,7 +32,7 @@ def test_the_list_of_variables_is_grouped_and_cut(tmp_path):
     path = build(replace(plain, variables=(*plain.variables, *many)), tmp_path)
     whole = run(path).output
     assert "4 parameters" in whole and "model-exchange, co-simulation" in whole
-    assert "cell[0].i" in whole and "cell[39].i" not in whole and "more: --all shows them, --find TEXT" in whole
+    assert "cell[0].i" in whole and "cell[39].i" not in whole and "--all shows every variable, --find TEXT" in whole
     row = next(line for line in whole.splitlines() if line.startswith("  m "))
     assert row.split() == ["m", "parameter", "fixed", "kg", "2", "[0.1,", "inf]"]
     found = read_capabilities(path)

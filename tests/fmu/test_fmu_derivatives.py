@@ -68,6 +68,9 @@ def test_points_that_are_sought_and_points_that_are_not(fmu):
         linearize(fmu(FAULTY, 2, "co-simulation"))
     with pytest.raises(ModelError, match="effects at its ends"):
         linearize(apply_effects(model, [{"effect": "lag", "at": "u", "parameters": {"T": 0.1}}]))
+    for option in ({"pade_order": 3}, {"side": "below"}, {"descriptor": True}):
+        with pytest.raises(LinearizationError, match=f"an FMU does not show its .*{next(iter(option))} has no meaning"):
+            linearize(model, sought, **option)
     assert linearize(fmu(COUNTER)).A.shape == (0, 0)
     assert issubclass(LinearizationError, InputError)
 

@@ -12,7 +12,7 @@ from fmpy.validation import validate_fmu
 
 from hvdc_ident.errors import ComputationError, ModelError
 from hvdc_ident.fmu.export import export_fmu
-from hvdc_ident.fmu.export.c_code import CModel
+from hvdc_ident.fmu.export.c_model import CModel
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model, shipped_models
 from tests.fmu_export import cases
@@ -102,7 +102,10 @@ def test_without_a_compiler_the_sources_alone_are_there(tmp_path: Path, monkeypa
     assert not [n for n in names if n.startswith("binaries/")]
     text = zipfile.ZipFile(written.path).read("modelDescription.xml").decode()
     listed = set(re.findall(r'<File name="([^"]+)"', text))
-    assert "model.c" in listed and {f"sources/{n}" for n in listed} <= set(names)
+    assert listed == {"fmu.c"}
+    sources = [zipfile.ZipFile(written.path).read(n).decode() for n in names if n.startswith("sources/")]
+    included = set(re.findall(r'#include "([^"]+)"', "\n".join(sources)))
+    assert "model.c" in included and {f"sources/{n}" for n in listed | included} - {"sources/fmi3.c"} <= set(names)
     with pytest.raises(ModelError, match="no C compiler"):
         export_fmu(cases.zoo(), tmp_path / "y.fmu", binary=True)
     assert not (tmp_path / "y.fmu").exists()

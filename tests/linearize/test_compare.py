@@ -1,13 +1,17 @@
 """Norms, nu-gap, minimal realisation and reduction."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
 from helpers import linear, stable
 
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize import balanced, h2_norm, hinf_norm, linearize, nu_gap
+from hvdc_ident.linearize import balanced, find_operating_point, h2_norm, hinf_norm, linearize, nu_gap
 from hvdc_ident.linearize.reduction import difference, minimal
+from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
 
 
@@ -62,6 +66,65 @@ def test_the_winding_condition_counts():
     found = nu_gap(linear([[-0.5]], [[100.0]], [[1.0]]), linear([[-0.5]], [[100.0]], [[-1.0]]))
     assert found.winding != 0 and found.value == 1.0
     assert nu_gap(stable_one, flipped).distance <= 1.0
+
+
+def late_lag(pole, gain, time):
+    """Return gain e^(-s time)/(s - pole)."""
+    lag = Model(
+        name="lag", parameters={"p": pole, "k": gain}, inputs={"u": 0.0}, states={"x": "k*u + p*x"}, outputs={"y": "x"}
+    )
+    late = apply_effects(lag, [{"effect": "delay", "at": ["y"], "parameters": {"T": time}}]) if time else lag
+    return linearize(late, find_operating_point(late), inputs="u", outputs="y")
+
+
+@pytest.mark.parametrize(("gain", "time"), [(5.0, 0.1), (5.0, 1.0), (5.0, 3.0), (50.0, 0.1), (50.0, 3.0)])
+@pytest.mark.parametrize("pole", [-1.0, 0.5])
+def test_the_winding_of_a_delay_is_that_of_its_exact_response(pole, gain, time):
+    """For gain/(s - p) without and with a delay f = 1 + |P|^2 e^(j w T): up to 48 turns, of which a Pade approximant has its order."""
+    w = np.linspace(0.0, 1e4, 200_001)
+    f = 1.0 + gain**2 / (w**2 + pole**2) * np.exp(1j * w * time)
+    turns = np.unwrap(np.angle(f))
+    plain, late = late_lag(pole, gain, 0.0), late_lag(pole, gain, time)
+    found = nu_gap(late, plain)
+    assert found.winding == round((turns[-1] - turns[0]) / np.pi) == -nu_gap(plain, late).winding
+    assert found.value == (1.0 if found.winding else found.distance)
+
+
+@pytest.mark.parametrize("pole", [-1.0, 0.0, 0.5])
+@pytest.mark.parametrize(("gain", "time"), [(1.0, 0.1), (1.0, 2.0), (5.0, 0.1), (5.0, 0.7), (5.0, 1.0)])
+def test_the_winding_of_a_delay_is_that_of_a_good_approximant(pole, gain, time):
+    """The approximant of order 10 is right up to w T = 10, where these gains are below 1; its winding comes from eigenvalues."""
+    plain, late = late_lag(pole, gain, 0.0), late_lag(pole, gain, time)
+    rational = replace(linearize(late.point.model, late.point, inputs="u", outputs="y", pade_order=10), exact=None)
+    assert nu_gap(plain, late).winding == nu_gap(plain, rational).winding
+    assert nu_gap(late, plain).winding == nu_gap(rational, plain).winding
+
+
+def test_poles_on_the_axis_of_a_model_with_a_delay_are_passed_on_their_right():
+    """An undamped oscillator seen late is near itself without the delay, and one that grows a little is as near."""
+    oscillator = Model(
+        name="oscillator", parameters={"d": 0.0}, inputs={"u": 0.0},
+        states={"x": "v", "v": {"derivative": "u - 4*x - d*v"}}, outputs={"y": "v"},
+    )  # fmt: skip
+    late = apply_effects(oscillator, [{"effect": "delay", "at": ["y"], "parameters": {"T": 0.01}}])
+    shown = {"inputs": "u", "outputs": "y"}
+    plain, seen = linearize(oscillator, **shown), linearize(late, **shown)
+    growing = linearize(late.with_values({"d": -0.01}), **shown)
+    damped = linearize(late.with_values({"d": 0.01}), **shown)
+    for first, second in ((plain, seen), (seen, plain), (seen, growing), (growing, seen), (damped, growing), (damped, seen)):
+        found = nu_gap(first, second)
+        assert found.winding == 0 and found.value < 0.03
+
+
+def test_a_winding_without_a_limit_is_refused():
+    """u itself, late, beside u: the determinant turns for ever."""
+    echo = Model(
+        name="echo", parameters={"T": {"value": 0.1, "unit": "s"}}, inputs={"u": 0.0}, states={"x": "u - x"},
+        delays={"late": {"of": "u", "time": "T"}}, outputs={"y": "2*u + late + x"},
+    )  # fmt: skip
+    found = linearize(echo)
+    with pytest.raises(LinearizationError, match="no limit at high frequency"):
+        nu_gap(found, linear([[-1.0]], [[1.0]], [[1.0]], [[1.0]]))
 
 
 def test_minimal_realisation_lists_what_it_removed():

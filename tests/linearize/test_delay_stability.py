@@ -272,7 +272,7 @@ def test_a_model_all_whose_delays_are_0_has_the_matrices_of_the_loop_without_the
     linear = hi.linearize(two_delays(0.0, 0.0))
     np.testing.assert_allclose(linear.A, [[-1.0 - 3.0 / 1.3]], rtol=1e-12)
     np.testing.assert_allclose(linear.B, [[1.0 / 1.3]], rtol=1e-12)
-    assert linear.delay_free is None and linear.state_names == ("x",)
+    assert linear.exact is None and linear.state_names == ("x",)
 
 
 def test_the_response_has_its_derivative_by_a_delay_at_0():

@@ -39,7 +39,7 @@ def test_a_loop_that_must_not_be_weakened():
     assert found.gain_margin.value == np.inf and found.stable
     assert "not below 0.1 at 0.03559 Hz" in str(found)
     data = found.to_dict()
-    assert data["lower_gain_margin"]["value"] == pytest.approx(0.1) and data["gain_margin"]["value"] == np.inf
+    assert data["lower_gain_margin"]["value"] == pytest.approx(0.1) and data["gain_margin"]["value"] is None
 
 
 @pytest.mark.parametrize(
@@ -97,8 +97,8 @@ def test_an_unstable_loop_has_no_margins():
     assert found.stable is False and found.stability.unstable == 2
     assert str(found) == "the closed loop is not stable (2 roots right of the imaginary axis): there are no margins"
     data = found.to_dict()
-    numbers = [v for m in data.values() if isinstance(m, dict) for v in m.values()]
-    assert len(numbers) == 14 and np.isnan(numbers).all() and data["stable"] is False
+    numbers = [v for name, m in data.items() if "margin" in name for v in m.values()]
+    assert len(numbers) == 14 and set(numbers) == {None} and data["stable"] is False
 
 
 # --- delays ---

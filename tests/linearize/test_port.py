@@ -1,5 +1,7 @@
 """Impedances in the network's frame, against the circuit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import Port, find_operating_point, port_admittance, port_impedance
 from hvdc_ident.linearize.operating_point import signal_value
-from hvdc_ident.model import Model, Output, Signal, State
+from hvdc_ident.model import Delay, Model, Output, Signal, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter
 
@@ -55,6 +57,21 @@ def test_a_station_s_impedance_and_the_grid_s_are_the_whole():
     r, x = signal_value(model, point, "R"), signal_value(model, point, "X")
     w0 = signal_value(model, point, "w0")
     np.testing.assert_allclose(whole.values - station.values, by_hand(r, x, w0, W), rtol=1e-6, atol=1e-7)
+
+
+def test_the_phase_of_an_impedance_counts_its_turns():
+    """A coil whose voltage is measured late, z e^(-s T): at four frequencies the phase has gone round some twenty times."""
+    late = replace(
+        coil(),
+        parameters=coil().parameters | {"T": Parameter(0.06, unit="s")},
+        delays=FrozenMap({"ed_late": Delay(parse("ed"), parse("T")), "eq_late": Delay(parse("eq"), parse("T"))}),
+    )
+    found = port_impedance(late, Port(("ed", "eq"), ("ed_late", "eq_late"), ("d", "q"), "0.3"), W)
+    want = by_hand(0.1, 0.5, 100 * np.pi, W) * np.exp(-0.06j * W)[:, None, None]
+    np.testing.assert_allclose(found.values, want, rtol=1e-9)
+    own = np.degrees(np.angle(by_hand(0.1, 0.5, 100 * np.pi, W)))
+    turned = found.phase_deg + np.degrees(0.06 * W)[:, None, None] - own
+    np.testing.assert_allclose(turned, np.broadcast_to(turned[:1], turned.shape), atol=1e-6)
 
 
 def test_a_port_that_cannot_be():

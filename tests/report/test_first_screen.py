@@ -13,6 +13,7 @@ import pytest
 from hvdc_ident.report.first_screen import first_screen
 from hvdc_ident.report.letter import Letterhead, write_letter
 from hvdc_ident.report.page import page, write_report
+from hvdc_ident.study import StageOptions, load_study, run_stage
 from hvdc_ident.summary import Results
 from tests.report.demo_like import EXPERIMENTS, GAINS, OUTPUTS, demo_like, judged
 from tests.report.test_browser import CLIPPED
@@ -263,12 +264,9 @@ def test_a_failed_stage_is_said_first(like_the_demo: Path, tmp_path: Path) -> No
 
 
 def test_a_study_without_recordings_shows_its_sections_open(tmp_path: Path) -> None:
-    heading = {"schema": 1, "study": "s", "model": "m", "software": "h", "seed": 0, "sources": {}}
-    mode = {"eigenvalue": [-1.0, 0.0], "frequency_hz": 0.0, "damping": 1.0, "participation": {"x": 1.0}}
-    (tmp_path / "linearization.json").write_text(
-        json.dumps({**heading, "modes": [mode], "operating_point": {}}), "utf-8"
-    )
-    text = page(tmp_path)
+    (tmp_path / "s.toml").write_text('schema = 1\n[model]\nsource = "vsc-hvdc-link"\n[linearize]\ninputs = ["Vdcref1"]\n', "utf-8")
+    run_stage(load_study(tmp_path / "s.toml"), "linearize", tmp_path / "r", StageOptions())
+    text = page(tmp_path / "r")
     assert "data-tile" not in text and text.count("<details class='section' open>") == text.count(
         "<details class='section"
     )

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.data import InputSignal, experiment, trajectory
+from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, StudyError, UnknownNameError
 from hvdc_ident.executor import Outcome
 from hvdc_ident.files import Rows, csv_cell, csv_name, json_text
@@ -84,6 +85,17 @@ def test_poles_and_response_at_each_point():
     assert np.allclose(found.poles[:, 0], [-1, -5])
     assert np.allclose(found.response[:, :, 0, 0], [[1 / (1j * w + k) for w in omega] for k in (1, 5)])
     assert found.to_dict()["points"][0]["bode"]["y"]["u"][0] == pytest.approx([1 / 1.01, -0.1 / 1.01])
+
+
+def test_the_phase_at_each_point_counts_the_turns_of_a_delay():
+    late = apply_effects(MODEL, [{"effect": "delay", "at": ["y"], "parameters": {"T": 0.5}}])
+    omega = np.array([0.1, 3.0, 200.0])
+    found = sweep(late, [], listed("k", [1, 5]), want=Quantities(("bode",), ["u"], ["y"], omega))
+    want = [-np.degrees(np.arctan(omega / k) + 0.5 * omega) for k in (1, 5)]
+    np.testing.assert_allclose(found.phase_deg[:, :, 0, 0], want, atol=1e-6)
+    back = type(found).from_dict(json.loads(json_text(found.to_dict())))
+    np.testing.assert_array_equal(back.phase_deg, found.phase_deg)
+    np.testing.assert_array_equal(found.to_xarray()["phase"].values, found.phase_deg)
 
 
 def test_a_grid_of_two_and_an_input_as_an_axis():

@@ -5,6 +5,7 @@ import pytest
 
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
+from hvdc_ident.model import Delay, Model, Sampled
 from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from tests.simulate.reference import Reference, sided
@@ -84,3 +85,60 @@ def test_small_steps_follow_the_linear_chain():
     run = experiment("small", t + 0.1, {"Vdcref1": InputSignal.step(0.1, 1.0, 1.0 + size), "Pref2": 0.0})
     found = simulate(LINK, run, {"Rdc": 1e-7, "Zg": 1e-9, "KIP": 1e-6}, rtol=1e-9)["Irorder1"]
     np.testing.assert_allclose((found - found[0] + kp * size) / size, y, atol=2e-2)
+
+
+@pytest.mark.parametrize("method", ["explicit", "rosenbrock"])
+def test_a_delayed_signal_is_exact_where_it_moves_faster_than_the_states(method):
+    """d = 1/(1 + 25 u^2), 0.2 s late, of a ramp u: nothing but d itself tells that it is no quartic over a step."""
+    model = Model(
+        "peak",
+        parameters={"T": 0.2},
+        inputs={"u": 0.0},
+        states={"x": "0.001*d - x"},
+        delays={"d": Delay("1/(1 + 25*u**2)", "T")},
+        outputs={"d": "d"},
+    )
+    time = np.linspace(0.0, 1.4, 1401)
+    run = simulate(model, experiment("ramp", time, {"u": InputSignal.ramp(0.1, -1.0, 0.9, 1.0)}), {}, ["T"], method=method)
+    u = np.clip((time - 0.3) / 0.8, 0.0, 1.0) * 2 - 1
+    np.testing.assert_allclose(run["d"], 1 / (1 + 25 * u**2), rtol=0, atol=2 * RTOL)
+    inside = (time > 0.301) & (time < 1.099)
+    slope = 125 * u / (1 + 25 * u**2) ** 2  # the ramp goes 2.5 a second
+    np.testing.assert_allclose(run.gradient("d")[inside, 0], slope[inside], rtol=0, atol=100 * RTOL * slope.max())
+
+
+def test_a_first_step_over_many_time_constants_is_exact_within():
+    """x = r - T s on a ramp r = s t: a step that begins at rest has to leave it first, and only its end is sure to be right."""
+    T, rtol = 1e-6, 1e-6
+    model = Model("lag", parameters={"T": T}, inputs={"u": 0.0}, states={"x": "(u - x)/T"}, outputs={"x": "x"})
+    time = np.linspace(0.0, 0.8, 801)
+    case = experiment("ramp", time, {"u": InputSignal.ramp(0.1, 0.0, 0.9, 0.8)})
+    run = simulate(model, case, {}, rtol=rtol, method="rosenbrock")
+    behind = np.clip(time - 0.1, 0.0, None)
+    np.testing.assert_allclose(run["x"], behind - T * (1 - np.exp(-behind / T)), rtol=0, atol=rtol * 0.1)
+
+
+@pytest.mark.parametrize("method", ["explicit", "rosenbrock"])
+def test_a_sample_that_a_delay_brings_back_moves_with_the_sampling_period(method):
+    """x' = q(t - 0.07), with q a ramp sampled every T: each step of it comes k T + 0.07 after the start."""
+    T, lag, slope = 0.13, 0.07, 1.7
+
+    def x(t, T):
+        edges = np.arange(20) * T + lag
+        return sum(slope * T * np.maximum(t - edge, 0.0) for edge in edges[1:])
+
+    model = Model(
+        "computer",
+        parameters={"T": T},
+        inputs={"u": 0.0},
+        states={"x": {"derivative": "late", "start": 0.0}},
+        sampled={"q": Sampled("u", "T")},
+        delays={"late": Delay("q", lag)},
+        outputs={"x": "x"},
+    )
+    time = np.linspace(0.0, 0.99, 34)
+    run = simulate(model, experiment("ramp", time, {"u": InputSignal.ramp(0.0, 0.0, 1.0, slope)}), {}, ["T"], method=method)
+    np.testing.assert_allclose(run["x"], x(time, T), rtol=0, atol=RTOL)
+    slopes = (x(time, T + 1e-6) - x(time, T - 1e-6)) / 2e-6
+    away = np.abs((time - lag) / T - np.round((time - lag) / T)) > 1e-4
+    np.testing.assert_allclose(run.gradient("x")[away, 0], slopes[away], rtol=0, atol=1e-7)

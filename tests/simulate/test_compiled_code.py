@@ -1,6 +1,9 @@
-"""Machine code: four instants at once give what one at a time gives; the cache knows every file it is made from."""
+"""Machine code: four instants at once give what one at a time gives, and little is loaded for it."""
 
 from __future__ import annotations
+
+import subprocess
+import sys
 
 import numpy as np
 
@@ -58,3 +61,18 @@ def test_outputs_of_a_plain_run_and_of_one_with_sensitivities_are_what_their_tex
             found = simulate(parse_card(CARD), step, sensitivities=names, rtol=1e-9, method=method)
             for name, values in expected(time, x, u).items():
                 assert np.allclose(found[name], values, rtol=1e-7, atol=1e-7), (name, names, method)
+
+
+def test_a_simulation_loads_little():
+    code = (
+        "import sys, numpy as np\n"
+        "from hvdc_ident import load_model, simulate\n"
+        "from hvdc_ident.data import experiment\n"
+        "case = experiment('short', np.linspace(0.0, 0.01, 11))\n"
+        "simulate(load_model('vsc-hvdc-link'), case, sensitivities=('KIP',))\n"
+        "print(*sys.modules)"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stderr == ""
+    unwanted = {"scipy.linalg", "hvdc_ident.effects"}
+    assert sorted(unwanted & set(found.stdout.split())) == []

@@ -118,3 +118,13 @@ def test_an_experiment_without_a_recording_is_run_too(tmp_path: Path) -> None:
     bare = hi.Experiment(TIME, "bare", inputs={"u": hi.step(1.0, 2.0, at=EVENT)})
     (line,) = hi.check(tmp_path / "tank.toml", bare).to_dict()["hindrances"]
     assert line.startswith("bare: ") and "stopped" in line
+
+
+def test_a_remark_on_several_recordings_is_told_once_with_their_number(tmp_path: Path) -> None:
+    path = write(tmp_path)
+    text = path.read_text()
+    table = text[text.index("[[experiment]]") :]
+    path.write_text(text + table.replace('"step"', '"second"') + table.replace('"step"', '"third"'))
+    shown = str(hi.check(path))
+    assert "experiment step: the file does not say the unit of its time: taken as s (and so in 2 more)" in shown
+    assert shown.count("the unit of its time") == 1

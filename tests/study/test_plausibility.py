@@ -12,9 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hvdc_ident.codec import plain
+from hvdc_ident.discrepancy import Diagnosis
+from hvdc_ident.discrepancy.result import EffectSize, FoundEffect
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.study import pipeline
-from hvdc_ident.study.checks import violations
 from hvdc_ident.study.pipeline import run_stage
+from hvdc_ident.study.plausibility import violations
 from hvdc_ident.study.stages import StageOptions, stage
 from hvdc_ident.study.study import load_study
 
@@ -71,7 +75,7 @@ def no_verdict(fit):
 
 
 def nothing_to_do(fit):
-    fit["adequacy"] |= {"verdict": "does-not-fit", "text": "", "next": ""}
+    fit["adequacy"] |= {"verdict": "does-not-fit", "text": "", "next": []}
 
 
 @pytest.mark.parametrize(
@@ -106,8 +110,9 @@ def test_other_stages_are_asked_too(results):
     assert "another branch" in found
     linear["operating_point"]["notes"] = ["This is not the model's own steady state."]
     assert violations("linearize", linear) == []
-    discrepancy = {"effects": [{"effect": "lag", "parameters": {"T": {"value": 3.0, "ci95": [1.0, 2.0]}}}]}
-    assert violations("diagnose", discrepancy) == ["effects parameters T = 3 lies outside its own interval 1 to 2"]
+    lag = FoundEffect("lag", ("u",), FrozenMap({"T": EffectSize(3.0, (1.0, 2.0))}))
+    diagnosis = plain(Diagnosis("named", effects=(lag,)))
+    assert violations("diagnose", diagnosis) == ["effects parameters T = 3 lies outside its own interval 1 to 2"]
 
 
 def test_a_violation_makes_the_stage_fail_and_keeps_what_it_found(study, tmp_path, monkeypatch):

@@ -92,7 +92,7 @@ def test_gaps_of_outputs_are_not_compared_and_said(tmp_path: Path) -> None:
     assert found.estimates["J"].ci95 is not None
     low, high = found.estimates["J"].ci95
     assert low < TRUE < high and high - low < 0.05 * TRUE
-    assert found.goodness["outputs"]["w"]["d"]["n"] == 231
+    assert found.goodness.outputs["w"]["d"].n == 231
 
 
 def test_gaps_reach_every_file_and_the_page(tmp_path: Path) -> None:
@@ -151,7 +151,7 @@ def test_outputs_of_other_rates_than_the_inputs_are_compared_at_their_own_rows(t
         assert study.noise["d"][output].source == "estimated"
         assert study.noise["d"][output].std == pytest.approx(1e-3, rel=3.0 / np.sqrt(2 * rows))
     found = fitted(study)
-    counted = {o: found.goodness["outputs"][o]["d"]["n"] for o in ("w", "i")}
+    counted = {o: found.goodness.outputs[o]["d"].n for o in ("w", "i")}
     assert counted == {"w": 598, "i": 77}  # of w, those until the last of v
     assert found.estimates["J"].ci95 is not None
     low, high = found.estimates["J"].ci95
@@ -265,7 +265,7 @@ def test_standard_deviations_of_every_row_weigh_as_scipy_weighs_them(tmp_path: P
     assert found.estimates["J"].value == pytest.approx(value[0], rel=1e-6)
     assert found.estimates["J"].std_raw == pytest.approx(np.sqrt(covariance[0, 0]), rel=1e-3)
     assert found.chi2_per_dof == pytest.approx(1.0, abs=0.25)
-    assert found.goodness["outputs"]["w"]["d"]["in_band"] > 0.9
+    assert found.goodness.outputs["w"]["d"].in_band > 0.9
 
 
 @pytest.mark.parametrize(

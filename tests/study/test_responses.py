@@ -336,6 +336,22 @@ def test_a_model_without_states_has_a_response_too(tmp_path):
     assert low <= 3.0 <= high
 
 
+def test_phases_of_a_response_through_a_delay_count_their_turns(motor, tmp_path):
+    """Measured at 6 frequencies with up to 20 turns between them: the dots lie on the model's curve, not some turns above it."""
+    (tmp_path / "motor.toml").write_text(
+        MOTOR.replace("[outputs]", '[delays]\nlate = {of = "w", time = "0.4"}\n[outputs]').replace('w = "w"', 'w = "late"')
+    )
+    f = np.geomspace(0.05, 50, 6)
+    g = 0.5 / (0.01 * 2j * np.pi * f + 0.1 + 0.25) * np.exp(-0.8j * np.pi * f)
+    csv(tmp_path / "g.csv", f, {"G": g})
+    result = run("linearize", motor, "--out", tmp_path / "r")
+    assert result.exit_code == 0, result.output
+    (found,) = json.loads((tmp_path / "r/linearization.json").read_text())["responses"]
+    want = -np.degrees(np.arctan(2 * np.pi * f * 0.01 / 0.35) + 0.8 * np.pi * f)
+    for shown in (found["measured"], *found["models"].values()):
+        np.testing.assert_allclose(np.array(shown["phase_deg"])[:, 0], want, atol=0.1)
+
+
 def test_a_model_that_is_unstable_where_it_was_measured_says_so(motor, tmp_path):
     card = tmp_path / "motor.toml"
     card.write_text(card.read_text().replace("b = {value = 0.1, min = 0.001", "b = {value = -0.5, min = -1.0"))

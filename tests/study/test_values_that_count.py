@@ -29,8 +29,8 @@ from hvdc_ident.next_step import NextStep
 from hvdc_ident.study.export import SSV
 from hvdc_ident.study.value_sets import value_set
 from hvdc_ident.summary import Results
+from hvdc_ident.summary.decisions import counting_of
 from hvdc_ident.summary.stage_results import diagnosis_of, fit_of
-from hvdc_ident.summary.summarise import counting_of
 
 K, T, LAG = 12.0, 0.05, 0.03
 TIME = np.arange(0.0, 1.2, 0.008)

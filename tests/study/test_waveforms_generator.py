@@ -28,6 +28,12 @@ def test_thirty_of_each_differ_in_size_slope_sign_and_operating_point():
         assert max(np.abs(s.values).max() for s in signals) <= moved.most
 
 
+def test_no_seed_moves_a_set_point_beyond_its_range():
+    driven = [e for seed in range(30) for e in experiments(Campaign(kinds=("Vdc",), seed=seed))]
+    ends = np.array([e.inputs["Vdcref1"].values[-1] for e in driven])
+    assert 1.029 < ends.max() <= MOVED["Vdc"].most
+
+
 def test_at_rest_every_experiment_begins_at_the_links_own_set_points():
     anywhere, rest = experiments(Campaign()), experiments(Campaign(at_rest=True))
     start = {"Pref2": 0.4, "Qref1": 0.0, "Vdcref1": 1.0}

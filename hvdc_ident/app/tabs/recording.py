@@ -82,7 +82,8 @@ class Mapper:
         self._seen = Seen(desk.file, None)
         self._stamp = desk.read_at
         self._turn = asyncio.Lock()  # reading and writing the study file follow one another, as they were asked for
-        self._record: Trajectory | None = None
+        self._raw: Trajectory | None = None
+        self._record: Trajectory | None = None  # with what its phases give
         self._columns: tuple[Column, ...] = ()
         self._matching: Matching | None = None
         self._map: RecordingMap | None = None
@@ -208,7 +209,6 @@ class Mapper:
         if mapping is None:
             raise StudyError(f"no experiment '{name}'", where=self._desk.file.name, hint="choose another one")
         record = await run.io_bound(hi.read_waveforms, self._desk.file.parent / mapping.data)
-        record = await run.io_bound(columns_with_derived, mapping, record, self._desk.file.name)
         await self._take(record, mapping, None, name)
 
     async def _open_file(self, data: str) -> None:
@@ -231,8 +231,9 @@ class Mapper:
         self._changed = True
         self._show_status()
 
-    async def _take(self, record: Trajectory, mapping: RecordingMap, matching: Matching | None, was: str) -> None:
-        self._record, self._map, self._matching, self._was = record, mapping, matching, was
+    async def _take(self, raw: Trajectory, mapping: RecordingMap, matching: Matching | None, was: str) -> None:
+        record = await run.io_bound(columns_with_derived, mapping, raw, self._desk.file.name)
+        self._raw, self._record, self._map, self._matching, self._was = raw, record, mapping, matching, was
         self._changed, self._draft, self._view, self._sketches = False, None, None, {}
         self._edited = False
         self._columns, self._rested_at = await run.io_bound(columns_of, record, mapping.event), mapping.event
@@ -258,8 +259,8 @@ class Mapper:
         try:
             model = await run.io_bound(hi.load_model, source, trust=self._desk.trust)
             self._desk, self._source = replace(self._desk, model=model, source=source), source
-            if self._map is not None and self._record is not None:
-                await self._propose(Path(self._map.data), self._map.data, self._record)
+            if self._map is not None and self._raw is not None:
+                await self._propose(Path(self._map.data), self._map.data, self._raw)
         except Exception:
             self._desk, self._source = before
             self._show_files()
@@ -594,12 +595,12 @@ class Mapper:
     async def _check(self) -> None:
         number = self._asked
         await asyncio.sleep(REST)
-        mapping, record, desk = self._map, self._record, self._desk
-        if number != self._asked or mapping is None or record is None:
+        mapping, raw, record, desk = self._map, self._raw, self._record, self._desk
+        if number != self._asked or mapping is None or raw is None or record is None:
             return
         draft, text = None, ""
         try:
-            draft = await run.io_bound(drafted, mapping, record, self._plant, desk.study, self._was, desk.file.name)
+            draft = await run.io_bound(drafted, mapping, raw, self._plant, desk.study, self._was, desk.file.name)
         except HvdcIdentError as error:
             text = str(error)
         if number == self._asked:
@@ -614,9 +615,9 @@ class Mapper:
             if draft is None:
                 ui.label(text).classes("alert")
                 return
-            found = draft.summary.to_dict()
-            doubts = {*found["rest_lines"], *(f"steady state, {line}" for line in found["steady_state"])}
-            lines = str(draft.summary).splitlines()
+            found = draft.summary
+            doubts = {*found.rest_lines, *(f"steady state, {line}" for line in found.steady_state)}
+            lines = str(found).splitlines()
             own = [line for line in lines[1:] if line.startswith(f"experiment {draft.experiment.name}")]
             told = [lines[0], *(line for line in lines if line in doubts), *own]
             moved = event_time(draft.experiment.inputs)

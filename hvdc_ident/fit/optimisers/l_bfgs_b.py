@@ -6,6 +6,7 @@ Byrd, Lu, Nocedal, Zhu 1995, doi 10.1137/0916069.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,9 @@ NAME = "l-bfgs-b"
 SUMMARY = "quasi-Newton with bounds (SciPy), with exact gradients"
 FLAT = 1e-7
 """Projected slope, of the cost at the start, below which an end that the line search could not better is an optimum."""
+RESOLVED = 1e-11
+"""Share of a cost that runs within the engine's tolerance still tell from it. Smaller ones are rounding and the choice of steps, by
+which a line search may go on for a dozen evaluations."""
 
 
 @dataclass(frozen=True)
@@ -43,14 +47,24 @@ class LBfgsB:
             value, gradient = run.value_and_gradient(x)
             return scale * value, scale * gradient
 
+        costs = [1.0]
+        still = False
+
+        def enough(*, intermediate_result: Any) -> None:
+            nonlocal still
+            costs.append(float(intermediate_result.fun))
+            still = costs[-2] - costs[-1] <= RESOLVED * costs[-1]
+            if still:
+                raise StopIteration
+
         # The run counts its own evaluations, and ends the method where it has had enough.
         most = 10 * self.max_evaluations
         options = {"ftol": self.cost, "gtol": self.gradient, "maxcor": self.memory, "maxfun": most, "maxiter": most}
         bounds = list(zip(low, high, strict=True))
-        end = minimize(scaled, run.x0, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        end = minimize(scaled, run.x0, jac=True, method="L-BFGS-B", bounds=bounds, options=options, callback=enough)
         # A slope that is rounding inside the bounds: the line search then ends as abnormal, at an optimum.
         flat = np.abs(np.clip(end.x - end.jac, low, high) - end.x).max() < FLAT
-        return bool(end.success or flat), str(end.message)
+        return bool(end.success or flat or still), str(end.message)
 
 
 OPTIMISER = LBfgsB

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import re
 import uuid
@@ -13,27 +14,20 @@ from pathlib import Path
 
 import numpy as np
 
-from hvdc_ident.errors import ModelError
+from hvdc_ident.data import Experiment
+from hvdc_ident.errors import HvdcIdentError, ModelError
 from hvdc_ident.files import write_bytes
 from hvdc_ident.fmu.compile import binary_folder, compiled, compiler, library_suffix
-from hvdc_ident.fmu.export.c_code import CModel
+from hvdc_ident.fmu.export.c_model import CModel
 from hvdc_ident.fmu.export.model_description import KINDS, ExportedVariables, build_description, description
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, used_names, without_delays
-from hvdc_ident.simulate import engine_of
+from hvdc_ident.simulate import core_sources, engine_of, simulate
 
 VERSIONS = ("2.0", "3.0")
-_RUNTIME = (
-    "linear.c",
-    "equations.c",
-    "start.c",
-    "history.c",
-    "integrate.c",
-    "tangent.c",
-    "instance.c",
-    "snapshot.c",
-    "fmi.c",
-)
+_SHELL = ("fmu.c", "instance.c", "start.c", "progress.c", "values.c", "snapshot.c", "fmi.c", "internal.h", "fmi.h")
+_TO_COMPILE = "fmu.c"
+"""The one file to compile, which includes the others."""
 _NAMESPACE = uuid.UUID("4f1f2a5e-6d0b-5a43-9f0e-3d5c1f6e7a90")
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same model gives the same file
 
@@ -57,12 +51,14 @@ def export_fmu(
     kinds: Sequence[str] = tuple(KINDS),
     binary: bool | None = None,
     stop: float = 1.0,
+    experiments: Sequence[Experiment] = (),
 ) -> FmuFile:
     """Write a model as an FMU to path; return what was written.
 
     model: the model, or its equations as C, where several FMUs are made of them. kinds: "model-exchange", "co-simulation"
     or both. binary: True needs a C compiler, False leaves the sources alone, None compiles where there is a compiler.
-    stop: end of the default experiment, s.
+    stop: end of the default experiment, s. experiments: where a run of one slides along a limit, so can the co-simulation, for
+    each such limit with as much code again as the model has; along others it stops with an error.
 
     The FMU starts from the steady state of the inputs and parameters given to it before its initialisation ends (states
     with a start of their own from that), with exact derivatives of that start. A delay that is 0 at the model's values is left
@@ -82,7 +78,7 @@ def export_fmu(
             expected="cc, gcc, clang or what CC names",
             hint="leave the binary out",
         )
-    code = model if isinstance(model, CModel) else CModel(_without_zero_delays(model))
+    code = model if isinstance(model, CModel) else _code(model, experiments)
     identifier = identifier_of(code.model.name)
     content = _content(code, version, chosen, identifier, stop)
     folder = None
@@ -90,15 +86,24 @@ def export_fmu(
     if command:
         folder = binary_folder(version)
         sources = {n.removeprefix("sources/"): t.decode() for n, t in content.items() if n.startswith("sources/")}
-        content[f"binaries/{folder}/{identifier}{library_suffix()}"] = compiled(command, sources)
+        content[f"binaries/{folder}/{identifier}{library_suffix()}"] = compiled(command, sources, _TO_COMPILE)
         note = f"binary for {folder}, and sources"
     return FmuFile(write_bytes(Path(path), _zipped(content)), version, chosen, folder, note)
+
+
+def _code(model: Model, experiments: Sequence[Experiment]) -> CModel:
+    """Return the model as C, with the slides that runs of the experiments get into, as far as they run."""
+    whole = _without_zero_delays(model)
+    for experiment in experiments:
+        with contextlib.suppress(HvdcIdentError):  # such an experiment is no reason not to export the model
+            simulate(whole, experiment, outputs=tuple(whole.outputs))
+    return CModel(whole, engine_of(whole).slides if experiments else ())
 
 
 def _without_zero_delays(model: Model) -> Model:
     """Return the model without the delays that are 0 at its values and the parameters that stood in their times alone.
 
-    The runtime keeps a delayed signal's history, which a delay of 0 has none of.
+    The core keeps a delayed signal's history, which a delay of 0 has none of.
     """
     if not model.delays:
         return model
@@ -119,16 +124,13 @@ def identifier_of(name: str) -> str:
 
 def _content(code: CModel, version: str, kinds: Sequence[str], identifier: str, stop: float) -> dict[str, bytes]:
     """Return the FMU's files but for the binary, by name."""
-    runtime = resources.files("hvdc_ident.fmu.export") / "runtime"
-    tableau = resources.files("hvdc_ident.simulate.core") / "tableau.h"
-    shared = (*_RUNTIME, f"fmi{version[0]}.c")
-    names = ("model.c", *shared)
+    shell = resources.files("hvdc_ident.fmu.export") / "runtime"
     variables = ExportedVariables(code)
-    files = {"model.c": code.source, "tableau.h": tableau.read_text("utf-8")}
-    files |= {n: (runtime / n).read_text("utf-8") for n in (*shared, "fmi.h", "internal.h")}
+    files = {n: (shell / n).read_text("utf-8") for n in (*_SHELL, f"fmi{version[0]}.c")}
+    files |= core_sources() | {"model.c": code.source}
 
     def described(token: str) -> str:
-        return description(variables, token, version, identifier, kinds, names, stop)
+        return description(variables, token, version, identifier, kinds, [_TO_COMPILE], stop)
 
     # The token is a digest of the content: an importer's stored state of another model is refused.
     everything = [described(""), code.header("", version), *(files[n] for n in sorted(files))]
@@ -137,7 +139,7 @@ def _content(code: CModel, version: str, kinds: Sequence[str], identifier: str, 
     content = {"modelDescription.xml": described(token)}
     content |= {f"sources/{n}": t for n, t in files.items()}
     if version == "3.0":
-        content["sources/buildDescription.xml"] = build_description(identifier, names)
+        content["sources/buildDescription.xml"] = build_description(identifier, [_TO_COMPILE])
     return {n: t.encode() for n, t in content.items()}
 
 

@@ -9,7 +9,7 @@ from itertools import accumulate
 from xml.etree import ElementTree as ET
 
 from hvdc_ident.expression import symbol
-from hvdc_ident.fmu.export.c_code import TOLERANCE, CModel
+from hvdc_ident.fmu.export.c_model import TOLERANCE, CModel
 
 
 @dataclass(frozen=True)

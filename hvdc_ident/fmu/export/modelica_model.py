@@ -14,7 +14,7 @@ from sympy.logic.boolalg import And, Not, Or
 from hvdc_ident.errors import ExpressionError
 from hvdc_ident.expression import clip, elementary, symbol
 from hvdc_ident.files import write_text
-from hvdc_ident.fmu.export.c_code import CModel
+from hvdc_ident.fmu.export.c_model import CModel
 from hvdc_ident.fmu.export.model_description import SI
 from hvdc_ident.model import Model
 

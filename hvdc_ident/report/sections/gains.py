@@ -92,8 +92,7 @@ def _searched(fit: FitResult, context: Context) -> str:
 
 
 def _derived(context: Context) -> str:
-    lines = context.derived.items()
-    rows = [(n, d["value"], d.get("std"), d.get("unit") or "", d["expression"]) for n, d in lines]
+    rows = [(n, d.value, d.std, d.unit, d.expression) for n, d in context.derived.items()]
     shown = rows_of(["parameter", "value", "std", "unit", "expression"], rows)
     return f"<h3>What follows from the estimates</h3>{shown}" if shown else ""
 

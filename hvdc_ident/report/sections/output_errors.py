@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from markupsafe import Markup
 
-from hvdc_ident.report.html import Section, folded, number, table, table_of, text
+from hvdc_ident.fit import FitResult
+from hvdc_ident.report.html import Section, folded, number, rows_of, shown, table_of, text
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.tables import signals_table
+from hvdc_ident.text import figures
 
 
 def _render(results: Results) -> str:
@@ -23,30 +25,29 @@ def _render(results: Results) -> str:
     ]
     windows = _windows(results)
     both = [windows, *parts] if s.profile.get("named") else [*parts, windows]
-    return "".join(both) + _held_out(results.get("fit"))
+    return "".join(both) + _held_out(results.objects.fit)
 
 
 def _windows(results: Results) -> str:
     """Largest, mean and mean absolute error before, during and after the event, beside the profile's limits."""
     s = results.summary
     profile, units = s.profile, results.units
-    over: list[list[str]] = []
-    rows: list[list[str]] = []
-    unjudged: list[list[str]] = []
+    over: list[tuple[str, ...]] = []
+    rows: list[tuple[str, ...]] = []
+    unjudged: list[tuple[str, ...]] = []
     why: list[str] = []
     ends = set()
     for output, name, about in results.windows(s.about):
-        ends.add(about.get("end_from"))
-        if about.get("event") is None:
-            continue
-        for window in ("before", "during", "after"):
-            w = about[window]
-            span = f"{number(w['from'], 3)} … {number(w['to'], 3)}" if w["n"] else "–"
-            errors = [_error(w, kind) for kind in ("max", "mean", "mean_absolute")]
-            row = [text(output), text(name), window, span, *errors, text(units.get(output, ""))]
-            {True: rows, False: over, None: unjudged}[w.get("within")].append(row)
-            if w.get("within") is None:
-                why.append(f"{output}: {about.get('reason') or 'no row in this window'}")
+        ends.add(about.end_from)
+        for window, w in about.by_name.items():
+            span = f"{figures(w.begin, 3)} … {figures(w.end, 3)}" if w.n else "–"
+            limits = w.limits or {}
+            kinds = {"max": w.max, "mean": w.mean, "mean_absolute": w.mean_absolute}
+            errors = [_error(value, limits.get(kind)) for kind, value in kinds.items()]
+            row = (output, name, window, span, *errors, units.get(output, ""))
+            {True: rows, False: over, None: unjudged}[w.within].append(row)
+            if w.within is None:
+                why.append(f"{output}: {about.reason or 'no row in this window'}")
     if not rows and not over and not unjudged:
         return ""
     steps = " A step counts as over where its record has settled." if "settling" in ends else ""
@@ -59,45 +60,32 @@ def _windows(results: Results) -> str:
     counted = (
         f"{len(rows)} windows within the limits, {len(over)} with an error above its limit, {len(unjudged)} not judged"
     )
-    above = table(head, over, words=(0, 1, 2, 7)) if over else ""
-    within = folded(f"{len(rows)} windows within the limits", table(head, rows, words=(0, 1, 2, 7))) if rows else ""
-    reasons = f"<p class='small'>{text('; '.join(dict.fromkeys(why)))}.</p>"
-    within += (
-        folded(f"{len(unjudged)} windows not judged", table(head, unjudged, words=(0, 1, 2, 7)) + reasons)
-        if unjudged
-        else ""
-    )
-    within += told
+    above = rows_of(head, over)
+    within = folded(f"{len(rows)} windows within the limits", rows_of(head, rows))
+    reasons = f"<p class='small'>{text('; '.join(dict.fromkeys(why)))}.</p>" if unjudged else ""
+    within += folded(f"{len(unjudged)} windows not judged", rows_of(head, unjudged) + reasons) + told
     if profile.get("named"):
         return f"<h3>Before, during and after the event: {counted}</h3>{above}{within}"
     return folded(f"Before, during and after the event: {counted}", above + within)
 
 
-def _error(window: dict[str, Any], kind: str) -> str:
-    value, limit = window.get(kind), (window.get("limits") or {}).get(kind)
-    if value is None:
-        return "–"
-    over = limit is not None and abs(value) > limit
-    return f"<strong>{number(value, 2)} &gt; {number(limit, 2)}</strong>" if over else number(value, 2)
+def _error(value: float | None, limit: float | None) -> str:
+    over = value is not None and limit is not None and abs(value) > limit
+    return Markup(f"<strong>{number(value, 2)} &gt; {number(limit, 2)}</strong>") if over else shown(value, 2)
 
 
-def _held_out(fit: dict[str, Any]) -> str:
+def _held_out(fit: FitResult | None) -> str:
     """Table of the errors at the estimates in experiments that were kept out of the fit."""
     rows = []
-    for name, line in (fit.get("validation") or {}).items():
-        if line.get("status") != "done":
-            rows.append([text(name), "–", "–", "–", "–", "could not be simulated at the estimates"])
-        for output, q in (line.get("outputs") or {}).items():
-            band = q.get("in_band")
-            note = "; ".join(
-                f"{n} {number(v)} from this record itself" for n, v in (line.get("nuisance") or {}).items()
-            )
-            cells = [text(name), text(output), number(q["rmse"], 3), number(q.get("of_fit"), 3)]
-            rows.append([*cells, f"{number(100.0 * band, 3)} %" if band is not None else "–", text(note)])
-    if not rows:
-        return ""
+    for name, line in ({} if fit is None else fit.validation).items():
+        if line.status != "done":
+            rows.append((name, "–", "–", "–", "–", "could not be simulated at the estimates"))
+        note = "; ".join(f"{n} {figures(v)} from this record itself" for n, v in line.nuisance.items())
+        for output, q in line.outputs.items():
+            band = f"{figures(100.0 * q.quality.in_band, 3)} %" if q.quality.in_band is not None else "–"
+            rows.append((name, output, shown(q.quality.rmse, 3), shown(q.of_fit, 3), band, note))
     head = ["held-out experiment", "output", "RMSE", "of the fit's", "samples in the 95 % band", "note"]
-    return "<h3>Held-out experiments</h3>" + table(head, rows, words=(0, 1, 5))
+    return f"<h3>Held-out experiments</h3>{rows_of(head, rows)}" if rows else ""
 
 
 SECTION = Section(

@@ -6,7 +6,9 @@ import base64
 import io
 import zipfile
 
-from hvdc_ident.report.html import Section, table, text
+from markupsafe import Markup
+
+from hvdc_ident.report.html import Section, rows_of, text
 from hvdc_ident.summary import Results
 
 ARCHIVE = "results.zip"
@@ -17,11 +19,10 @@ LARGEST = 20_000_000
 
 def _render(results: Results) -> str:
     heading = results.heading
-    rows = [["study", text(heading.get("study", ""))], ["model", text(heading.get("model", ""))]]
-    rows += [["software", text(heading.get("software", ""))], ["seed", text(heading.get("seed", ""))]]
+    rows = [(name, Markup(text(heading.get(name, "")))) for name in ("study", "model", "software", "seed")]
     sources = heading.get("sources") or {}
-    rows += [["source", f"{text(name)}<br><code>sha256 {text(value)}</code>"] for name, value in sources.items()]
-    return table(["what", "which"], rows, words=(0, 1)) + _numbers(results)
+    rows += [("source", Markup(f"{text(name)}<br><code>sha256 {text(value)}</code>")) for name, value in sources.items()]
+    return rows_of(["what", "which"], rows) + _numbers(results)
 
 
 def _numbers(results: Results) -> str:

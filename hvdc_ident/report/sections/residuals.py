@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-from hvdc_ident.report.html import Section, number, table, text
+from markupsafe import Markup
+
+from hvdc_ident.fit.adequacy import ResidualTest, ResidualTests
+from hvdc_ident.fit.result import Goodness
+from hvdc_ident.report.html import Section, number, rows_of, typeset
 from hvdc_ident.summary import Results
+from hvdc_ident.text import figures
 
 LOW = 0.01
 """A p below this is marked."""
 
 
 def _render(results: Results) -> str:
-    fit = results.get("fit")
-    tests = fit.get("residual_tests") or {}
-    if not tests:
+    fit = results.objects.fit
+    if fit is None or not fit.residual_tests:
         return ""
     head = [
         "output",
@@ -31,42 +35,32 @@ def _render(results: Results) -> str:
         f"correlation with inputs, each filtered by itself). Below {LOW:g} it is marked: something is left over.</p>"
     )
 
-    def tested(by_output: dict[str, Any], of: dict[str, Any]) -> str:
-        rows = [_row(o, e, line, of) for o, by_name in by_output.items() for e, line in by_name.items()]
-        return table(head, rows, words=(0, 1, 7))
+    def tested(by_output: ResidualTests, of: Goodness) -> str:
+        return rows_of(head, (_row(o, e, line, of) for o, by_name in by_output.items() for e, line in by_name.items()))
 
-    diagnosis = results.get("discrepancy")
-    with_effect = diagnosis.get("residual_tests_after") or {}
+    diagnosis = results.objects.diagnosis
+    with_effect = {} if diagnosis is None else diagnosis.residual_tests_after
     if not with_effect or results.summary.counting.name != "effect":
-        return tested(tests, fit) + told
+        return tested(fit.residual_tests, fit.goodness) + told
     return (
-        f"<h3>With the effect, at the values that count</h3>{tested(with_effect, {})}"
-        f"<h3>Fitted without it</h3>{tested(tests, fit)}{told}"
+        f"<h3>With the effect, at the values that count</h3>{tested(with_effect, Goodness())}"
+        f"<h3>Fitted without it</h3>{tested(fit.residual_tests, fit.goodness)}{told}"
     )
 
 
-def _row(output: str, experiment: str, line: dict[str, Any], fit: dict[str, Any]) -> list[str]:
-    quality = ((((fit.get("goodness") or {}).get("outputs") or {}).get(output)) or {}).get(experiment) or {}
-    inputs = {n: i.get("p") for n, i in (line.get("inputs") or {}).items() if i.get("p") is not None}
+def _row(output: str, experiment: str, line: ResidualTest, of: Goodness) -> tuple[Any, ...]:
+    quality = of.outputs.get(output, {}).get(experiment)
+    inputs = {n: i.p for n, i in line.inputs.items() if i.p is not None}
     least = min(inputs, key=lambda n: inputs[n], default=None)
-    share = quality.get("r2")
-    return [
-        text(output),
-        text(experiment),
-        number(line.get("n")),
-        f"{number(100.0 * share, 5 if share > 0.9 else 3)} %" if share is not None else "–",
-        _p((line.get("ljung_box") or {}).get("p")),
-        _p((line.get("runs") or {}).get("p")),
-        _p(inputs[least]) if least is not None else "–",
-        text(least or ""),
-    ]
+    share = None if quality is None else quality.r2
+    explained = f"{figures(100.0 * share, 5 if share > 0.9 else 3)} %" if share is not None else "–"
+    tests = (line.ljung_box.p, line.runs.p, None if least is None else inputs[least])
+    return output, experiment, line.n, explained, *map(_p, tests), least or ""
 
 
-def _p(value: float | None) -> str:
-    if value is None:
-        return "–"
-    shown = number(value, 2) if value > 0 else "&lt;10<sup>−300</sup>"
-    return f"<strong>{shown}</strong>" if value < LOW else shown
+def _p(value: float | None) -> Markup:
+    p = Markup(typeset("<1e-300") if value == 0.0 else number(value, 2))
+    return Markup(f"<strong>{p}</strong>") if value is not None and value < LOW else p
 
 
 SECTION = Section(

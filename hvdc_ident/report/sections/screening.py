@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvdc_ident.report.html import Section, number, table, text
+from hvdc_ident.report.html import Section, rows_of, shown
 from hvdc_ident.sensitivity import ScreeningResult
 from hvdc_ident.summary import Results
 
@@ -19,7 +19,7 @@ def _render(results: Results) -> str:
     found = ScreeningResult.from_dict(data)
     columns = COLUMNS[found.method]
     rows = [
-        [text(o), text(e), text(p), *(number(m[n], 3) for n in columns)]
+        (o, e, p, *(shown(m[n], 3) for n in columns))
         for o, e in found.series
         for p, m in found.of(o, e).items()
     ]
@@ -29,7 +29,7 @@ def _render(results: Results) -> str:
         f"<p>{method} of the RMSE against {against}, every parameter over its whole range; {found.evaluations} runs, "
         f"{found.failed} failed.</p>"
     )
-    return head + table(["output", "experiment", "parameter", *columns.values()], rows, words=(0, 1, 2))
+    return head + rows_of(["output", "experiment", "parameter", *columns.values()], rows)
 
 
 SECTION = Section(

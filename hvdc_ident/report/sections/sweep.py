@@ -10,10 +10,10 @@ import numpy as np
 from hvdc_ident.colours import MARK, SERIES
 from hvdc_ident.data import Array
 from hvdc_ident.report.drawing import bode_axes, draw_response, figure, svg
-from hvdc_ident.report.html import Section, captioned, number, table, text
+from hvdc_ident.report.html import Section, captioned, rows_of, text
 from hvdc_ident.sensitivity import SweepResult
 from hvdc_ident.summary import Results
-from hvdc_ident.text import with_unit
+from hvdc_ident.text import figures, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,15 +45,13 @@ def _render(results: Results) -> str:
 
 def _best(found: SweepResult) -> str:
     rows = []
-    for (output, experiment), unit in zip(found.series, found.series_units, strict=True):
-        errors = found.error(output, experiment)
-        extremes = [number(float(np.nanmin(errors)), 3), number(float(np.nanmax(errors)), 3)]
-        best = found.best(output, experiment)
+    for line in found.bests:
+        extremes = [figures(line.smallest, 3), figures(line.largest, 3)]
         flat = extremes[0] == extremes[1]  # of a flat line none is the best
-        at = ["–" if flat else number(v, 5) for v in best.values()]
-        rows.append([text(output), text(experiment), *at, *extremes, text(unit)])
-    header = ["output", "experiment", *(f"best {text(n)}" for n in found.parameters), "smallest RMSE", "largest", "unit"]
-    return table(header, rows, words=(0, 1, len(header) - 1)) if rows else ""
+        at = ["–" if flat else figures(v, 5) for v in line.at.values()]
+        rows.append((line.output, line.experiment, *at, *extremes, line.unit))
+    header = ["output", "experiment", *(f"best {n}" for n in found.parameters), "smallest RMSE", "largest", "unit"]
+    return rows_of(header, rows)
 
 
 def _figures(found: SweepResult, name: str, rows: Array) -> str:
@@ -87,8 +85,9 @@ def _bode(found: SweepResult, name: str, rows: Array) -> list[str]:
     drawn = []
     for b, a in [(b, a) for b in range(len(outputs)) for a in range(len(inputs))][:CHANNELS]:
         label = f"{outputs[b]} over {inputs[a]}"
-        responses = found.response[some][:, positive, b, a]
-        fig = sweep_bode(name, found.values(name)[some], found.omega[positive], responses, label)
+        responses, phases = (x[some][:, positive, b, a] for x in (found.response, found.phase_deg))
+        phases = phases + 360.0 * np.round((phases[:1, :1] - phases[:, :1]) / 360.0)  # all begin within half a turn
+        fig = sweep_bode(name, found.values(name)[some], found.omega[positive], responses, phases, label)
         caption = f"Frequency response of {text(label)} over {text(name)}, gain above phase."
         drawn.append(captioned(svg(fig, f"frequency response of {label} over {name}"), caption))
     return drawn
@@ -149,8 +148,10 @@ def sweep_poles(parameter: str, values: Array, poles: np.ndarray) -> Figure:
     return fig
 
 
-def sweep_bode(parameter: str, values: Array, omega: Array, response: np.ndarray, channel: str) -> Figure:
-    """Gain and phase of one channel, a curve a row, (rows, frequencies) complex, colored by the parameter."""
+def sweep_bode(
+    parameter: str, values: Array, omega: Array, response: np.ndarray, phase: Array, channel: str
+) -> Figure:
+    """Gain and phase of one channel, a curve a row, (rows, frequencies) complex and degrees, colored by the parameter."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
@@ -158,8 +159,8 @@ def sweep_bode(parameter: str, values: Array, omega: Array, response: np.ndarray
     fig = figure(7.4, 4.4)
     (pair,) = bode_axes(fig)
     scale = Normalize(float(values.min()), float(values.max()))
-    for value, row in zip(values, response, strict=True):
-        draw_response(pair, omega, row, color=colormaps["viridis"](scale(value)), linewidth=0.9)
+    for value, row, turned in zip(values, response, phase, strict=True):
+        draw_response(pair, omega, row, turned, color=colormaps["viridis"](scale(value)), linewidth=0.9)
     pair[0].set_title(channel, fontsize=8)
     pair[0].set_xlim(omega[0] / (2 * np.pi), omega[-1] / (2 * np.pi))
     fig.colorbar(ScalarMappable(scale, "viridis"), ax=list(pair), label=parameter)

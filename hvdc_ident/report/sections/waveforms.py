@@ -46,8 +46,8 @@ def _render(results: Results) -> str:
 
 
 def _caption(results: Results, overlay: Overlay) -> str:
-    about = results.experiments.get(overlay.experiment) or {}
-    role = ", held out: not used by the fit" if about.get("role") == "holdout" else ""
+    about = results.experiments.get(overlay.experiment)
+    role = ", held out: not used by the fit" if about is not None and about.role == "holdout" else ""
     return f"{text(overlay.output)} in {text(overlay.experiment)}{role}."
 
 
@@ -55,7 +55,7 @@ def _recordings(results: Results) -> str:
     """What was noticed about the files, each remark once with the recordings that it is about."""
     remarks: dict[str, list[str]] = {}
     for name, about in results.experiments.items():
-        for line in recording_lines(about["recording"]) if about.get("recording") else ():
+        for line in recording_lines(about.recording) if about.recording else ():
             remarks.setdefault(str(line), []).append(name)
     every = len(results.experiments)
     lines = [

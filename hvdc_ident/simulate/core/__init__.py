@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array
+from hvdc_ident.errors import InstallationError
 
 if TYPE_CHECKING:
     from typing_extensions import Buffer
@@ -26,6 +27,7 @@ FOLDER = Path(__file__).parent
 BUILDS = {"avx2": ("avx2", "fma"), "baseline": ()}
 """The builds of the library, best first, with the features of the processor that each needs."""
 LIBRARY = "core-{build}.so.1"
+REBUILD = "`pip install --force-reinstall hvdc_ident`; in a checkout `python build_backend.py`, which needs a C compiler"
 Record = NDArray[np.int64]
 
 
@@ -66,9 +68,14 @@ GIVEN_INSTANTS = slice(GIVEN.stop, GIVEN.stop + len(_STATED_INSTANTS))
 """Then, as doubles, start, end and the tolerances, relative and absolute."""
 
 
+def core_sources() -> dict[str, str]:
+    """Return the core's files, {name: text}, for a program that includes `core.c`, which includes the others."""
+    return {p.name: p.read_text("utf-8") for p in sorted(FOLDER.glob("*.[ch]")) if p.name != "all.c"}
+
+
 @cache
 def library() -> ctypes.CDLL:
-    """Return the library that suits this processor. Raises ImportError where it was not built."""
+    """Return the library that suits this processor. Raises InstallationError where it was not built."""
     features = llvm.get_host_cpu_features()
     for build, needed in BUILDS.items():
         path = FOLDER / LIBRARY.format(build=build)
@@ -76,12 +83,16 @@ def library() -> ctypes.CDLL:
             found = ctypes.CDLL(str(path))
             found.hvdc_ident_room.restype = found.hvdc_ident_fields.restype = ctypes.c_int64
             if found.hvdc_ident_fields() != len(RUN_FIELDS):
-                raise ImportError(f"{path} was built with another core.h: build it anew, with: python build_backend.py")
+                raise InstallationError(
+                    "the installation is incomplete: the compiled core is of another version", where=str(path), hint=REBUILD
+                )
             found.hvdc_ident_judge.restype = found.hvdc_ident_repeat.restype = None
             return found
-    raise ImportError(
-        f"{FOLDER}: the compiled core is not there, expected {LIBRARY.format(build='baseline')}. "
-        "Install the package (pip install .), or build it in a checkout with: python build_backend.py"
+    raise InstallationError(
+        "the installation is incomplete: the compiled core is not there",
+        where=str(FOLDER),
+        expected=LIBRARY.format(build="baseline"),
+        hint=REBUILD,
     )
 
 

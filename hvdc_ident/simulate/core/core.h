@@ -2,7 +2,9 @@
 
    A model comes as functions of one signature (`function`), by address, with the sizes of its vectors. Everything else that a
    run knows stands in one record, `run`, which is the caller's. The record's fields are listed once, by macros, so that
-   a caller in another language can read their order from this file. Every field takes eight bytes. */
+   a caller in another language can read their order from this file. Every field takes eight bytes.
+
+   `all.c` makes a library of the core; an exported FMU includes the same files. */
 
 #ifndef HVDC_IDENT_CORE_H
 #define HVDC_IDENT_CORE_H
@@ -26,7 +28,8 @@ enum status { CONVERGED, STEP_LIMIT, NOT_FINITE, CHATTER, INCONSISTENT, STIFF, S
 enum {
     NONE = -1,   /* no switch */
     AGAIN = -2,  /* the step is to be taken once more */
-    NODES = 5    /* a delayed signal is kept as a quartic in each step, through five equidistant values */
+    NODES = 5,   /* a delayed signal is kept as a quartic in each step, through five equidistant values */
+    PIECES = 16  /* or in as many pieces of a step at most */
 };
 
 /* --- numbers that the caller reads from here too --- */
@@ -36,8 +39,18 @@ enum {
 #define SHORTEST 0x1p-16 /* of a path of values: a step that has to be shorter means that the path ends */
 #define TINY 1e-3       /* the least that an unknown counts for, where it tells by what an equation's residual is measured */
 
-/* A loop whose turns do not depend on each other: over elements of vectors that do not overlap, or are the same (-fopenmp-simd). */
-#define EACH(i, count) _Pragma("omp simd") for (integer i = 0; i < (count); i++)
+/* What tells the compiler that the turns of a loop do not depend on each other; the build of the library defines it. */
+#ifndef INDEPENDENT
+#define INDEPENDENT
+#endif
+
+/* Such a loop over elements of vectors that do not overlap, or are the same. */
+#define EACH(i, count) INDEPENDENT for (integer i = 0; i < (count); i++)
+
+/* How the functions that a caller uses are linked: in an exported FMU they are its own alone. */
+#ifndef INTERFACE
+#define INTERFACE
+#endif
 
 /* --- one set of equations: of the model, or of a slide on the surface of a switch --- */
 
@@ -111,11 +124,14 @@ enum {
     INT(first)     /* the first segment */                                                                                     \
     INT(fresh)     /* the first stage holds the derivative at (t, y) */                                                        \
     INT(again)     /* the step before was rejected: what was computed at (t, y) stands */                                      \
+    INT(factored)  /* how the step's matrix is factored: 1 by the generated elimination, 2 by dense partial pivoting */         \
     INT(last)      /* this step ends at the segment's end */                                                                   \
+    INT(continued) /* nothing happens where the next segment begins: it goes on from the one before */                         \
     INT(echo_now) INT(disturbed) INT(published) /* what happened at the present break */
 
 #define INSTANTS(REAL)                                                                                                         \
     REAL(t) REAL(tb)     /* tb: the present segment's end */                                                                   \
+    REAL(span)           /* of the whole run: what a step counts as short or long by */                                        \
     REAL(h) REAL(hs) REAL(step_end)            /* the step wanted, the step taken, its end */                                  \
     REAL(order) REAL(shortest) REAL(last_event) REAL(error) REAL(stiffness)                                                    \
     REAL(surface_top)                          /* largest value of the sliding switch so far */

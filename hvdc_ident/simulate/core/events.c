@@ -34,15 +34,34 @@ static void widen(run *r)
     }
 }
 
+/* The switch that is furthest beyond its mode at a share of the present step, or NONE.
+
+   Where a switch is near 0 the point of the dense output is made exact as far as its defect tells, or always, where `exact`: while a
+   play is pulled, the switch that lets it go is 1e-7 of a speed, and what is pulled is no quartic. */
+static integer violation_at(run *r, double share, bool exact)
+{
+    interpolate(r, share, r->n, r->u);
+    outside(r, r->t + share * r->hs, r->t);
+    integer which = violation(r, r->u);
+    if (!r->rosenbrock)
+        return which;
+    for (integer k = 0; k < r->ns; k++)
+        exact = exact || fabs(r->sv[k]) < 0.1 * r->top[k];
+    if (which == NONE && !exact)
+        return NONE;
+    rodas_defect(r, share);
+    EACH(i, r->n)
+        r->u[i] += r->e[i];
+    return violation(r, r->u);
+}
+
 /* Bisection on "some switch is beyond its mode", on the dense output: the share of the step, and the switch in `event`. */
 static double bisect(run *r, double bad, integer *event)
 {
     double good = bad == 0.5 ? 0.0 : 0.5;
     for (integer k = 0; k < 60; k++) {
         double middle = 0.5 * (good + bad);
-        interpolate(r, middle, r->n, r->u);
-        outside(r, r->t + middle * r->hs, r->t);
-        integer which = violation(r, r->u);
+        integer which = violation_at(r, middle, true);
         if (which >= 0) {
             bad = middle;
             *event = which;
@@ -61,9 +80,7 @@ static double bisect(run *r, double bad, integer *event)
 static integer find_switch(run *r)
 {
     double bad = 0.5;
-    interpolate(r, 0.5, r->n, r->u);
-    outside(r, r->t + 0.5 * r->hs, r->t);
-    integer event = violation(r, r->u);
+    integer event = violation_at(r, 0.5, false);
     if (event == NONE) {
         bad = 1.0;
         outside(r, r->step_end, r->t);
@@ -76,7 +93,7 @@ static integer find_switch(run *r)
         return met ? aim : NONE; /* the step aimed at this switch and met it */
     }
     bad = bisect(r, bad, &event);
-    if (bad < 0.98 && bad * r->hs > 1e-12 * (r->end - r->start)) {
+    if (bad < 0.98 && bad * r->hs > 1e-12 * r->span) {
         /* Step again up to the switch itself: the dense output is less exact than the step. */
         r->h = bad * r->hs;
         r->aim = event;
@@ -106,8 +123,6 @@ static void add_echo(run *r, integer i, double order)
 {
     integer width = r->width;
     double at = r->t + r->lag[i];
-    if (!(at < r->end))
-        return;
     double *echo = r->echo + r->echoes * (2 + width);
     echo[0] = at;
     echo[1] = order;
@@ -172,7 +187,7 @@ static enum status cross(run *r, integer event)
 static enum status pass_switch(run *r, integer event)
 {
     r->events++;
-    if (event == r->last_switch && r->t - r->last_event < 1e-9 * (r->end - r->start)) {
+    if (event == r->last_switch && r->t - r->last_event < 1e-9 * r->span) {
         if (++r->chatter > 40)
             return CHATTER;
     } else {

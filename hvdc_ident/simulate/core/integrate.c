@@ -77,6 +77,7 @@ static void begin_run(run *r, const double *y, const double *w)
     for (integer i = 0; i < r->nu; i++)
         r->at[i] = r->pointer[i];
     r->t = r->start;
+    r->span = r->end - r->start;
     r->first = 1;
     r->last_event = -INFINITY;
     r->last_switch = r->aim = NONE;
@@ -116,7 +117,7 @@ static enum status take_step(run *r)
         return STEP_LIMIT;
     if (r->nd)
         r->h = fmin(r->h, r->shortest);
-    double span = r->end - r->start, largest = fmax(fabs(r->t), fabs(r->end));
+    double span = r->span, largest = fmax(fabs(r->t), fabs(r->end));
     r->last = r->t + 1.000001 * r->h >= r->tb;
     r->step_end = r->last ? r->tb : r->t + r->h;
     r->hs = r->step_end - r->t;
@@ -152,22 +153,51 @@ static enum status take_step(run *r)
     return accept(r, factor);
 }
 
-/* Run from segment to segment, with room for what has no size known beforehand: steps for delayed signals to look back to, and
-   jumps that will come back. */
-static enum status run_segments(run *r)
+/* Forget the steps that no delay reaches any more, where that is at least half of them. */
+static void forget(run *r)
+{
+    integer line = 2 + r->nd * NODES * (1 + r->width), old = 0;
+    double longest = 0.0;
+    for (integer i = 0; i < r->nd; i++)
+        longest = fmax(longest, r->lag[i]);
+    while (old < r->kept && r->history[old * line] + r->history[old * line + 1] < r->t - 1.001 * longest)
+        old++;
+    if (2 * old < r->kept)
+        return;
+    r->kept -= old;
+    for (integer q = 0; q < r->kept * line; q++)
+        r->history[q] = r->history[old * line + q];
+}
+
+/* Make room for what a step or the beginning of a segment may add: jumps that come back, and pieces of a step to look back to.
+   False: no memory. */
+static bool make_rooms(run *r)
 {
     integer line = 2 + r->width, of_history = 2 + r->nd * NODES * (1 + r->width);
-    for (;;) {
-        if (!make_room(&r->echo, &r->echo_room, r->echoes, r->nd + 1, line))
+    if (r->nd == 0)
+        return true;
+    if (r->kept + PIECES > r->history_room)
+        forget(r);
+    return make_room(&r->history, &r->history_room, r->kept, PIECES, of_history) &&
+           make_room(&r->echo, &r->echo_room, r->echoes, r->nd + 1, line);
+}
+
+/* Run from segment to segment until r->end, where nothing has happened yet. */
+static enum status run_segments(run *r)
+{
+    while (r->t < r->end) {
+        if (!make_rooms(r))
             return OUT_OF_MEMORY;
-        if (!begin_segment(r))
+        if (r->continued)
+            r->tb = next_stop(r);
+        else if (!begin_segment(r))
             return INCONSISTENT;
-        if (!(r->t < r->end))
-            return CONVERGED;
-        prepare_segment(r);
+        describe_segment(r);
+        if (!r->continued)
+            prepare_segment(r);
+        r->continued = 0;
         while (r->t < r->tb) {
-            if (r->nd && !(make_room(&r->history, &r->history_room, r->kept, 1, of_history) &&
-                           make_room(&r->echo, &r->echo_room, r->echoes, r->nd, line)))
+            if (!make_rooms(r))
                 return OUT_OF_MEMORY;
             enum status status = take_step(r);
             if (status != CONVERGED)
@@ -175,45 +205,5 @@ static enum status run_segments(run *r)
         }
         end_segment(r);
     }
-}
-
-/* Doubles of workspace that a run takes. r: with the sizes of the largest equations that it may use. */
-integer hvdc_ident_room(const run *r)
-{
-    run copy = *r;
-    return (integer)arrange(&copy, NULL);
-}
-
-/* Integrate from r->start to r->end and write the outputs and their rows into r->out (n_out, no (1 + width)). Returns a status;
-   r->t is the instant reached.
-
-   r: with zeros but for the sizes of the largest equations it may use, heads (switches + 1: of the slide on each switch, zeros
-   where there are none yet, then those without a slide), the instants, tolerances, max_steps, slides, and the caller's vectors:
-   p, constants (delay times, sampling periods and compute times with their rows), breaks (2, n_breaks: instants at which a step
-   ends, and whether delays bring them back), pointer, times and values of the inputs' pieces, t_out, out, scale of each
-   parameter. work: zeros, as many doubles as `hvdc_ident_room` says. y: the flat start vector, consistent to solver tolerance;
-   w: what comes from outside there, with rows. */
-int hvdc_ident_integrate(run *r, double *work, const double *y, const double *w)
-{
-    arrange(r, work);
-    use(r, r->ns);
-    begin_run(r, y, w);
-    enum status status = run_segments(r);
-    free(r->history);
-    free(r->echo);
-    r->history = r->echo = NULL;
-    return status;
-}
-
-/* Fields of a run's record, by which a caller sees that it was built with the same header. */
-integer hvdc_ident_fields(void)
-{
-    return (integer)(sizeof(run) / sizeof(integer));
-}
-
-/* Call a generated function so many times, to measure what it costs. */
-void hvdc_ident_repeat(function code, const double *y, const double *w, const double *p, const double *m, double *out, integer count)
-{
-    for (integer k = 0; k < count; k++)
-        code(y, y, w, w, p, m, out);
+    return CONVERGED;
 }

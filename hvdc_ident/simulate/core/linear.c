@@ -35,7 +35,7 @@ static bool lu(double *a, integer *pivots, integer n)
                 continue;
             double share = own[k] * inverse;
             own[k] = share;
-            _Pragma("omp simd") for (integer j = k + 1; j < n; j++)
+            INDEPENDENT for (integer j = k + 1; j < n; j++)
                 own[j] -= share * pivot_row[j];
         }
     }

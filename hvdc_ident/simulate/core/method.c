@@ -7,7 +7,7 @@ static void attempt(run *r)
 {
     /* An unknown may have an infinite slope for an instant, as sqrt(1.1^2 - i^2) where i meets its limit. The states pass it; very
        short steps are judged by them alone. */
-    integer rows = r->hs > 1e-6 * (r->end - r->start) || r->nx == 0 ? r->n : r->nx;
+    integer rows = r->hs > 1e-6 * r->span || r->nx == 0 ? r->n : r->nx;
     r->error = r->rosenbrock ? rodas_step(r, rows) : dopri_step(r, rows);
 }
 

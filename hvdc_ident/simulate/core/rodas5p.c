@@ -49,30 +49,36 @@ static void rodas_prepare(run *r, integer stage)
 #undef STAGE
 }
 
-/* Factor M/(h gamma) - J: 1 by the generated elimination, 2 by dense partial pivoting, 0 if it is singular.
+/* Factor M/(h gamma) - J. Returns false if it is singular.
 
    The generated one takes its pivots as they come: it is trusted where none is small against its row. */
-static int rodas_factor(run *r)
+static bool rodas_factor(run *r)
 {
     integer n = r->n;
     double shift = 1.0 / (r->hs * RODAS_GAMMA);
     r->shift[0] = shift;
     if (r->factors) {
         r->do_lu(r->jac, r->yd, r->shift, r->yd, r->yd, r->m, r->factor);
-        if (r->factor[r->factors] < 1e7)
-            return 1;
+        r->factored = r->factor[r->factors] < 1e7 ? 1 : 0;
+        if (r->factored)
+            return true;
     }
     for (integer q = 0; q < n * n; q++)
         r->matrix[q] = -r->jac[q];
     for (integer i = 0; i < r->nx; i++)
         r->matrix[i * n + i] += shift;
-    return lu(r->matrix, r->pivots, n) ? 2 : 0;
+    r->factored = lu(r->matrix, r->pivots, n) ? 2 : 0;
+    return r->factored > 0;
 }
 
-/* The work of the generated solve by dense linear algebra: from the right-hand side in k to the stage. */
+/* From the right-hand side in k, to which comes r->add, to the stage. */
 static void rodas_solve(run *r, double *k)
 {
     integer n = r->n, width = r->width;
+    if (r->factored == 1) {
+        r->do_solve(r->add, r->hessian, r->w, r->wd, r->factor, r->m, k);
+        return;
+    }
     EACH(q, r->stride)
         k[q] += r->add[q];
     solve(r->matrix, r->pivots, k, n);
@@ -82,39 +88,6 @@ static void rodas_solve(run *r, double *k)
     for (integer q = 0; q < r->hessians; q++)
         subtract(rows + r->hess_row[q] * width, r->hessian + q * width, -k[r->hess_column[q]], width);
     solve_rows(r->matrix, r->pivots, rows, n, width);
-}
-
-/* One step into r->yn. Returns the error over the first `rows` unknowns. */
-static double rodas_step(run *r, integer rows)
-{
-    outside(r, r->t, r->t);
-    if (!r->again) {
-        evaluate(r, r->do_jac, r->y, r->jac);
-        if (r->forced)
-            evaluate(r, r->do_ft, r->y, r->ft);
-        if (r->hessians)
-            evaluate(r, r->do_hess, r->y, r->hessian);
-    }
-    int kind = rodas_factor(r);
-    if (kind == 0)
-        return INFINITY;
-    r->evaluations += 8;
-    for (integer stage = 0; stage < 8; stage++) {
-        if (0 < stage && stage < 6) /* the later ones are taken at the same instant as 5 */
-            outside(r, stage == 5 ? r->step_end : r->t + RODAS_TIME[stage] * r->hs, r->t);
-        rodas_prepare(r, stage);
-        double *k = r->k + r->stride * stage;
-        evaluate(r, r->do_rhs, stage ? r->u : r->y, k);
-        if (kind == 1)
-            r->do_solve(r->add, r->hessian, r->w, r->wd, r->factor, r->m, k);
-        else
-            rodas_solve(r, k);
-    }
-    const double *restrict error = r->k + r->stride * 7, *restrict u = r->u;
-    double *restrict yn = r->yn;
-    EACH(i, r->stride)
-        yn[i] = u[i] + error[i];
-    return error_norm(r, error, rows);
 }
 
 /* Write the quartic of the step that ended in r->yn into r->dense. */
@@ -132,4 +105,58 @@ static void rodas_dense(run *r)
         d2[i] = c - b;
         d3[i] = -c;
     }
+}
+
+/* Write into r->e by how much the step's quartic is off at x in 0..1, as its defect tells; leaves its point there in r->u.
+
+   What follows an input at once is right at the end of a step however long that is, and in between only as far as a quartic can be.
+   Needs r->dense and the step's factors. */
+static void rodas_defect(run *r, double x)
+{
+    const double *restrict a = r->dense, *restrict b = a + r->stride, *restrict c = b + r->stride, *restrict d = c + r->stride;
+    const double *restrict mass = r->mass;
+    double *restrict add = r->add, inverse = 1.0 / r->hs;
+    interpolate(r, x, r->size, r->u);
+    EACH(i, r->stride)
+        add[i] = -mass[i] * inverse * (a[i] + x * (2 * b[i] + x * (3 * c[i] + x * 4 * d[i])));
+    outside(r, r->t + x * r->hs, r->t);
+    evaluate(r, r->do_rhs, r->u, r->e);
+    rodas_solve(r, r->e);
+}
+
+/* One step into r->yn. Returns the error over the first `rows` unknowns. */
+static double rodas_step(run *r, integer rows)
+{
+    outside(r, r->t, r->t);
+    if (!r->again) {
+        evaluate(r, r->do_jac, r->y, r->jac);
+        if (r->forced)
+            evaluate(r, r->do_ft, r->y, r->ft);
+        if (r->hessians)
+            evaluate(r, r->do_hess, r->y, r->hessian);
+    }
+    if (!rodas_factor(r))
+        return INFINITY;
+    r->evaluations += 8;
+    for (integer stage = 0; stage < 8; stage++) {
+        if (0 < stage && stage < 6) /* the later ones are taken at the same instant as 5 */
+            outside(r, stage == 5 ? r->step_end : r->t + RODAS_TIME[stage] * r->hs, r->t);
+        rodas_prepare(r, stage);
+        double *k = r->k + r->stride * stage;
+        evaluate(r, r->do_rhs, stage ? r->u : r->y, k);
+        rodas_solve(r, k);
+    }
+    const double *restrict error = r->k + r->stride * 7, *restrict u = r->u;
+    double *restrict yn = r->yn;
+    EACH(i, r->stride)
+        yn[i] = u[i] + error[i];
+    double size = error_norm(r, error, rows);
+    if (r->fresh && size <= 1.0) {
+        /* A step from rest may be much longer than a fast mode, which has still to go where it stays while an input ramps: the
+           quartic begins beside that. Once there it stays there. */
+        rodas_dense(r);
+        rodas_defect(r, 0.1);
+        size = fmax(size, error_norm(r, r->e, rows));
+    }
+    return size;
 }

@@ -68,28 +68,89 @@ static void write_rows(run *r)
     }
 }
 
-/* Add the present step to the history of delayed signals. */
-static void remember(run *r)
+/* Add a step of length h from t to the history of delayed signals; r->nodes holds each source at 0, 1/4, 1/2, 3/4 and 1 of it. */
+static void keep_step(run *r, double t, double h)
 {
-    integer nd = r->nd, width = r->width, rows = 1 + width;
-    for (integer j = 0; j < NODES; j++) {
-        double share = (double)j / (NODES - 1) * (r->step_end - r->t) / r->hs;
-        interpolate(r, share, r->size, r->u);
-        outside(r, fmin(r->t + share * r->hs, r->step_end), r->t);
-        evaluate(r, r->do_sources, r->u, r->src);
-        for (integer i = 0; i < nd; i++) {
-            double *node = r->nodes + (i * NODES + j) * rows;
-            node[0] = r->src[i];
-            for (integer c = 0; c < width; c++)
-                node[1 + c] = r->src[nd + r->nq + i * width + c];
-        }
-    }
-    double *step = r->history + (2 + nd * NODES * rows) * r->kept;
-    step[0] = r->t;
-    step[1] = r->step_end - r->t;
-    for (integer i = 0; i < nd; i++)
+    integer rows = 1 + r->width;
+    double *step = r->history + (2 + r->nd * NODES * rows) * r->kept;
+    step[0] = t;
+    step[1] = h;
+    for (integer i = 0; i < r->nd; i++)
         quartics(r->nodes + i * NODES * rows, step + 2 + i * NODES * rows, rows);
     r->kept++;
+}
+
+/* Write the sources of the delays, each with its rows, `apart` doubles from one to the next, at a share of the present step. */
+static void write_sources(run *r, double share, double *out, integer apart)
+{
+    integer nd = r->nd, width = r->width;
+    interpolate(r, share, r->size, r->u);
+    outside(r, fmin(r->t + share * r->hs, r->step_end), r->t);
+    evaluate(r, r->do_sources, r->u, r->src);
+    for (integer i = 0; i < nd; i++) {
+        out[i * apart] = r->src[i];
+        for (integer c = 0; c < width; c++)
+            out[i * apart + 1 + c] = r->src[nd + r->nq + i * width + c];
+    }
+}
+
+/* The largest difference of the sources in r->nodes from their polynomials at x in 0..1 of a step of the history, over the tolerance.
+
+   Where a parameter moves the delay its row has the quartic's rate, which is off by 27 times the value's error at x = 0.1. */
+static double history_error(const run *r, const double *step, double x)
+{
+    integer rows = 1 + r->width;
+    double worst = 0.0;
+    for (integer i = 0; i < r->nd; i++) {
+        const double *c0 = step + 2 + i * NODES * rows, *c1 = c0 + rows, *c2 = c1 + rows, *c3 = c2 + rows, *c4 = c3 + rows;
+        double rate = (c1[0] + x * (2 * c2[0] + x * (3 * c3[0] + x * 4 * c4[0]))) / step[1], rate_error = 0.0;
+        for (integer j = 0; j < 1 + r->np; j++) {
+            double value = r->nodes[i * rows + j], floor = j ? r->floors[j - 1] : r->atol;
+            double kept = c0[j] + x * (c1[j] + x * (c2[j] + x * (c3[j] + x * c4[j])));
+            worst = fmax(worst, fabs(kept - value) / (floor + r->rtol * fabs(value)));
+            if (j == 0)
+                rate_error = 27.0 / step[1] * fabs(kept - value);
+            else
+                worst = fmax(worst, rate_error / (floor / fabs(r->lag_p[i * r->width + j - 1]) + r->rtol * fabs(rate)));
+        }
+    }
+    return worst;
+}
+
+/* Add the present step from one share to another to the history of delayed signals; returns its error, of the tolerance. */
+static double remember_piece(run *r, double from, double to)
+{
+    integer rows = 1 + r->width;
+    const double *step = r->history + (2 + r->nd * NODES * rows) * r->kept;
+    double worst = 0.0;
+    for (integer j = 0; j < NODES; j++)
+        write_sources(r, from + (to - from) * (double)j / (NODES - 1), r->nodes + j * rows, NODES * rows);
+    keep_step(r, r->t + from * r->hs, (to - from) * r->hs); /* not before: a source may look back too */
+    for (double x = 0.1; x < 1.0; x += 0.8) {
+        write_sources(r, from + (to - from) * x, r->nodes, rows);
+        worst = fmax(worst, history_error(r, step, x));
+    }
+    return worst;
+}
+
+/* Add the present step to the history of delayed signals, in as many pieces as its sources ask for.
+
+   States are quartics over a step; a source is a function of them and of inputs, about which the step's length says nothing. Where it
+   is the corners of an input that are lost, the error falls with the length alone: more pieces would not help. */
+static void remember(run *r)
+{
+    integer before = r->kept;
+    double end = (r->step_end - r->t) / r->hs, coarser[2] = {INFINITY, INFINITY};
+    for (integer pieces = 1; pieces <= PIECES; pieces *= 2) {
+        double part = end / (double)pieces, worst = 0.0;
+        r->kept = before;
+        for (integer j = 0; j < pieces; j++)
+            worst = fmax(worst, remember_piece(r, part * (double)j, part * (double)(j + 1)));
+        if (worst <= 1.0 || worst > 0.2 * coarser[1])
+            return;
+        coarser[1] = coarser[0];
+        coarser[0] = worst;
+    }
 }
 
 /* --- the beginning of a segment --- */
@@ -129,6 +190,8 @@ static bool publish_samples(run *r)
         if (width) {
             evaluate(r, r->do_f, r->y, r->f_after);
             shift_rows(r, r->f_before, r->f_after, r->publish_p + i * width);
+            for (integer c = 0; c < width; c++)
+                r->jump_p[c] = r->publish_p[i * width + c]; /* for what a delay brings back of it */
         }
         r->publish[i] = INFINITY;
         r->published = 1;
@@ -222,7 +285,7 @@ static bool begin_segment(run *r)
 /* The length that changes the states by a hundredth of themselves, in the error's weights, or the last step's if shorter. */
 static void first_step(run *r)
 {
-    double span = r->end - r->start, d0 = 0.0, d1 = 0.0;
+    double span = r->span, d0 = 0.0, d1 = 0.0;
     for (integer i = 0; i < r->nx; i++) {
         double weight = r->atol + r->rtol * fabs(r->y[i]);
         d0 += (r->y[i] / weight) * (r->y[i] / weight);
@@ -238,8 +301,8 @@ static void first_step(run *r)
     r->h = r->h == 0.0 || guess < r->h ? fmin(fmax(guess, 1e-9 * span), 0.1 * span) : fmin(r->h, guess);
 }
 
-/* Set the constants of the segment, the switches' tolerances and the first step's length. */
-static void prepare_segment(run *r)
+/* Set what holds in the whole segment. */
+static void describe_segment(run *r)
 {
     r->segments++;
     bool still = enter_segment(r);
@@ -248,6 +311,11 @@ static void prepare_segment(run *r)
     r->still = still;
     r->quiet = still && r->nd == 0;
     force(r);
+}
+
+/* Set the switches' tolerances and the first step's length. */
+static void prepare_segment(run *r)
+{
     if (r->ns) {
         evaluate(r, r->do_sw, r->y, r->sv);
         for (integer i = 0; i < r->ns; i++) {

@@ -121,7 +121,7 @@ static bool write_rows_at_rest(const steady *e, double *jac, integer *pivots)
    at the solution (0: any); with inf instead of the first, steps are halved until the residual falls. On return rule[1] is the
    sign found. Where undamped corrections at least halve, Kantorovich's condition holds (h <= 1/2 gives h / (2 (1 - h)) <= 1/2,
    Deuflhard 2004, Newton Methods, 2.1): the solution is the one that the start is connected with, no fold lies between. */
-int hvdc_ident_newton(const steady *e, double *rule)
+INTERFACE int hvdc_ident_newton(const steady *e, double *rule)
 {
     integer n = e->n, inner = e->inner, small = 0;
     scratch s;
@@ -295,7 +295,7 @@ static bool advance(const path *a, double share, double ahead, const double *v, 
    method leads back to where the step began, which from another branch it does not. (Corrections that halve on the way there
    show the condition in their own direction only.) Else it is halved. Across a limit, where the equations have a corner, no such
    ratio holds, and a long step may end anywhere: there it has to be short, within which the pieces are as good as straight. */
-int hvdc_ident_continuation(const steady *e, const double *ends_p, const double *ends_w, double *v, double *way)
+INTERFACE int hvdc_ident_continuation(const steady *e, const double *ends_p, const double *ends_w, double *v, double *way)
 {
     integer n = e->n, most = n > e->ns ? n : e->ns;
     scratch s;
@@ -403,7 +403,7 @@ static bool euler_step(const steady *e, slow *a, const double *size, const doubl
 /* Move v (n,) by implicit Euler steps whose length grows as the residual falls, one Newton step each: follow the model.
 
    size (n,): the most that each unknown counts for. 1, or -1: no memory. */
-int hvdc_ident_pseudo_transient(const steady *e, const double *size, double *v)
+INTERFACE int hvdc_ident_pseudo_transient(const steady *e, const double *size, double *v)
 {
     integer n = e->n;
     slow a;
@@ -450,7 +450,7 @@ int hvdc_ident_pseudo_transient(const steady *e, const double *size, double *v)
 
    A loop that rests there is driven to it from both sides: a step that is not solved for goes past the edge, and the next one
    back. Arguments and result as above. */
-int hvdc_ident_implicit_euler(const steady *e, const double *size, double *v)
+INTERFACE int hvdc_ident_implicit_euler(const steady *e, const double *size, double *v)
 {
     integer n = e->n;
     slow a;
@@ -478,7 +478,7 @@ int hvdc_ident_implicit_euler(const steady *e, const double *size, double *v)
 
 /* Write the residual at v (n,) into r (n,), its Jacobian into jac (n, n, zeros before) and what each equation's residual is measured
    by into weights (n,). size (n,): the most that each unknown counts for. */
-void hvdc_ident_judge(const steady *e, const double *size, const double *v, double *r, double *jac, double *weights)
+INTERFACE void hvdc_ident_judge(const steady *e, const double *size, const double *v, double *r, double *jac, double *weights)
 {
     residual(e, v, r);
     jacobian(e, jac);

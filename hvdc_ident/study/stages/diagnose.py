@@ -127,16 +127,20 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The verdict, what is missing, what it changes, and what to measure to be sure."""
     from hvdc_ident.summary import summarise
     from hvdc_ident.summary.screen import lines_of as screen
+    from hvdc_ident.summary.stage_results import diagnosis_of
 
-    if "verdict" not in data:
+    found = diagnosis_of(data)
+    if found is None:
         return [str(data.get("message", ""))]
-    said = f"{data['verdict']}: {data['text']}"
-    return [said, "", *screen(summarise({"discrepancy": data}), more=data["notes"])]
+    return [f"{found.verdict}: {found.text}", "", *screen(summarise({"discrepancy": data}), more=found.notes)]
 
 
 def verdict(data: Mapping[str, Any]) -> str:
     """Return the verdict with its text."""
-    return f"{data['verdict']}: {data['text']}" if "verdict" in data else str(data.get("message", ""))
+    from hvdc_ident.summary.stage_results import diagnosis_of
+
+    found = diagnosis_of(data)
+    return str(data.get("message", "")) if found is None else f"{found.verdict}: {found.text}"
 
 
 STAGE = Stage(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -51,17 +50,15 @@ def _context(
     study: Study, problem: Problem, options: StageOptions, report: IdentifiabilityReport, result: FitResult
 ) -> dict[str, Any]:
     """Return what a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
+    from hvdc_ident.study import fitting
     from hvdc_ident.study.study import candidate_lines
 
     return {
         "forced": [n for n in options.force if n in result.fitted and n not in report.identifiable],
         "candidates": candidate_lines(study),
         "units": {o: e.measured.unit(o) for e in problem.experiments if e.measured is not None for o in e.outputs},
-        "experiments": {
-            e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording}
-            for e in problem.experiments
-        },
-        "noise": {e: {o: asdict(n) for o, n in notes.items()} for e, notes in study.noise.items()},
+        "experiments": {e.name: fitting.context_of(e) for e in problem.experiments},
+        "noise": study.noise,
         "ties": {n: line.tie for n, line in study.settings.parameters.items() if line.tie is not None},
     }
 
@@ -85,8 +82,8 @@ def follow(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str
 
 def lines_of(data: Mapping[str, Any]) -> list[str]:
     """The status and the verdict on the residuals, the values, what is to be said of each, and what to do next."""
-    from hvdc_ident.study.measured_responses import response_lines
     from hvdc_ident.summary import summarise
+    from hvdc_ident.summary.compared_responses import response_lines
     from hvdc_ident.summary.phrases import remarks
     from hvdc_ident.summary.screen import lines_of as screen
     from hvdc_ident.summary.stage_results import Context, fit_of
@@ -98,7 +95,7 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     more = [f"{capital(fit.adequacy.text)}."] if fit.adequacy is not None and fit.adequacy.text else []
     more += [f"{fit.roughness['text']}."] if fit.roughness else []
     more += [f"{n}: {remark}." for n, remark in remarks(fit, about.candidates).items()] + _conditions(fit, about)
-    more += [*response_lines(data.get("responses", ()), "fitted"), *_searched(fit, about)]
+    more += [*response_lines(about.responses, "fitted"), *_searched(fit, about)]
     return [f"{fit.status}: {fit.message}", "", *screen(summarise({"fit": data}), more=more)]
 
 
@@ -123,7 +120,10 @@ def _searched(fit: FitResult, about: Context) -> list[str]:
 
 def verdict(data: Mapping[str, Any]) -> str:
     """Return any doubt about the search, and the fit's status."""
-    return "; ".join(str(part) for part in (data.get("search_doubt"), data["status"]) if part)
+    from hvdc_ident.summary.stage_results import fit_of
+
+    fit = fit_of(data)
+    return "" if fit is None else "; ".join(part for part in (fit.search_doubt, fit.status) if part)
 
 
 STAGE = Stage(

@@ -10,6 +10,7 @@ from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
     from hvdc_ident.linearize import LinearModel
+    from hvdc_ident.linearize.modal import NamedMode
     from hvdc_ident.study.study import Study
     from hvdc_ident.study.value_sets import ValueSet
 
@@ -29,28 +30,31 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     from hvdc_ident.errors import HvdcIdentError
     from hvdc_ident.study.checks import at_given
     from hvdc_ident.study.value_sets import fitted_values, value_set
+    from hvdc_ident.summary.linear import FittedLinear, Linearisation, LinearResult, NoLinearModel
 
-    given = value_set(study, "given")
+    selected = value_set(study, "given")
     with at_given(study):
-        model = linear_model(study, given)
-    data, files = _described(study, model, given, options)
+        model = linear_model(study, selected)
+    fields, files = _described(study, model, selected, options)
+    given = LinearResult(**fields)
     found, why = (None, "") if options.folder is None else fitted_values(study, options.folder)
     if found is None or why:
-        return StageResult({**data, "fitted_note": why}, files)
+        return StageResult(Linearisation(given, None, why).to_dict(), files)
+    fitted: FittedLinear | NoLinearModel
     try:
-        other, more = _described(study, linear_model(study, found), found, options, like=data["modes"])
+        fields, more = _described(study, linear_model(study, found), found, options, like=given.modes)
+        fitted = FittedLinear(**fields, fit=found.fit, diagnosis=found.diagnosis)
+        files |= {f"fitted.{name}": text for name, text in more.items()}
     except HvdcIdentError as e:  # the given model is the answer all the same
-        about = {"values": found.name, "set": found.of, "parameters": dict(found.values)}
-        other, more = {**about, "message": f"no linear model: {e}"}, {}
-    files |= {f"fitted.{name}": text for name, text in more.items()}
-    marks = {"fit": found.fit, "diagnosis": found.diagnosis}
-    return StageResult({**data, "fitted": {**other, **marks}, "fitted_note": found.note}, files)
+        message = f"no linear model: {e}"
+        fitted = NoLinearModel(message, found.name, found.of, dict(found.values), found.fit, found.diagnosis)
+    return StageResult(Linearisation(given, fitted, found.note).to_dict(), files)
 
 
 def _described(
-    study: Study, model: LinearModel, selected: ValueSet, options: StageOptions, like: Sequence[Mapping[str, Any]] = ()
+    study: Study, model: LinearModel, selected: ValueSet, options: StageOptions, like: Sequence[NamedMode] = ()
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """The JSON of one linear model, and its files. like: modes of another one, in whose order its own are listed."""
+    """The fields of the result on one linear model, and its files. like: modes of another one, in whose order its own are listed."""
     from hvdc_ident.linearize import jacobian_error
     from hvdc_ident.study.linear_analysis import MOST_CHANNELS, analyses, modes_of
     from hvdc_ident.study.measured_responses import compared
@@ -60,42 +64,35 @@ def _described(
     assert point is not None
     options.progress(1, 3, "modes and transfer functions")
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
-    data = {
+    fields = {
+        "linear": model,
         "values": selected.name,
         "set": selected.of,
         "parameters": dict(selected.values),
-        **model.to_dict(),
-        "operating_point": point.to_dict(),
         "stable": point.stable,
-        "stability": model.stability().to_dict(),
+        "stability": model.stability(),
         "branch": point.branch,
-        "notes": list(point.notes),
-        "modes": _ordered(modes_of(study, model), like),
-        "transfer_functions": [f.to_dict() for f in functions],
+        "notes": tuple(point.notes),
+        "modes": tuple(_ordered(modes_of(study, model), like)),
+        "transfer_functions": tuple(functions),
         "method": model.provenance["method"],
-        "jacobian_error": jacobian_error(point.model, point, model.output_names),
+        "jacobian_error": jacobian_error(study.model, point, model.output_names),
         "jacobian_check": CHECKS[model.provenance["method"]],
+        "frequency_response": model.bode() if len(functions) <= MOST_CHANNELS else None,
     }
-    if len(functions) <= MOST_CHANNELS:
-        data["frequency_response"] = model.bode().to_dict()
     options.progress(2, 3, "norms, margins, ports and comparisons")
     more, files = analyses(study, model)
-    data |= more
-    if study.responses:
-        data["responses"] = compared(study, {selected.name: selected.values})
-    for key in ("schema", "kind", "model"):
-        data.pop(key, None)
-    return data, files
+    return {**fields, **more, "responses": tuple(compared(study, {selected.name: selected.values}))}, files
 
 
-def _ordered(modes: list[dict[str, Any]], like: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _ordered(modes: list[NamedMode], like: Sequence[NamedMode]) -> list[NamedMode]:
     """The modes, each at the place of the nearest of the others (relative, all together); as they are where counts differ."""
     import numpy as np
     from scipy.optimize import linear_sum_assignment
 
     if len(modes) != len(like) or not modes:
         return modes
-    eigenvalues, others = (np.array([complex(*m["eigenvalue"]) for m in some]) for some in (modes, like))
+    eigenvalues, others = (np.array([m.mode.eigenvalue for m in some]) for some in (modes, like))
     size = np.maximum(np.maximum(np.abs(eigenvalues)[None, :], np.abs(others)[:, None]), np.finfo(float).tiny)
     return [modes[k] for k in linear_sum_assignment(np.abs(others[:, None] - eigenvalues[None, :]) / size)[1]]
 
@@ -127,36 +124,30 @@ def with_model(study: Study, selected: ValueSet) -> Study:
 
 def lines_of(data: Mapping[str, Any]) -> list[str]:
     """At which values the linear models stand; then of each the point, the oscillating modes, margins, ports and the rest."""
-    from hvdc_ident.study.measured_responses import response_lines
-    from hvdc_ident.summary.linear import lines
+    from hvdc_ident.summary.linear import Linearisation, NoLinearModel
     from hvdc_ident.text import listed
 
-    def described(found: Mapping[str, Any], of: str) -> list[str]:
-        return lines(found) + response_lines(found.get("responses", ()), of)
-
-    fitted = data.get("fitted") or {}
-    ends = f"from {listed(data['input_names'])} to {listed(data['output_names'])}"
-    found = [f"{data['model']}, linear model of {len(data['state_names'])} states {ends}", "at the given values:"]
-    found += described(data, "given")
-    if fitted.get("modes"):
-        return [*found, f"at the {data['fitted_note']}:", *described(fitted, "fitted")]
-    if fitted.get("message"):
-        return [*found, f"At the fitted values there is {fitted['message']}."]
-    why = data["fitted_note"]
-    found += [f"There is no linear model at fitted values: {why}. `hvdc-ident fit STUDY` fits it."] if why else []
-    return [*found, "Next: `hvdc-ident export STUDY --to FILE.mat` (.json, .csv, .m) writes A, B, C and D."]
+    found = Linearisation.from_dict(data)
+    model = found.given.linear
+    ends = f"from {listed(model.input_names)} to {listed(model.output_names)}"
+    lines = [f"{model.name}, linear model of {len(model.state_names)} states {ends}", "at the given values:"]
+    lines += found.given.lines
+    if found.at_fitted is not None:
+        return [*lines, f"at the {found.fitted_note}:", *found.at_fitted.lines]
+    why = found.why_none
+    if isinstance(found.fitted, NoLinearModel):
+        return [*lines, f"At the fitted values there is {why}."]
+    lines += [f"There is no linear model at fitted values: {why}. `hvdc-ident fit STUDY` fits it."] if why else []
+    return [*lines, "Next: `hvdc-ident export STUDY --to FILE.mat` (.json, .csv, .m) writes A, B, C and D."]
 
 
 def verdict(data: Mapping[str, Any]) -> str:
     """Return the stability of the operating point, and the least damped mode."""
-    from hvdc_ident.summary.linear import stability
+    from hvdc_ident.summary.linear import Linearisation
 
-    swinging = [m for m in data["modes"] if m["eigenvalue"][1] > 0]
-    least = min(swinging, key=lambda m: m["damping"], default=None)
-    mode = (
-        "" if least is None else f"; least damped mode {least['frequency_hz']:.4g} Hz, {100 * least['damping']:.3g} %"
-    )
-    return f"{stability(data) or 'no states'}{mode}"
+    found = Linearisation.from_dict(data).given
+    least = next((f"; least damped mode {m.mode.frequency_hz:.4g} Hz, {100 * m.mode.damping:.3g} %" for m in found.swinging), "")
+    return f"{found.verdict or 'no states'}{least}"
 
 
 STAGE = Stage(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from hvdc_ident.study.stages import Stage, StageOptions, StageResult
@@ -11,6 +10,8 @@ from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment, Trajectory
     from hvdc_ident.study.study import Study
+    from hvdc_ident.summary.gaps import SignalGap
+    from hvdc_ident.summary.stage_results import ExperimentContext
 
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
@@ -22,11 +23,12 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     from hvdc_ident.study import fitting
     from hvdc_ident.study.checks import at_given, need_experiments
     from hvdc_ident.study.study import candidate_lines
+    from hvdc_ident.summary.gaps import worst_first
 
     need_experiments(study, "simulate")
     table: dict[str, dict[str, float | None]] = {}
-    gaps: list[dict[str, Any]] = []
-    status: dict[str, dict[str, str]] = {}
+    gaps: list[SignalGap] = []
+    experiments: dict[str, ExperimentContext] = {}
     files: dict[str, str] = {}
     curves = {}
     for done, experiment in enumerate(study.experiments):
@@ -35,38 +37,35 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             with at_given(study):
                 one = simulate(study.model, experiment, study.given, partial=True)
         except ComputationError as e:
-            status[experiment.name] = {"status": "failed", "reason": str(e)}
+            experiments[experiment.name] = fitting.context_of(experiment, "failed", str(e))
             for output in experiment.outputs:
                 table.setdefault(output, {})[experiment.name] = None
             continue
         simulated, ended = one.trajectory, one.status == "ended"
-        status[experiment.name] = {"status": one.status, "reason": one.notes.get("end", "")}
+        experiments[experiment.name] = fitting.context_of(experiment, one.status, one.notes.get("end", ""))
         if ended:
             experiment = _until(experiment, simulated.time.size)
         assert experiment.measured is not None  # a study's experiments have outputs
         for output in experiment.outputs:
             comparable = not ended or np.isfinite(experiment.measured[output][experiment.compared]).any()
             gap = _gap(study, experiment, simulated, output) if comparable else None
-            table.setdefault(output, {})[experiment.name] = None if gap is None else gap["rmse"]
+            table.setdefault(output, {})[experiment.name] = None if gap is None else gap.rmse
             gaps += [] if gap is None else [gap]
         if not ended:
             curves[experiment.name] = fitting.curves_of_run(experiment, simulated)
         files[f"simulation.{experiment.name}.csv"] = _comparison_csv(experiment, simulated)
-    failed = [name for name, s in status.items() if s["status"] != "converged"]
+    failed = {name: e.reason for name, e in experiments.items() if e.status != "converged"}
     data = {
         "values": {**study.model.values, **study.given},
         "rmse": table,
         "units": {o: study.model.outputs[o].unit for o in table},
-        "gaps": _worst_first(gaps),
+        "gaps": worst_first(gaps),
         "candidates": candidate_lines(study),
-        "experiments": {
-            e.name: {"role": e.role, "event": e.event, "window": e.window, "recording": e.recording, **status[e.name]}
-            for e in study.experiments
-        },
-        "noise": {e: {o: asdict(n) for o, n in notes.items()} for e, notes in study.noise.items()},
+        "experiments": experiments,
+        "noise": study.noise,
         "judgement": fitting.judgement_of(study, {"given": curves}),
     }
-    return StageResult(data, files, failed=_failures({n: status[n]["reason"] for n in failed}))
+    return StageResult(data, files, failed=_failures(failed))
 
 
 def _failures(reasons: Mapping[str, str]) -> str:
@@ -90,16 +89,12 @@ def _until(experiment: Experiment, rows: int) -> Experiment:
     )
 
 
-def _gap(study: Study, experiment: Experiment, simulated: Trajectory, output: str) -> dict[str, Any]:
-    """Return how far recorded and simulated output are apart over the rows that are compared, in the output's unit.
-
-    rmse: root mean square of recorded - simulated. nrmse: the same over the range that was recorded. noise: standard
-    deviation of the recording's noise, noise_units: the RMSE over it; None where the noise is not known before a fit.
-    largest, at: the difference of largest modulus, and its time in s. Raises StudyError where no row is compared.
-    """
+def _gap(study: Study, experiment: Experiment, simulated: Trajectory, output: str) -> SignalGap:
+    """Return how far recorded and simulated output are apart. Raises StudyError where no row is compared."""
     import numpy as np
 
     from hvdc_ident.fit.residual import compared_rows
+    from hvdc_ident.summary.gaps import SignalGap
 
     rows = compared_rows(experiment, output)
     assert experiment.measured is not None
@@ -109,23 +104,17 @@ def _gap(study: Study, experiment: Experiment, simulated: Trajectory, output: st
     note = study.noise[experiment.name][output]
     noise = note.std if note.source in ("given", "estimated") and note.std > 0.0 else None
     k = int(np.argmax(np.abs(difference)))
-    return {
-        "output": output,
-        "experiment": experiment.name,
-        "unit": study.model.outputs[output].unit,
-        "rmse": rmse,
-        "nrmse": rmse / span if span > 0.0 else None,
-        "noise": noise,
-        "noise_units": None if noise is None else rmse / noise,
-        "largest": float(difference[k]),
-        "at": float(experiment.time[rows][k]),
-    }
-
-
-def _worst_first(gaps: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the gaps from the largest: in units of the noise where every noise is known, else over the recorded range."""
-    by = "noise_units" if all(g["noise_units"] is not None for g in gaps) else "nrmse"
-    return sorted(gaps, key=lambda g: -(g[by] or 0.0))
+    return SignalGap(
+        output,
+        experiment.name,
+        study.model.outputs[output].unit,
+        rmse,
+        rmse / span if span > 0.0 else None,
+        noise,
+        None if noise is None else rmse / noise,
+        float(difference[k]),
+        float(experiment.time[rows][k]),
+    )
 
 
 def _comparison_csv(experiment: Experiment, simulated: Trajectory) -> str:
@@ -145,50 +134,46 @@ ROWS = 12
 """Rows of the table on the screen; what follows is told by its largest."""
 
 
-def worst_of(data: Mapping[str, Any]) -> str:
-    """Return the worst signal with its errors, as a phrase; empty where nothing was compared."""
-    from hvdc_ident.text import figures, quantity
-
-    if not data.get("gaps"):
-        return ""
-    g = data["gaps"][0]
-    over = [f"{figures(100.0 * g['nrmse'], 3)} % of the recorded range"] if g["nrmse"] is not None else []
-    over += [f"{figures(g['noise_units'], 3)} times the noise"] if g["noise_units"] is not None else []
-    return f"{g['output']} in {g['experiment']}, RMSE {', '.join([quantity(g['rmse'], g['unit']), *over])}"
-
-
 def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The question, a table of the errors from the worst signal on, the largest gap, and what to do next."""
     from hvdc_ident.display import Table, rounded
+    from hvdc_ident.summary.stage_results import Context
     from hvdc_ident.text import listed, quantity
 
-    if not data.get("gaps"):
+    about = Context.from_dict(data)
+    gaps, roles = about.gaps, [e.role for e in about.experiments.values()]
+    if not gaps:
         return []
-    gaps, roles = data["gaps"], [e["role"] for e in data["experiments"].values()]
     held = f", {roles.count('holdout')} of them held out" if "holdout" in roles else ""
     recordings = f"{len(roles)} recording{'s' if len(roles) > 1 else ''}{held}"
     found = [f"{data['model']} at its given values against {recordings}:", ""]
     rows = []
     for g in gaps[:ROWS]:
-        percent = None if g["nrmse"] is None else rounded(100.0 * g["nrmse"], 3)
-        noise = None if g["noise_units"] is None else rounded(g["noise_units"], 3)
-        name = (g["output"], g["experiment"], data["experiments"][g["experiment"]]["role"])
-        rows.append((*name, rounded(g["rmse"]), g["unit"], percent, noise))
+        percent = None if g.nrmse is None else rounded(100.0 * g.nrmse, 3)
+        name = (g.output, g.experiment, about.experiments[g.experiment].role)
+        rows.append((*name, rounded(g.rmse), g.unit, percent, rounded(g.noise_units, 3)))
     header = ("output", "recording", "role", "RMSE", "unit", "NRMSE, %", "RMSE/noise")
     found += str(Table(header, tuple(rows)).without_empty()).splitlines()
     found += [f"and {len(gaps) - ROWS} more, with smaller errors"] if len(gaps) > ROWS else []
     g = gaps[0]
-    by = f"{quantity(abs(g['largest']), g['unit'])} {'above' if g['largest'] > 0 else 'below'} the model"
+    by = f"{quantity(abs(g.largest), g.unit)} {'above' if g.largest > 0 else 'below'} the model"
     found += ["", "NRMSE: RMSE over the recorded range of the output."]
-    found += [f"Worst signal: {worst_of(data)}.", f"Its largest gap: the recording is {by} at {g['at']:.6g} s."]
-    names = list(data["candidates"])
-    if names:
-        found.append(f"Next: `hvdc-ident fit STUDY` estimates what the recordings determine of {listed(names)}.")
+    found += [f"Worst signal: {g.text}.", f"Its largest gap: the recording is {by} at {g.at:.6g} s."]
+    if about.candidates:
+        names = listed(about.candidates)
+        found.append(f"Next: `hvdc-ident fit STUDY` estimates what the recordings determine of {names}.")
     else:
         found.append(
             "Next: name what may be estimated in [parameters], NAME = {min = ..., max = ...}; then `hvdc-ident fit STUDY`."
         )
     return found
+
+
+def verdict(data: Mapping[str, Any]) -> str:
+    """Return the worst signal; empty where nothing was compared."""
+    from hvdc_ident.summary.stage_results import Context
+
+    return next((f"worst is {g.text}" for g in Context.from_dict(data).gaps), "")
 
 
 STAGE = Stage(
@@ -200,5 +185,5 @@ STAGE = Stage(
     order=10,
     tell=lines_of,
     told_in_part=True,
-    verdict=lambda data: f"worst is {worst}" if (worst := worst_of(data)) else "",
+    verdict=verdict,
 )

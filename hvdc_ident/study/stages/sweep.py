@@ -116,29 +116,19 @@ def swept_names(tables: Sequence[schema.SweepTable]) -> tuple[Want, ...]:
 
 def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """Return the number of points, the reason of the first that failed, and where the error of each series is smallest."""
-    found: dict[tuple[str, str], list[tuple[float, Mapping[str, float]]]] = {}
-    reason = ""
-    for point in data["points"]:
-        if point["status"] != "done":
-            reason = reason or f"; the first: {point['reason']}"
-            continue
-        for output, line in point["rmse"].items():
-            for experiment, error in line.items():
-                found.setdefault((output, experiment), []).append((error, point["values"]))
-    lines = [f"{data['count']} points of {', '.join(data['parameters'])}, {data['failed']} failed{reason}"]
-    for (output, experiment), each in found.items():
-        (error, values), (largest, _) = min(each, key=lambda e: e[0]), max(each, key=lambda e: e[0])
-        at = ", ".join(f"{n} = {v:.6g}" for n, v in values.items())
-        size = f"{error:.4g} {data['units'].get(output, '')}".rstrip()
-        flat = f"{error:.3g}" == f"{largest:.3g}"
-        said = f"RMSE {size} at every point" if flat else f"smallest RMSE {size}, at {at}"
-        lines.append(f"{output} in {experiment}: {said}")
-    return lines
+    from hvdc_ident.sensitivity import SweepSummary
+
+    found = SweepSummary.from_dict(data)
+    first = f"; the first: {found.failure}" if found.failure else ""
+    return [f"{found.text}, {found.failed} failed{first}", *(series.text for series in found.best)]
 
 
 def verdict(data: Mapping[str, Any]) -> str:
     """Return the number of points and of those that failed."""
-    return f"{data['count']} points of {', '.join(data['parameters'])}, {data['failed'] or 'none'} failed"
+    from hvdc_ident.sensitivity import SweepSummary
+
+    found = SweepSummary.from_dict(data)
+    return f"{found.text}, {found.failed or 'none'} failed"
 
 
 STAGE = Stage(

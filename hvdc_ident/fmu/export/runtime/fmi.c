@@ -13,25 +13,27 @@
 #define GET_DERIVATIVES_TEXT "GetContinuousStateDerivatives"
 #endif
 
-Status report(Instance *i, int good) {
+static void log_error(Instance *i); /* as the version of the standard says */
+
+static Status report(Instance *i, int good) {
     if (good) return fmiOK;
     if (i->logger) log_error(i);
     return fmiError;
 }
 
-int allowed(Instance *i, int phases, Text function) {
+static int allowed(Instance *i, int phases, Text function) {
     if (IN(i->s.phase) & phases) return 1;
     say(i, "%s is not allowed in this state of the FMU", function);
     return 0;
 }
 
-int as_many(Instance *i, size_t n, size_t expected) {
+static int as_many(Instance *i, size_t n, size_t expected) {
     if (n == expected) return 1;
     say(i, "%u values were given or asked for where there are %u", (unsigned)n, (unsigned)expected);
     return 0;
 }
 
-Status no_variables(Instance *i, size_t n) {
+static Status no_variables(Instance *i, size_t n) {
     if (!i) return fmiError;
     if (n == 0) return fmiOK;
     say(i, "all variables of this FMU are of type " REAL_TYPE);
@@ -115,7 +117,7 @@ EXPORT Status STATE(Serialize, )(void *c, void *state, Byte bytes[], size_t size
 EXPORT Status DESERIALIZE(void *c, const Byte bytes[], size_t size, void **state) {
     Instance *i = c;
     if (!i || !state) return fmiError;
-    void *copy = snapshot_read((const char *)bytes, size);
+    void *copy = snapshot_read(c, (const char *)bytes, size);
     if (!copy) {
         say(i, "the bytes are no state of this FMU");
     } else {
@@ -129,10 +131,7 @@ EXPORT Status DESERIALIZE(void *c, const Byte bytes[], size_t size, void **state
 
 EXPORT Status FMI(EnterEventMode)(void *c) {
     CHECK(IN(CONTINUOUS) | IN(EVENT), "EnterEventMode");
-    int good = complete_step(i);
-    i->s.phase = EVENT;
-    i->s.stale = 1;
-    return report(i, good);
+    return report(i, enter_event_mode(i));
 }
 
 EXPORT Status FMI(EnterContinuousTimeMode)(void *c) {
@@ -161,7 +160,7 @@ EXPORT Status FMI(GetContinuousStates)(void *c, double x[], size_t n) {
     CHECK(IN(INITIALIZATION) | RUNNING, "GetContinuousStates");
     Ref refs[SOME(NX)];
     for (int k = 0; k < NX; k++) refs[k] = REF_STATE + (Ref)k;
-    return report(i, as_many(i, n, NX) && get_values(i, refs, NX, x));
+    return report(i, as_many(i, n, NX) && get_by_reference(i, refs, NX, x));
 }
 
 EXPORT Status GET_DERIVATIVES(void *c, double values[], size_t n) {

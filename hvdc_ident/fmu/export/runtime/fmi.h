@@ -58,13 +58,4 @@ typedef const char *Text;
     if (!i) return fmiError;    \
     if (!allowed(i, phases, VERSION_TEXT function)) return report(i, 0)
 
-/* fmi.c */
-Status report(Instance *i, int good);
-Status no_variables(Instance *i, size_t n);
-int allowed(Instance *i, int phases, Text function);
-int as_many(Instance *i, size_t n, size_t expected);
-
-/* fmi2.c, fmi3.c */
-void log_error(Instance *i);
-
 #endif

@@ -17,7 +17,7 @@ typedef struct {
     double nextEventTime;
 } EventInfo;
 
-void log_error(Instance *i) {
+static void log_error(Instance *i) {
     ((Logger)i->logger)(i->environment, i->name, fmiError, "logStatusError", "%s", i->message);
 }
 
@@ -55,12 +55,12 @@ EXPORT Status FMI(EnterInitializationMode)(void *c) {
 
 EXPORT Status FMI(GetReal)(void *c, const Ref refs[], size_t n, double values[]) {
     CHECK(IN(INSTANTIATED) | IN(INITIALIZATION) | RUNNING, "GetReal");
-    return report(i, get_values(i, refs, n, values));
+    return report(i, get_by_reference(i, refs, n, values));
 }
 
 EXPORT Status FMI(SetReal)(void *c, const Ref refs[], size_t n, const double values[]) {
     CHECK(SETTABLE, "SetReal");
-    return report(i, set_values(i, refs, n, values));
+    return report(i, set_by_reference(i, refs, n, values));
 }
 
 /* There are no variables of the other types. */
@@ -130,7 +130,7 @@ EXPORT Status FMI(GetStatus)(void *c, const fmi2StatusKind kind, Status *value) 
 
 EXPORT Status FMI(GetRealStatus)(void *c, const fmi2StatusKind kind, double *value) {
     if (!c || kind != fmi2LastSuccessfulTime) return fmiDiscard;
-    *value = ((Instance *)c)->s.t;
+    *value = ((Instance *)c)->r.t;
     return fmiOK;
 }
 

@@ -4,7 +4,7 @@
 typedef const uint8_t *Binary;
 typedef void (*Logger)(void *, Status, Text, Text);
 
-void log_error(Instance *i) { ((Logger)i->logger)(i->environment, fmiError, "logStatusError", i->message); }
+static void log_error(Instance *i) { ((Logger)i->logger)(i->environment, fmiError, "logStatusError", i->message); }
 
 static Status without(void *c, Text function) {
     Instance *i = c;
@@ -68,12 +68,12 @@ EXPORT Status FMI(EnterInitializationMode)(void *c, bool has_tolerance, double t
 
 EXPORT Status FMI(GetFloat64)(void *c, const Ref refs[], size_t n, double values[], size_t count) {
     CHECK(IN(INSTANTIATED) | IN(INITIALIZATION) | RUNNING, "GetFloat64");
-    return report(i, as_many(i, count, n) && get_values(i, refs, n, values));
+    return report(i, as_many(i, count, n) && get_by_reference(i, refs, n, values));
 }
 
 EXPORT Status FMI(SetFloat64)(void *c, const Ref refs[], size_t n, const double values[], size_t count) {
     CHECK(SETTABLE, "SetFloat64");
-    return report(i, as_many(i, count, n) && set_values(i, refs, n, values));
+    return report(i, as_many(i, count, n) && set_by_reference(i, refs, n, values));
 }
 
 /* There are no variables of the other types. */
@@ -246,6 +246,6 @@ EXPORT Status FMI(DoStep)(void *c, double t, double h, bool no_return, bool *eve
     (void)no_return;
     *event = *terminate = *early = false;
     int good = do_step(i, t, h);
-    *last = i->s.t;
+    *last = i->r.t;
     return report(i, good);
 }

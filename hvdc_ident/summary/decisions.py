@@ -13,6 +13,7 @@ from hvdc_ident.fit.result import Estimate, FitResult
 from hvdc_ident.fit.uncertainty import narrow
 from hvdc_ident.identifiability import Verdict
 from hvdc_ident.next_step import NextStep
+from hvdc_ident.summary.candidate import Candidate
 from hvdc_ident.summary.run_summary import (
     SETS,
     AddedEffect,
@@ -32,7 +33,7 @@ from hvdc_ident.summary.run_summary import (
     SignalError,
     SignalSummary,
 )
-from hvdc_ident.summary.stage_results import NO_ESTIMATES, Candidate, Json, StageResults
+from hvdc_ident.summary.stage_results import NO_ESTIMATES, Json, StageResults
 from hvdc_ident.text import capital, listed, quantity
 
 Swing = Callable[[str, str], float | None]
@@ -218,7 +219,7 @@ def _set(judgement: Judgement, limits: Yardstick, swing: Swing) -> SetSummary:
 
 def _unjudged(about: SignalJudgement, limits: Yardstick) -> str:
     """Return why a signal has no verdict in the limits; "" where the study states no tolerance for it."""
-    return "" if limits == "tolerance" else str(about.windows.get("reason") or "no limit in its unit")
+    return "" if limits == "tolerance" else about.windows.reason or "no limit in its unit"
 
 
 def lines_of(judgement: Judgement) -> Iterable[tuple[str, str, SignalJudgement]]:
@@ -257,7 +258,7 @@ def _signals(
         reason = "no noise is known" if verdict == "not judged" else ""
         if one and by != "noise" and verdict == "not judged":
             reason = _unjudged(one, by) or "the study states no tolerance"
-        role = str((experiments.get(experiment) or {}).get("role") or "fit")
+        role = experiments[experiment].role if experiment in experiments else "fit"
         scales = next(iter(each.values()))
         errors_of = {n: _error(a, limits) for n, a in each.items()}
         line = (units.get(output, ""), scales.noise, scales.tolerance, verdict, reason, errors_of)

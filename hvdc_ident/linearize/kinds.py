@@ -1,0 +1,53 @@
+"""What is asked of every kind of model that has operating points and linear models: one with equations, and an FMU."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from hvdc_ident.linearize.derivatives import Side
+from hvdc_ident.linearize.equilibrium import At
+from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.point import OperatingPoint
+
+
+@dataclass(frozen=True)
+class PointOptions:
+    """What is asked of an operating point, as `find_operating_point` has it."""
+
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    free: Collection[str] = ()
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    guess: Mapping[str, float] = field(default_factory=dict)
+    at: At = "steady"
+    moving: Collection[str] = ()
+    time: float = 0.0
+
+
+@dataclass(frozen=True)
+class LinearOptions:
+    """What is asked of a linear model, as `linearize` has it."""
+
+    inputs: Sequence[str] | None = None
+    outputs: Sequence[str] | None = None
+    pade_order: int | None = None
+    sensitivities: Sequence[str] = ()
+    side: Side = "refuse"
+    descriptor: bool = False
+
+
+class Kind(Protocol):
+    """A model that has operating points, and a linear model at each."""
+
+    def point(self, asked: PointOptions) -> OperatingPoint:
+        """Return an operating point. Raises UnknownNameError, SteadyStateError where there is none."""
+        ...
+
+    def linear(self, point: OperatingPoint, asked: LinearOptions) -> LinearModel:
+        """Return the linear model at a point. Raises UnknownNameError, LinearizationError for what it cannot answer."""
+        ...
+
+    def jacobian_error(self, point: OperatingPoint, outputs: Sequence[str] | None) -> float:
+        """Return how far the Jacobian is off an independent one, of each row's largest entry."""
+        ...
