@@ -256,3 +256,10 @@ def write(folder: Path, text: str) -> Path:
     path = folder / "data.csv"
     path.write_bytes(text.encode())
     return path
+
+
+def test_a_comma_in_a_name_between_blanks_separates_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "blanks.txt"
+    path.write_text("time U(1,2) I\n0 1 2\n1 3 4\n")
+    found = read_waveforms(path)
+    assert found.names == ("U(1,2)", "I") and found["U(1,2)"].tolist() == [1.0, 3.0]

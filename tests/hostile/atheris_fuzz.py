@@ -1,7 +1,7 @@
 """The same kinds of input, spoilt by a fuzzer that watches which lines run; for a night, not for the tests.
 
     pip install atheris
-    python tests/hostile/atheris_fuzz.py csv -max_total_time=3600
+    python -m tests.hostile.atheris_fuzz csv -max_total_time=3600
 
 Everything after the kind is libFuzzer's. It stops at the first input that ends in anything but an InputError, and keeps
 that input in a file of the working folder.
@@ -16,7 +16,7 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["hvdc_ident"]):
-    import fuzz
+    from tests.hostile import fuzz
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 As a test, 500 of every kind (test_fuzz.py). As a program, as many as asked for, where over 5 s or 1 GB is wrong too:
 
-    python tests/hostile/fuzz.py --runs 10000 [--only csv]
+    python -m tests.hostile.fuzz --runs 10000 [--only csv]
 
 Deterministic for a seed; a case that fails is printed with its kind, seed and number, and can be run alone.
 """
