@@ -269,7 +269,7 @@ def test_residual_tests_tell_noise_from_a_missing_effect():
     bad = fit(Problem(simulator, (recorded("e", t, {"y": 0.1}, rest, y=wrong),), free), starts=1)
     test = bad.residual_tests["y"]["e"]
     assert test.ljung_box.p < 1e-3
-    assert test["inputs"]["u"]["p"] < 1e-3
+    assert test.inputs["u"].p < 1e-3
 
 
 def test_slow_residuals_widen_the_interval():

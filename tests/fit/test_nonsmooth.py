@@ -13,7 +13,7 @@ from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.nonsmooth import SLIGHT, roughness, trend_of
 from hvdc_ident.fit.uncertainty import TWO_SIDED
 from hvdc_ident.identifiability.assess import identifiability
-from hvdc_ident.study.checks import violations
+from hvdc_ident.study.plausibility import violations
 from tests.fit.simulators import Closed, decay, parameters, recorded
 
 T = np.linspace(0.0, 3.0, 31)
