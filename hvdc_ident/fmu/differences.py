@@ -32,7 +32,7 @@ Differences = Generator[list[Run], list[Array], Result]
 
 
 @dataclass(frozen=True, eq=False)
-class Line(Generic[Run]):
+class ParameterRuns(Generic[Run]):
     """Runs along one parameter. at: the run at a value of it. value: where the derivative is taken, within [low, high].
 
     size: a typical size of the parameter. middle: (n, outputs), the outputs at the value.
@@ -88,7 +88,7 @@ def noise_of(run: Callable[[float], Run], middle: Array) -> Differences[Run, Arr
     return np.asarray(np.sqrt(np.maximum(square, rounding**2)))
 
 
-def first_difference(line: Line[Run], noise: Array) -> Differences[Run, tuple[Array, DifferenceStep]]:
+def first_difference(line: ParameterRuns[Run], noise: Array) -> Differences[Run, tuple[Array, DifferenceStep]]:
     """Return the derivative, (n, outputs), from two runs or four, and the step for later.
 
     noise: (outputs,). Errors are those of the output with the largest, rms over rows and in its range.
@@ -119,7 +119,7 @@ def first_difference(line: Line[Run], noise: Array) -> Differences[Run, tuple[Ar
     return (yield from difference(line, step)), step
 
 
-def difference(line: Line[Run], step: DifferenceStep) -> Differences[Run, Array]:
+def difference(line: ParameterRuns[Run], step: DifferenceStep) -> Differences[Run, Array]:
     """Return the derivative, (n, outputs), to the order of the step: from one run, or from two."""
     if step.sides == 2:
         return (yield from difference_pair(line, step.h))[0]
@@ -128,7 +128,7 @@ def difference(line: Line[Run], step: DifferenceStep) -> Differences[Run, Array]
     return np.asarray((beside - line.middle) / side)
 
 
-def difference_pair(line: Line[Run], h: float) -> Differences[Run, tuple[Array, Array]]:
+def difference_pair(line: ParameterRuns[Run], h: float) -> Differences[Run, tuple[Array, Array]]:
     """Return first and second derivative from two more runs: on both sides, or on one where a bound is near."""
     value, middle = line.value, line.middle
     if value - h >= line.low and value + h <= line.high:

@@ -16,7 +16,7 @@ from hvdc_ident.fmu.differences import (
     SHORT_STEP,
     SUFFICIENT,
     Differences,
-    Line,
+    ParameterRuns,
     difference,
     difference_pair,
     first_difference,
@@ -92,9 +92,9 @@ class Varied:
             return replace(run, values={**run.values, self.name: value})
         return replace(run, signals=replace(run.signals, values=run.signals.values + value * self.points))
 
-    def line(self, run: RunRequest, middle: Array) -> Line[RunRequest]:
+    def line(self, run: RunRequest, middle: Array) -> ParameterRuns[RunRequest]:
         """Return the runs along it. middle: the outputs at its value."""
-        return Line(lambda value: self.moved(run, value), self.value, self.size, self.low, self.high, middle)
+        return ParameterRuns(lambda value: self.moved(run, value), self.value, self.size, self.low, self.high, middle)
 
 
 @dataclass(frozen=True, eq=False)

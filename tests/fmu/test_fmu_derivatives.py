@@ -11,7 +11,7 @@ from hvdc_ident import find_operating_point, linearize, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError
-from hvdc_ident.fmu.differences import SUFFICIENT, Line, difference, first_difference, noise_of, together
+from hvdc_ident.fmu.differences import SUFFICIENT, ParameterRuns, difference, first_difference, noise_of, together
 from hvdc_ident.linearize import continuation, jacobian_error, point_at
 
 TIME = np.linspace(0.0, 5.0, 251)
@@ -156,7 +156,7 @@ def test_a_step_is_chosen_against_the_noise(noise, low, high):
     level = done(noise_of(lambda k: 2.0 + away * k * 2e-3, middle), runs)
     assert level[0] == pytest.approx(noise, rel=0.3) if noise else level[0] < 1e-12
     wanted = t * np.exp(2.0 * t)
-    line = Line(float, 2.0, 2.0, low, high, middle)
+    line = ParameterRuns(float, 2.0, 2.0, low, high, middle)
     begun, step = done(first_difference(line, level), runs)
     assert len(counted) <= 1 + 6 + 2 and step.sides == 1 and step.error <= SUFFICIENT
     counted.clear()
@@ -177,7 +177,7 @@ def test_noise_asks_for_both_sides():
 
     middle = runs(2.0)
     wanted = t * np.exp(2.0 * t)
-    line = Line(float, 2.0, 2.0, -np.inf, np.inf, middle)
+    line = ParameterRuns(float, 2.0, 2.0, -np.inf, np.inf, middle)
     begun, step = done(first_difference(line, done(noise_of(lambda k: 2.0 + k * 2e-3, middle), runs)), runs)
     assert step.sides == 2 and step.error < 1e-2
     for found in (begun, done(difference(line, step), runs)):
