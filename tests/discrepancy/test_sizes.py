@@ -62,8 +62,8 @@ def test_a_size_that_leaves_no_steady_state_is_left_out():
     found = diagnose(LOOP, data, (FitParameter("T", 0.08, 0.01, 1.0),), effects=["limit", "lag", "gain"])
     assert [(e.effect, e.at) for e in found.effects] == [("limit", ("u",))], found.text
     shown = size_curves(LOOP, data, found)
-    assert shown is not None and shown["chosen"] is not None
-    assert shown["shares"] == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert shown is not None and shown.chosen is not None
+    assert shown.shares == (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def filtered(levels, role, seed):
@@ -95,5 +95,5 @@ def test_a_size_that_the_effect_cannot_have_is_left_out():
     sizes = found.effects[0].parameters
     assert sizes["T2"].value == pytest.approx(0.15, rel=0.05) and sizes["T1"].value < 0.02
     shown = size_curves(LOOP, data, found)
-    assert shown is not None and shown["chosen"] is not None
-    assert shown["parameter"] == "T1" and shown["shares"] == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert shown is not None and shown.chosen is not None
+    assert shown.parameter == "T1" and shown.shares == (0.0, 0.25, 0.5, 0.75, 1.0)

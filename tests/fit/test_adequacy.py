@@ -164,8 +164,8 @@ def test_two_slow_signals_that_have_nothing_to_do_with_each_other_are_not_relate
     """Of independent AR(1) signals of coefficient 0.95 about one pair in twenty has p < 0.05; a copy is seen at its lag."""
     random = np.random.default_rng(11)
     slow = lfilter([1.0], [1.0, -0.95], random.standard_normal((2, 200, 400)), axis=2)
-    found = [cross_correlation(r, u)["p"] for r, u in zip(*slow, strict=True)]
+    found = [cross_correlation(r, u).p for r, u in zip(*slow, strict=True)]
     assert np.mean(np.array(found) < 0.05) < 0.1
     signal = slow[0, 0]
     led = cross_correlation(signal[:-3], signal[3:])  # the input leads by three rows
-    assert led["lag"] == 3 and led["correlation"] == pytest.approx(1.0, abs=0.02) and led["p"] < 1e-6
+    assert led.lag == 3 and led.correlation == pytest.approx(1.0, abs=0.02) and led.p < 1e-6

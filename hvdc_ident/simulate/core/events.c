@@ -38,7 +38,8 @@ static void widen(run *r)
 
    Where a switch is near 0 the point of the dense output is corrected by its defect, and looked at again: while a play is pulled, the
    switch that lets it go is 1e-7 of a speed, and what is pulled is no quartic. exact: the corrected point alone decides; else what
-   either says. */
+   either says. The correction is that of an implicit step of gamma h: before gamma it would reach back behind the step's start, where
+   the point is exact. */
 static integer violation_at(run *r, double share, bool exact)
 {
     interpolate(r, share, r->n, r->u);
@@ -47,7 +48,7 @@ static integer violation_at(run *r, double share, bool exact)
     bool near = exact;
     for (integer k = 0; k < r->ns; k++)
         near = near || fabs(r->sv[k]) < 0.1 * r->top[k];
-    if (!r->rosenbrock || !near || (which != NONE && !exact))
+    if (!r->rosenbrock || share < RODAS_GAMMA || !near || (which != NONE && !exact))
         return which;
     rodas_defect(r, share);
     EACH(i, r->n)
