@@ -27,6 +27,7 @@ from hvdc_ident.cli import app
 from hvdc_ident.errors import StudyError
 from hvdc_ident.next_step import NextStep
 from hvdc_ident.study.export import SSV
+from hvdc_ident.study.stages.linearize import verdict
 from hvdc_ident.study.value_sets import value_set
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.decisions import counting_of
@@ -184,6 +185,8 @@ def test_the_linear_model_is_that_of_the_servo_behind_the_lag(
     fitted = results["linearization"]["fitted"]
     assert (results["linearization"]["set"], fitted["set"], fitted["values"]) == ("given", "effect", "fitted")
     assert "with lag at" in results["linearization"]["fitted_note"]
+    slowest = np.linalg.eigvals(np.array(fitted["A"])).real.max()
+    assert verdict(results["linearization"]).startswith(f"with the effect: stable, rightmost eigenvalue {slowest:.4g} 1/s")
 
 
 @pytest.mark.parametrize(("name", "poles"), [("effect", 3), ("fit", 2), ("fitted", 3), ("given", 2)])

@@ -141,13 +141,17 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     return [*lines, "Next: `hvdc-ident export STUDY --to FILE.mat` (.json, .csv, .m) writes A, B, C and D."]
 
 
+_AT = {"given": "at the given values", "start": "at the start values", "fit": "at the fitted values", "effect": "with the effect"}
+
+
 def verdict(data: Mapping[str, Any]) -> str:
-    """Return the stability of the operating point, and the least damped mode."""
+    """Return the stability of the operating point at the values that count, and the least damped mode there."""
     from hvdc_ident.summary.linear import Linearisation
 
-    found = Linearisation.from_dict(data).given
+    both = Linearisation.from_dict(data)
+    found = both.at_fitted or both.given
     least = next((f"; least damped mode {m.mode.frequency_hz:.4g} Hz, {100 * m.mode.damping:.3g} %" for m in found.swinging), "")
-    return f"{found.verdict or 'no states'}{least}"
+    return f"{_AT[found.set]}: {found.verdict or 'no states'}{least}"
 
 
 STAGE = Stage(
