@@ -27,6 +27,9 @@ enum { EVENT_MODE, CONTINUOUS_TIME_MODE };
 #ifndef AT_TERMINATE
 #define AT_TERMINATE
 #endif
+#ifndef AT_RESET
+#define AT_RESET
+#endif
 #ifndef STEP_EVENT
 #define STEP_EVENT(r) 0
 #endif
@@ -153,12 +156,7 @@ int fmi2SetupExperiment(Instance c, int d, double tol, double t, int e, double e
 int fmi2EnterInitializationMode(Instance c) { AT_ENTER(M->r); return 0; }
 int fmi2ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
 int fmi2Terminate(Instance c) { AT_TERMINATE; return 0; }
-int fmi2Reset(Instance c) {
-#ifdef AT_RESET
-    AT_RESET;
-#endif
-    fresh(M); return 0;
-}
+int fmi2Reset(Instance c) { AT_RESET; fresh(M); return 0; }
 int fmi2GetReal(Instance c, const unsigned *v, size_t n, double *x) { return get(M, v, n, x); }
 int fmi2SetReal(Instance c, const unsigned *v, size_t n, const double *x) { return set(M, v, n, x); }
 int fmi2GetInteger(Instance c, const unsigned *v, size_t n, int *x) { for (size_t i = 0; i < n; i++) x[i] = (int)M->r[v[i]]; return 0; }
@@ -231,12 +229,7 @@ int fmi3EnterInitializationMode(Instance c, bool d, double tol, double t, bool e
 int fmi3ExitInitializationMode(Instance c) { INITIALIZE(M->r); return 0; }
 int fmi3EnterEventMode(Instance c) { NEEDS(CONTINUOUS_TIME_MODE); M->mode = EVENT_MODE; return 0; }
 int fmi3Terminate(Instance c) { AT_TERMINATE; return 0; }
-int fmi3Reset(Instance c) {
-#ifdef AT_RESET
-    AT_RESET;
-#endif
-    fresh(M); return 0;
-}
+int fmi3Reset(Instance c) { AT_RESET; fresh(M); return 0; }
 int fmi3GetFloat64(Instance c, const unsigned *v, size_t n, double *x, size_t m) { return get(M, v, n, x); }
 int fmi3SetFloat64(Instance c, const unsigned *v, size_t n, const double *x, size_t m) { return set(M, v, n, x); }
 int fmi3GetInt32(Instance c, const unsigned *v, size_t n, int *x, size_t m) { for (size_t i = 0; i < n; i++) x[i] = (int)M->r[v[i]]; return 0; }

@@ -94,10 +94,12 @@ def export_fmu(
 def _code(model: Model, experiments: Sequence[Experiment]) -> CModel:
     """Return the model as C, with the slides that runs of the experiments get into, as far as they run."""
     whole = _without_zero_delays(model)
+    if not experiments or not engine_of(whole).structure.sizes.ns:  # without a switch nothing slides
+        return CModel(whole)
     for experiment in experiments:
         with contextlib.suppress(HvdcIdentError):  # such an experiment is no reason not to export the model
             simulate(whole, experiment, outputs=tuple(whole.outputs))
-    return CModel(whole, engine_of(whole).slides if experiments else ())
+    return CModel(whole, engine_of(whole).slides)
 
 
 def _without_zero_delays(model: Model) -> Model:

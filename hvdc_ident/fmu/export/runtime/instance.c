@@ -164,6 +164,14 @@ static void take_inputs(Instance *i)
     outside(r, r->t, i->s.from);
 }
 
+/* Note the present values as those at which the history of model exchange ends. */
+static void end_history(Instance *i)
+{
+    i->s.t_kept = i->r.t;
+    copy(i->s.y_kept, i->r.y, NY);
+    copy(i->s.u_kept, i->r.w + 1, NU);
+}
+
 /* Bring the unknowns up to what was set since; modes are free to change only where an event may happen. */
 static int refresh(Instance *i)
 {

@@ -1,7 +1,7 @@
 /* How an instance gets on: from one communication point to the next, and through the events of model exchange. */
 #include "internal.h"
 
-static double near(double t)
+static double rounding(double t)
 {
     return 1e-13 * fmax(1.0, fabs(t)); /* what rounding alone may keep an importer's instants off ours */
 }
@@ -24,15 +24,21 @@ static bool is_due(const Instance *i)
     return i->s.disturbed || r->first || r->disturbed || r->echo_now || next_due(r) <= r->t;
 }
 
+/* Tell the run where something was set from outside: what delays have as their sources may jump. */
+static void hand_on(Instance *i)
+{
+    if (i->s.disturbed) {
+        i->r.disturbed = 1;
+        i->r.order = 0.0;
+    }
+}
+
 /* Let happen what happens at the present instant. */
 static int pass_event(Instance *i)
 {
     run *r = &i->r;
     State *s = &i->s;
-    if (s->disturbed) {
-        r->disturbed = 1;
-        r->order = 0.0;
-    }
+    hand_on(i);
     s->from = r->t;
     r->end = horizon(i);
     tell_inputs(i, r->t + 1.0);
@@ -82,15 +88,12 @@ static int do_step(Instance *i, double t, double h)
         if (s->slope[k] != 0.0 && !s->slope_given[k])
             set_slope(i, REF_INPUT + (unsigned)k, 0.0);
     r->continued = !is_due(i);
-    if (s->disturbed) {
-        r->disturbed = 1;
-        r->order = 0.0;
-    }
+    hand_on(i);
     r->steps = r->forced_steps = 0;
     r->end = t + h;
     tell_inputs(i, r->end);
     enum status status = run_segments(r);
-    if (status == CONVERGED && next_due(r) <= r->end + near(r->end)) {
+    if (status == CONVERGED && next_due(r) <= r->end + rounding(r->end)) {
         r->end = next_due(r);
         status = run_segments(r);
     }
@@ -143,9 +146,7 @@ static int complete_step(Instance *i)
                                       h * x * left * (left * start_rate[k] - x * end_rate[k]);
     }
     keep_step(r, s->t_kept, h);
-    s->t_kept = r->t;
-    copy(s->y_kept, r->y, NY);
-    copy(s->u_kept, r->w + 1, NU);
+    end_history(i);
 #else
     (void)i;
 #endif
@@ -160,7 +161,7 @@ static int enter_event_mode(Instance *i)
     if (!complete_step(i))
         return 0;
     double due = next_due(r);
-    if (due > r->t && due <= r->t + near(r->t))
+    if (due > r->t && due <= r->t + rounding(r->t))
         r->t = due;
     end_segment(r);
     i->s.phase = EVENT;
@@ -180,7 +181,7 @@ static int update_events(Instance *i, int *has_next, double *next)
         s->disturbed = 1;
     if (!pass_event(i))
         return 0;
-    while (r->tb <= r->t + near(r->t)) { /* instants that rounding alone sets apart are one for the importer */
+    while (r->tb <= r->t + rounding(r->t)) { /* instants that rounding alone sets apart are one for the importer */
         r->t = r->tb;
         end_segment(r);
         if (!pass_event(i))
@@ -200,12 +201,9 @@ static int update_events(Instance *i, int *has_next, double *next)
 
 static int leave_event_mode(Instance *i)
 {
-    State *s = &i->s;
     if (!current(i))
         return 0;
-    s->t_kept = i->r.t;
-    copy(s->y_kept, i->r.y, NY);
-    copy(s->u_kept, i->r.w + 1, NU);
-    s->phase = CONTINUOUS;
+    end_history(i);
+    i->s.phase = CONTINUOUS;
     return 1;
 }

@@ -133,9 +133,8 @@ static int find_start(Instance *i)
         r->ticks[k] = r->pending[k] = 0.0;
     begin_run(r, r->y, r->w);
     r->span = span;
-    s->from = s->t_kept = r->start;
-    copy(s->y_kept, r->y, NY);
-    copy(s->u_kept, r->w + 1, NU);
+    s->from = r->start;
+    end_history(i);
     for (int k = 0; k < NS; k++)
         r->top[k] = 0.0;
     evaluate(r, model_sw, r->y, r->sv);

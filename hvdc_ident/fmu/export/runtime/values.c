@@ -101,7 +101,7 @@ static int set_input(Instance *i, int k, double value)
 {
     State *s = &i->s;
     double change = fabs(value - input_now(s, k, i->r.t));
-    if (change <= (s->slope[k] != 0.0 ? near(value) : 0.0))
+    if (change <= (s->slope[k] != 0.0 ? rounding(value) : 0.0))
         return 1;
     s->u0[k] = value;
     s->t_input[k] = i->r.t;
