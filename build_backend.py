@@ -75,8 +75,7 @@ def build_core() -> None:
 
 def get_requires_for_build_wheel(config_settings: Any = None) -> list[str]:
     """Return what a build needs: ziglang where there is no compiler for it."""
-    own = asked_platform() is None and shutil.which(os.environ.get("CC", "cc"))
-    return build_meta.get_requires_for_build_wheel(config_settings) + ([] if own else ["ziglang>=0.13"])
+    return build_meta.get_requires_for_build_wheel(config_settings) + ([] if compiler() else ["ziglang>=0.13"])
 
 
 get_requires_for_build_editable = get_requires_for_build_wheel

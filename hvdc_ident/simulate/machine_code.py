@@ -14,6 +14,9 @@ from hvdc_ident.data import Array
 from hvdc_ident.simulate.codegen import Function, declarations, function_text
 from hvdc_ident.simulate.graph import Graph
 
+WELL, QUICK = 2, 0
+"""LLVM's efforts."""
+
 
 @cache
 def _target() -> llvm.Target:
@@ -34,14 +37,14 @@ def _machine(effort: int) -> llvm.TargetMachine:
 
 
 @cache
-def _simplifier(effort: int) -> tuple[llvm.ModulePassManager, llvm.PassBuilder]:
+def _simplifier() -> tuple[llvm.ModulePassManager, llvm.PassBuilder]:
     """The pass that simplifies instructions. One for the process: LLVM keeps 10 KiB of each that is made, for ever.
 
     The ready-made pipelines would keep 60 KiB of every module besides.
     """
     passes = llvm.create_new_module_pass_manager()
     passes.add_instruction_combine_pass()
-    return passes, llvm.create_pass_builder(_machine(effort), llvm.create_pipeline_tuning_options(speed_level=effort))
+    return passes, llvm.create_pass_builder(_machine(WELL), llvm.create_pipeline_tuning_options(speed_level=WELL))
 
 
 def _compiled(text: str, well: bool) -> llvm.ExecutionEngine:
@@ -49,16 +52,16 @@ def _compiled(text: str, well: bool) -> llvm.ExecutionEngine:
 
     The graph is free of common parts and its rows are vectors already: little is left for the optimiser.
     """
-    effort = 2 if well else 0
+    effort = WELL if well else QUICK
     module = llvm.parse_assembly(text, llvm.create_context())
     module.verify()
     module.triple = llvm.get_default_triple()
     if well:
-        passes, builder = _simplifier(effort)
+        passes, builder = _simplifier()
         passes.run(module, builder)
     code = bytes(_machine(effort).emit_object(module))
     # An engine keeps its module: with an empty one it takes 0.7 MB, a fifth of what it takes with the text's.
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly("", llvm.create_context()), _machine(0))
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly("", llvm.create_context()), _machine(QUICK))
     engine.set_object_cache(getbuffer_func=lambda _: code)
     engine.finalize_object()
     engine.set_object_cache()  # it has read the code
