@@ -29,7 +29,7 @@ fmu_linear jacobian operating_point linearisation mode delayed_modes delayed_loc
 transfer_function formula impedance response_file export
 """,
     "fmu": """
-archive description piecewise_linear differences fmi instance runner derivatives model_exchange co_simulation experiment_run worker
+archive description piecewise_linear differences fmi instance runner derivatives model_exchange co_simulation worker_run worker
 worker_pool gradients evaluate terminal_effects capabilities model compile export
 """,
 }

@@ -83,7 +83,7 @@ class Varied:
 
     @property
     def label(self) -> str:
-        """What tells it from others of a run."""
+        """Name of the column among those of a run: the parameter, and of a variable's points their digest."""
         return self.name if self.points is None else f"{self.name} {sha256(self.points.tobytes()).hexdigest()}"
 
     def moved(self, run: RunRequest, value: float) -> RunRequest:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -15,10 +16,10 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.fmu.derivatives import PointEvaluation
 from hvdc_ident.fmu.description import Message, Setup
-from hvdc_ident.fmu.experiment_run import ExperimentRun
 from hvdc_ident.fmu.fmi import VariableGroup
 from hvdc_ident.fmu.instance import Instance, Reuse, RunFailed, failure
 from hvdc_ident.fmu.runner import Runner
+from hvdc_ident.fmu.worker_run import ExperimentRun
 from hvdc_ident.parallel.inside import limit_memory, resident, space
 from hvdc_ident.parallel.progress import PROCESS
 
@@ -54,7 +55,7 @@ def serve(connection: Connection, progress: memoryview[float], setup: Setup, lea
     while True:
         request = connection.recv()
         runner.restart_deadline()
-        answer(lambda: _answered(runner, *request))  # noqa: B023 - called at once
+        answer(partial(_answered, runner, *request))
 
 
 def _loaded(instance: Instance) -> Message:

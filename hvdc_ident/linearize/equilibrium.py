@@ -146,7 +146,7 @@ At = Literal["steady", "start"]
 
 @dataclass(frozen=True)
 class PointOptions:
-    """What is asked of an operating point, as `find_operating_point` has it."""
+    """Request for an operating point: the arguments of `find_operating_point`."""
 
     fixed: Mapping[str, float] = field(default_factory=dict)
     free: Collection[str] = ()

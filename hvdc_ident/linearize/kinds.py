@@ -1,4 +1,4 @@
-"""What is asked of every kind of model that has operating points and linear models: one with equations, and an FMU."""
+"""Interface of every kind of model that has operating points and linear models: one with equations, and an FMU."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hvdc_ident.linearize.point import OperatingPoint
 
 @dataclass(frozen=True)
 class LinearOptions:
-    """What is asked of a linear model, as `linearize` has it."""
+    """Request for a linear model: the arguments of `linearize`."""
 
     inputs: Sequence[str] | None = None
     outputs: Sequence[str] | None = None

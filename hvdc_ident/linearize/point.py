@@ -27,7 +27,7 @@ Branch = Literal["own", "unconnected", "other", "trimmed"]
 
 @dataclass(frozen=True)
 class _Judged:
-    """What the JSON of a point has of its limits, and what only its model tells."""
+    """Limits of a point as its JSON holds them, and the stability and notes that only its model tells."""
 
     active_limits: tuple[Limit, ...]
     margins: tuple[Limit, ...]

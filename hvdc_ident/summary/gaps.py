@@ -10,7 +10,7 @@ from hvdc_ident.text import figures, quantity
 
 @dataclass(frozen=True)
 class SignalGap:
-    """How far recorded and simulated output are apart over the rows that are compared, in the output's unit.
+    """Distance of a recorded and a simulated output over the rows that are compared, in the output's unit.
 
     rmse: root mean square of recorded - simulated. nrmse: the same over the range that was recorded. noise: standard
     deviation of the recording's noise, noise_units: the RMSE over it; None where the noise is not known before a fit.

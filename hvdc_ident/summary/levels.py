@@ -1,4 +1,4 @@
-"""What the rows before the events tell, as the results hold it: the noise, and recorded levels against the model's."""
+"""Noise, and recorded levels against the model's, as the rows before the events tell them and the results hold them."""
 
 from __future__ import annotations
 

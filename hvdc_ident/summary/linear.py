@@ -35,7 +35,7 @@ VALUES_SHOWN = 6
 
 @dataclass(frozen=True)
 class Trim:
-    """What a point was trimmed to: outputs and inputs as asked, and what was found for the freed ones."""
+    """Outputs and inputs that a point was trimmed to, as asked, and the values found for the freed ones."""
 
     outputs: Mapping[str, float]
     inputs: Mapping[str, float]
@@ -176,7 +176,7 @@ class LinearResult(Coded):
 
     @property
     def verdict(self) -> str:
-        """Whether the operating point is stable, with its rightmost eigenvalue; empty for a model without modes.
+        """Stability of the operating point in words, with its rightmost eigenvalue; empty for a model without modes.
 
         Of a model with delays the number of its unstable roots comes along, which is what the verdict rests on.
         """

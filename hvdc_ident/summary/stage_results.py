@@ -48,7 +48,7 @@ class Derived:
 
 @dataclass(frozen=True)
 class Context(Coded):
-    """What the JSON of a simulation, an identifiability analysis or a fit has beside its result.
+    """Entries that the JSON of a simulation, an identifiability analysis or a fit has beside its result.
 
     candidates: by name. units: of the outputs. experiments: by name. noise: by experiment and output. gaps: of a simulation, the
     largest first. judgement: of the model with each set of values. derived: what follows from the estimates of a fit. responses:

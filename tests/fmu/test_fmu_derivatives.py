@@ -136,7 +136,7 @@ def test_there_is_no_derivative_by_a_whole_number(fmu):
 
 
 def done(rule, run):
-    """What a rule returns, from runs that are made one by one."""
+    """Return the result of a rule whose runs are made one by one."""
     return together([rule], lambda values: [run(v) for v in values])[0]
 
 

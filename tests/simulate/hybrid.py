@@ -115,7 +115,7 @@ class _Compiled:
 
 @dataclass
 class Point:
-    """What there is at one instant: unknowns, what comes from outside with its rates and rows, rates and rows of the unknowns."""
+    """Values at one instant: unknowns, what comes from outside with its rates and rows, rates and rows of the unknowns."""
 
     z: np.ndarray
     w: np.ndarray
@@ -211,7 +211,7 @@ class Hybrid:
         return value, by_y @ at.rate + by_w @ at.w_rate, by_y @ at.rows + by_w @ at.w_rows + by_p
 
     def outside(self, t, segment):
-        """What comes from outside at t, its rates and its rows; at the segment's ends as seen from the inside."""
+        """Return what comes from outside at t, its rates and its rows; at the segment's ends as seen from the inside."""
         nd, first = self.nd, self.first
         w, rate, rows = np.zeros(first + nd + self.nq), np.zeros(first + nd + self.nq), np.zeros((0, self.k))
         w[0], rate[0] = t, 1.0
@@ -307,7 +307,7 @@ class Hybrid:
         return np.concatenate([y[:nx], rows[:nx].ravel()])
 
     def rests(self, y):
-        """Whether states, unknowns and held values solve the equations of the start, in the modes that they say."""
+        """Return whether states, unknowns and held values solve the equations of the start, in the modes that they say."""
         n, w = self.nx + self.nz, np.zeros(self.first + self.nd + self.nq)
         w[1 : self.first], w[self.first :] = [points[0][1] for points in self.points], y[n:]
         m = np.zeros(self.ns)

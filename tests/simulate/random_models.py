@@ -24,7 +24,7 @@ ALLOWED = 100.0
 """Largest error allowed, of rtol and of the largest value (or derivative): each of some hundreds of steps may add an error of rtol,
 and most of it dies out; between the ends of steps what follows a ramp at once is less exact."""
 BY_DELAY = 30.0
-"""How much more the derivative by a parameter of a delay's time may be off: it has the slope of the delayed signal's dense output."""
+"""Factor of what is allowed for the derivative by a parameter of a delay's time: it has the slope of the delayed signal's dense output."""
 KINDS = ("plain", "plain", "delay", "sampled", "both", "stiff")
 FAST = 2e-4  # s; a shorter time constant makes a model stiff
 
@@ -211,7 +211,10 @@ class Difference:
 
 
 def difference(case, rtol=None):
-    """How far the engine is from the reference, in rtol of the largest value. Raises Undecided where there is nothing to compare."""
+    """Return the distance of the engine from the reference, in rtol of the largest value.
+
+    Raises Undecided where there is nothing to compare.
+    """
     rtol = case.rtol if rtol is None else rtol
     spread = np.random.default_rng(7).uniform(0.0, END, 60)
     time = np.concatenate([[0.0], np.sort(spread), [END]])

@@ -19,7 +19,7 @@ TOLERANCE = 1e-8
 _IN_A_RUN = ("f", "jac", "ft", "sw", "swd", "out", "src", "srcd")
 """Functions that the core calls in every run, as `ModelEquations` names them."""
 _ALIASES = {"rhs": "f", "observe": "out", "sources": "src"}
-"""What else of the core's head they are, where there are no sensitivities."""
+"""Further functions of the core's head, and which of those they are where there are no sensitivities."""
 
 
 @dataclass(frozen=True, eq=False)
