@@ -24,9 +24,9 @@ options result candidates movable nominal prediction hypothesis screen location 
 stand_ins moves known_errors remainder forms size_search search candidate_table classes findings verdict diagnosis
 """,
     "linearize": """
-limits system delays sampling characteristic stability equilibrium plot derivatives point linear_model zeros realisation frequency kinds
-fmu_linear jacobian operating_point linearisation mode delayed_modes delayed_locus modal gain_limits loops reduction distance
-transfer_function formula impedance response_file export
+limits system delays sampling characteristic stability descriptor equilibrium plot derivatives point linear_model zeros frequency
+realisation norms kinds fmu_linear jacobian operating_point linearisation mode delayed_modes modal root_loci gain_limits loops reduction
+distance transfer_function formula impedance response_file export
 """,
     "fmu": """
 archive description piecewise_linear differences fmi instance runner derivatives model_exchange co_simulation worker_run worker

@@ -29,12 +29,14 @@ if TYPE_CHECKING:
         margins,
         plant_and_controller,
     )
-    from hvdc_ident.linearize.modal import RootLocus, named, named_modes, parts_of, root_locus
+    from hvdc_ident.linearize.modal import named, named_modes, parts_of
     from hvdc_ident.linearize.mode import Mode
+    from hvdc_ident.linearize.norms import h2_norm, hinf_norm, linf_norm
     from hvdc_ident.linearize.operating_point import continuation, find_operating_point, point_at
     from hvdc_ident.linearize.point import OperatingPoint
-    from hvdc_ident.linearize.reduction import Reduction, balanced, h2_norm, hinf_norm, linf_norm
+    from hvdc_ident.linearize.reduction import Reduction, balanced
     from hvdc_ident.linearize.response_file import ResponseFile, read_response
+    from hvdc_ident.linearize.root_loci import RootLocus, root_locus
     from hvdc_ident.linearize.transfer_function import TransferFunction
 else:
     __getattr__ = offered(
@@ -50,11 +52,13 @@ else:
             "linear_model": "LinearModel",
             "loops": "Loop LoopMargins Margins loop loop_margins margins plant_and_controller",
             "mode": "Mode",
-            "modal": "RootLocus named named_modes parts_of root_locus",
+            "modal": "named named_modes parts_of",
             "point": "OperatingPoint",
             "operating_point": "continuation find_operating_point point_at",
-            "reduction": "Reduction balanced h2_norm hinf_norm linf_norm",
+            "norms": "h2_norm hinf_norm linf_norm",
+            "reduction": "Reduction balanced",
             "response_file": "ResponseFile read_response",
+            "root_loci": "RootLocus root_locus",
             "transfer_function": "TransferFunction",
         },
     )

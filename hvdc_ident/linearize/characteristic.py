@@ -70,17 +70,17 @@ class Part:
 
         E is as large as at `FARTHEST` left of it, where only states before a delay have roots.
         """
-        return np.stack([*[np.ones_like(s)] * self.nx, *self._of_delays(response, s)], axis=-1)
+        return self._by_row(s, 1.0, self._of_delays(response, s))
 
     def factors_by_s(self, s: Array) -> Array:
         """Return the derivative of the factors by s."""
-        return np.stack([*[np.zeros_like(s)] * self.nx, *self._of_delays(response_by_s, s)], axis=-1)
+        return self._by_row(s, 0.0, self._of_delays(response_by_s, s))
 
     def factors_along(self, s: Array, times: Sequence[Array]) -> Array:
         """Return the derivative of the factors for a derivative of each delay's time, and of its compute time where it has one."""
         slopes = self._of_delays(response_slopes, s)
         moved = [sum(x * t for x, t in zip(by, time, strict=False)) for by, time in zip(slopes, times, strict=True)]
-        return np.stack([*[np.zeros_like(s)] * self.nx, *moved], axis=-1)
+        return self._by_row(s, 0.0, moved)
 
     def pencil(self, s: Array) -> Array:
         """(frequencies, rows, columns) of the matrix whose determinant is the characteristic function."""
@@ -100,6 +100,13 @@ class Part:
     def pencil_along(self, s: Array, matrix: Array, times: Sequence[Array]) -> Array:
         """Return the derivative of the pencil for a derivative of the matrix and of the delays' times."""
         return -self.factors(s)[:, :, None] * matrix - self.factors_along(s, times)[:, :, None] * self.matrix
+
+    def _by_row(self, s: Array, of_states: float, of_delays: Sequence[Array | complex]) -> Array:
+        """Return (frequencies, rows) one number for all states, and those of the delays."""
+        found = np.full((s.size, self.nx + len(of_delays)), of_states, dtype=complex)
+        for k, values in enumerate(of_delays):
+            found[:, self.nx + k] = values
+        return found
 
     def _of_delays(self, function: Callable[[str, float, float, Array], T], s: Array) -> list[T]:
         """Return a function of kind, time, compute time and frequencies for each delay, at the edge of the search left of it."""
@@ -264,12 +271,34 @@ class Part:
                 kept.append(v)
         return np.array([x for v in kept for x in ((v, v.conjugate()) if v.imag else (v,))], dtype=complex)
 
+    def null_vectors(self, root: complex, count: int) -> tuple[Array, Array]:
+        """Return the null vectors of the pencil at a root so many times there: the right ones in columns, the left ones in rows."""
+        pencil = self.pencil(np.array([root]))[0]
+        size = np.abs(pencil)
+        rows = np.where(size.max(axis=1) > 1e-13 * size.max(), size.max(axis=1), 1.0)
+        size = size / rows[:, None]
+        columns = np.where(size.max(axis=0) > 1e-13 * size.max(), size.max(axis=0), 1.0)
+        u, sizes, vh = np.linalg.svd(pencil / rows[:, None] / columns)
+        dimension = max(1, min(count, int((sizes <= 1e-8 * sizes[0]).sum())))
+        right = vh[-dimension:].conj().T / columns[:, None]
+        left = u[:, -dimension:].conj().T / rows
+        return right / np.linalg.norm(right, axis=0), left / np.linalg.norm(left, axis=1)[:, None]
+
     def multiplicity(self, root: complex, others: Array) -> int:
         """Return how many roots lie at one place, by an integral around it."""
         near = np.abs(others - root)
         radius = 0.3 * min(float(near[near > 0].min(initial=np.inf)), 1e-2 * (abs(root) + self.unit))
         around = root + radius * np.exp(2j * np.pi * (np.arange(64) + 0.5) / 64)
         return max(1, round(float((self._logarithmic(around) * (around - root)).mean().real)))
+
+
+VISIBLE = 1e-9
+"""Share of the largest gain of inputs or outputs at which a mode is taken for reached by rounding alone."""
+
+
+def reaches(product: Array, matrix: Array) -> bool:
+    """Return whether a mode's vectors of norm 1, multiplied by the matrix of inputs or outputs, leave more than rounding."""
+    return bool(np.abs(product).max(initial=0.0) > VISIBLE * np.abs(matrix).max(initial=1e-300))
 
 
 def spectral_radius(matrix: Array) -> float:

@@ -10,12 +10,10 @@ from hvdc_ident.errors import LinearizationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.characteristic import Part
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.mode import Mode, kind_of_mode
-from hvdc_ident.linearize.stability import ZERO, Change, Characteristic, sliding_means
+from hvdc_ident.linearize.mode import Mode, damping_of, kind_of_mode
+from hvdc_ident.linearize.stability import ALIKE, Change, Characteristic, reached, sliding_means
 from hvdc_ident.linearize.system import Array
 
-ALIKE = 1e-7
-"""Roots nearer to each other than this share of their size are taken for one of several times."""
 Along = tuple[Array, Sequence[Array]]
 """The change of a part's matrix with a parameter, and of each of its delays' times, s."""
 CONTOUR = 32
@@ -40,21 +38,21 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
             hint="leave its parameters out of the sensitivities, or take a small delay",
         )
     equation = model.characteristic
+    assert isinstance(equation, Characteristic)
     found_roots = equation.roots
     roots = found_roots.values if found_roots.averaged is None else found_roots.averaged
     whole, means = equation.whole, sliding_means(equation)
     names = (*model.state_names[: equation.nx], *(c.name for c in equation.channels))
-    zero = ZERO * max(1.0, float(np.abs(roots).max(initial=0.0)))
     slowest = np.argsort(np.abs(roots), kind="stable")[:means]
     found = []
     for k, root in enumerate(roots):
         apart = np.abs(roots - root) > ALIKE * max(abs(root), 1e-3 * whole.unit)
         place = int((~apart[:k]).sum())  # among the roots that are alike
-        right, left = _vectors(whole, complex(root), int((~apart).sum()))
+        right, left = whole.null_vectors(complex(root), int((~apart).sum()))
         shape = _shape(right, place)
         own = _unknowns(equation, complex(root), whole.unit)
         part = equation.part(own)
-        right_of_own, left_of_own = _vectors(part, complex(root), int((~apart).sum()))
+        right_of_own, left_of_own = part.null_vectors(complex(root), int((~apart).sum()))
         share = np.zeros(len(names))
         share[own] = _participation(part, complex(root), right_of_own, left_of_own)
         radius = 0.3 * float(np.abs(roots - root)[apart].min(initial=whole.unit))
@@ -63,16 +61,18 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
             for name, g in model.gradients.items()
             if g.exact is not None
         }
-        mean = k in slowest and abs(root) <= zero
+        mean = k in slowest and root == 0
         found.append(
             Mode(
                 complex(root),
                 abs(float(root.imag)) / (2 * np.pi),
-                0.0 if abs(root) <= zero else float(-root.real / abs(root)),
+                damping_of(complex(root)),
                 FrozenMap(zip(names, (float(x) for x in share), strict=True)),
                 FrozenMap(zip(names, (complex(x) for x in shape), strict=True)),
                 FrozenMap(slopes),
-                "sliding mean (cancelled by its delay)" if mean else _kind(equation, complex(root), right, left, zero),
+                "sliding mean (cancelled by its delay)"
+                if mean
+                else kind_of_mode(complex(root), *reached(equation, complex(root), (right, left))),
             )
         )
     return tuple(found)
@@ -86,20 +86,6 @@ def _unknowns(equation: Characteristic, root: complex, unit: float) -> Array:
         if (np.abs(values - root) <= ALIKE * max(abs(root), 1e-3 * unit)).any():
             owners.append(places)
     return owners[0] if len(owners) == 1 else np.arange(equation.matrix.shape[0])
-
-
-def _vectors(whole: Part, root: complex, count: int) -> tuple[Array, Array]:
-    """Return the null vectors of the pencil at a root: the right ones in columns, the left ones in rows."""
-    pencil = whole.pencil(np.array([root]))[0]
-    size = np.abs(pencil)
-    rows = np.where(size.max(axis=1) > 1e-13 * size.max(), size.max(axis=1), 1.0)
-    size = size / rows[:, None]
-    columns = np.where(size.max(axis=0) > 1e-13 * size.max(), size.max(axis=0), 1.0)
-    u, sizes, vh = np.linalg.svd(pencil / rows[:, None] / columns)
-    dimension = max(1, min(count, int((sizes <= 1e-8 * sizes[0]).sum())))
-    right = vh[-dimension:].conj().T / columns[:, None]
-    left = u[:, -dimension:].conj().T / rows
-    return right / np.linalg.norm(right, axis=0), left / np.linalg.norm(left, axis=1)[:, None]
 
 
 def _participation(part: Part, root: complex, right: Array, left: Array) -> Array:
@@ -138,10 +124,3 @@ def _slope(
     count = np.trace(np.linalg.solve(pencil, slope), axis1=1, axis2=2) @ (around - root)
     moved = np.trace(np.linalg.solve(pencil, change), axis1=1, axis2=2) @ (around - root)
     return complex(-moved / count)
-
-
-def _kind(equation: Characteristic, root: complex, right: Array, left: Array, zero: float) -> str:
-    """Return the kind of a mode that is not a sliding mean."""
-    driven = np.abs(left @ equation.given).max(initial=0.0) > 1e-9 * np.abs(equation.given).max(initial=1e-300)
-    seen = np.abs(equation.read @ right).max(initial=0.0) > 1e-9 * np.abs(equation.read).max(initial=1e-300)
-    return kind_of_mode(root, zero, bool(driven), bool(seen))

@@ -42,23 +42,6 @@ def jacobian_at(
     return modes, jac
 
 
-def state_matrix(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Array:
-    """Return A, (states, states), of a model without delays at a point given by its vectors, without states that never move.
-
-    Raises as `linearize` does.
-    """
-    reduced = without_unknowns(s.layout, jacobian_at(model, s, y, w, p)[1], [], ())
-    if reduced.condition > WELL_POSED:
-        raise LinearizationError(
-            "the algebraic part is ill-conditioned",
-            where=f"model '{model.name}'",
-            got=f"condition number {reduced.condition:.2g}",
-            hint="use linearize(), which keeps it as a descriptor",
-        )
-    n, constant = s.layout.nx, [s.states.index(k) for k in constants(model)]
-    return np.delete(np.delete(reduced.result[:n, :n], constant, 0), constant, 1)
-
-
 def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array) -> Characteristic:
     """Return the characteristic equation at a point given by its vectors, delays exact, with all inputs and outputs.
 
@@ -67,6 +50,13 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
     found = channels(model, s, p)
     closed = [k for k, c in enumerate(found) if c.total == 0.0]
     reduced = without_unknowns(s.layout, jacobian_at(model, s, y, w, p)[1], list(range(s.layout.nu)), closed)
+    if reduced.condition > WELL_POSED:
+        raise LinearizationError(
+            "the algebraic part is ill-conditioned",
+            where=f"model '{model.name}'",
+            got=f"condition number {reduced.condition:.2g}",
+            hint="use linearize(), which keeps it as a descriptor",
+        )
     return Characteristic.of(reduced, s.layout.nx, tuple(c for c in found if c.total > 0.0))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
@@ -11,12 +11,11 @@ from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.frequency import followed, transfer, wide_omega
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.realisation import on_axis, visible
-from hvdc_ident.linearize.reduction import Peak, difference, hankel, linf_norm, peak_over, same_channels
-from hvdc_ident.linearize.stability import ZERO, Characteristic, Stability, sliding_means, stability
+from hvdc_ident.linearize.norms import Peak, largest_gain, linf_norm, peak_over
+from hvdc_ident.linearize.realisation import approximate_visible, difference, same_channels, visible
+from hvdc_ident.linearize.reduction import hankel
+from hvdc_ident.linearize.stability import Characteristic, poles_of_transfer, stability
 from hvdc_ident.linearize.system import Array
-
-StateSpace = tuple[Array, Array, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -75,48 +74,13 @@ def winding_count(first: LinearModel, second: LinearModel) -> int:
     hidden from inputs or outputs do not belong to the transfer functions and are left out. Raises LinearizationError
     where the number of a model's unstable poles is not known or infinite, or the determinant has no limit at high frequency.
     """
-    one, two = _equation(first), _equation(second)
+    one, two = visible(first), visible(second)
     through = np.eye(one.through.shape[1]) + two.through.T @ one.through
     if np.linalg.cond(through) > 1e12:
         return 1_000_000
-    (right1, axis1), (right2, axis2) = (_poles_of(e, m) for e, m in ((one, first), (two, second)))
-    if one.channels or two.channels:
-        winding = _wound(one, two, through, np.concatenate([axis1, axis2]).imag)
-    else:
-        winding = _zeros_less_poles(one, two, through)
-    return winding + right1 - right2 - axis2.size
-
-
-def _poles_of(equation: Characteristic, model: LinearModel) -> tuple[int, Array]:
-    """Return the number of poles right of the axis and those on it, sliding means left out."""
-    if not equation.channels:
-        return _right_and_on_axis(equation.matrix)
-    roots = equation.roots
-    if roots.unstable is None or np.isinf(roots.unstable):
-        raise LinearizationError(
-            "the number of unstable poles is not known", where=f"linear model '{model.name}'", got=roots.reason
-        )
-    nearest = roots.values[np.argsort(np.abs(roots.values.real), kind="stable")[: roots.axis]]
-    return int(roots.unstable), nearest[np.argsort(np.abs(nearest), kind="stable")[sliding_means(equation) :]]
-
-
-def _zeros_less_poles(one: Characteristic, two: Characteristic, through: Array) -> int:
-    """Return the zeros less the poles of det(1 + P2~ P1) right of the axis, without delays: from eigenvalues."""
-    # P2~(s) = P2(-s)^T, in series behind P1, with unit negative feedback.
-    at, bt, ct, dt = -two.matrix.T, -two.read.T, two.given.T, two.through.T
-    series_a = np.block([[one.matrix, np.zeros((one.nx, two.nx))], [bt @ one.read, at]])
-    series_b = np.concatenate([one.given, bt @ one.through])
-    series_c = np.concatenate([dt @ one.read, ct], axis=1)
-    closed = series_a - series_b @ np.linalg.solve(through, series_c)
-    right = [_right_and_on_axis(a)[0] for a in (closed, one.matrix, at)]
-    return right[0] - right[1] - right[2]
-
-
-def _right_and_on_axis(a: Array) -> tuple[int, Array]:
-    """Return the number of eigenvalues right of the imaginary axis, and those on it."""
-    values = np.linalg.eigvals(a).astype(complex)
-    axis = on_axis(values, a)
-    return int(((values.real > 0) & ~axis).sum()), values[axis]
+    right1, axis1 = poles_of_transfer(one, f"linear model '{first.name}'")
+    right2, axis2 = poles_of_transfer(two, f"linear model '{second.name}'")
+    return _wound(one, two, through, np.concatenate([axis1, axis2]).imag) + right1 - right2 - axis2.size
 
 
 BESIDE = 1e-4
@@ -141,7 +105,7 @@ def _wound(one: Characteristic, two: Characteristic, through: Array, axis: Array
         return value, turned * value, np.zeros(value.shape)
 
     sizes = np.abs(np.concatenate([one.roots.values, two.roots.values]))
-    sizes = sizes[sizes > ZERO * max(1.0, float(sizes.max(initial=0.0)))] if sizes.size else np.ones(1)
+    sizes = sizes[sizes > 0.0]
     near, far = BESIDE * float(sizes.min(initial=1.0)), 1e9 * float(sizes.max(initial=1.0))
     path = [near + 0j, 1j * near]
     axis = np.unique(axis[axis > near])
@@ -165,27 +129,6 @@ def _wound(one: Characteristic, two: Characteristic, through: Array, axis: Array
     return round(turns)
 
 
-def _graph(model: LinearModel) -> StateSpace:
-    """A, B, C, D of the normalised right coprime factors [M; N], from the Riccati equation (Vidyasagar 1988)."""
-    a, b, c, d = visible(model)
-    m = b.shape[1]
-    r = np.eye(m) + d.T @ d
-    root = np.linalg.inv(np.real(scipy.linalg.sqrtm(r)))
-    if a.shape[0] == 0:
-        return a, b @ root, np.zeros((m + c.shape[0], 0)), np.vstack([root, d @ root])
-    try:
-        x = scipy.linalg.solve_continuous_are(a, b, c.T @ c, r, s=c.T @ d)
-    except np.linalg.LinAlgError as e:
-        raise LinearizationError(
-            "the Riccati equation of the plant's normalised coprime factors has no solution",
-            where=f"linear model '{model.name}'",
-            got=str(e),
-            hint="reduce the model first (`reduce`), or scale its inputs and outputs",
-        ) from None
-    f = -np.linalg.solve(r, d.T @ c + b.T @ x)
-    return a + b @ f, b @ root, np.vstack([f, c + d @ f]), np.vstack([root, d @ root])
-
-
 # --- the margin ---
 
 
@@ -198,9 +141,7 @@ def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Pea
     `nu_gap`. Raises LinearizationError where the sizes do not fit, or the loop is ill-posed.
     """
     if controller is None:
-        a, b, c, _ = _graph(plant)
-        values = hankel(a, b, c)[0] if a.shape[0] else np.zeros(1)
-        return Peak(float(np.sqrt(max(1.0 - float(values[0]) ** 2, 0.0))), float("nan"))
+        return Peak(_attainable(plant), float("nan"))
     outputs, inputs = len(plant.output_names), len(plant.input_names)
     if (len(controller.output_names), len(controller.input_names)) != (inputs, outputs):
         raise LinearizationError(
@@ -209,77 +150,62 @@ def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Pea
             expected=f"a controller of {outputs} inputs and {inputs} outputs",
             got=f"{len(controller.input_names)} inputs and {len(controller.output_names)} outputs",
         )
-    closed = _four_blocks(plant, controller)
-    if plant.exact is None and controller.exact is None:
-        poles = closed.poles()
-        if (poles.real >= 0).any():
-            return Peak(0.0, float(abs(poles[np.argmax(poles.real)].imag)))
-        peak = linf_norm(closed)
-    else:
-        found = _closed_with_delays(plant, controller)
-        if found.verdict != "stable":
-            return Peak(0.0, float("nan") if found.rightmost is None else abs(found.rightmost.imag))
-        peak = _exact_peak(plant, controller)
-    return Peak(1.0 / peak.value, peak.omega)
-
-
-def _four_blocks(plant: LinearModel, controller: LinearModel) -> LinearModel:
-    """[I; C] (I + P C)^-1 [I, P] in state space: v = w1 + P (w2 - C v), seen as v and C v."""
-    a1, b1, c1, d1 = visible(plant)
-    a2, b2, c2, d2 = visible(controller)
-    p, m, n1, n2 = c1.shape[0], b1.shape[1], a1.shape[0], a2.shape[0]
-    loop = np.block([[np.eye(p), d1], [-d2, np.eye(m)]])
-    if np.linalg.cond(loop) > 1e12:
-        raise LinearizationError("the loop is ill-posed: I + D_P D_C is singular", where=f"'{plant.name}'")
-    # [v; C v] from the states and [w1; w2].
-    right = np.block([[c1, np.zeros((p, n2)), np.eye(p), d1], [np.zeros((m, n1)), c2, np.zeros((m, p + m))]])
-    seen = np.linalg.solve(loop, right)
-    v, cv = seen[:p], seen[p:]
-    drive = np.concatenate([np.zeros((m, n1 + n2 + p)), np.eye(m)], axis=1) - cv
-    rates = np.concatenate([b1 @ drive, b2 @ v])
-    rates[:n1, :n1] += a1
-    rates[n1:, n1 : n1 + n2] += a2
-    n = n1 + n2
-    return plant.with_matrices(
-        rates[:, :n], rates[:, n:], seen[:, :n], seen[:, n:],
-        input_names=tuple(f"w{k + 1}" for k in range(p + m)), input_units=(), u0=(0.0,) * (p + m),
-        output_names=tuple(f"z{k + 1}" for k in range(p + m)), output_units=(), y0=(0.0,) * (p + m),
-        point=None, name=f"loop of {plant.name} and {controller.name}",
-    )  # fmt: skip
-
-
-def _closed_with_delays(plant: LinearModel, controller: LinearModel) -> Stability:
-    """Return whether plant and controller are stable together, delays exact. Raises LinearizationError where it cannot be told."""
-    both = _equation(plant).beside(_equation(controller))
-    p, m = len(plant.output_names), len(plant.input_names)
-    # The plant's inputs are the controller's outputs with a negative sign, and the controller's inputs the plant's outputs.
-    feedback = np.block([[np.zeros((m, p)), -np.eye(m)], [np.eye(p), np.zeros((p, m))]])
-    found = stability(both.fed_back(feedback))
+    closed = _four_blocks(visible(plant), visible(controller), f"'{plant.name}' with '{controller.name}'")
+    found = stability(closed)
     if found.verdict == "not decided":
         raise LinearizationError(
             "whether the loop is stable cannot be told",
             where=f"'{plant.name}' with '{controller.name}'",
             got=found.reason,
         )
-    return found
+    if found.verdict != "stable":
+        return Peak(0.0, float("nan") if found.rightmost is None else abs(found.rightmost.imag))
+    grid = np.unique(np.concatenate([wide_omega(m, 4000 if closed.channels else 400) for m in (plant, controller)]))
+    peak = largest_gain(closed, grid)
+    return Peak(1.0 / peak.value, peak.omega)
 
 
-def _equation(model: LinearModel) -> Characteristic:
-    if model.exact is not None:
-        return model.characteristic.visible()
-    return Characteristic.rational(*visible(model))
+def _attainable(plant: LinearModel) -> float:
+    """Return the largest margin of any controller: from the Hankel norm of the normalised right coprime factors [M; N].
+
+    The factors are those of the Riccati equation (Vidyasagar 1988), delays in their Pade form.
+    """
+    found = approximate_visible(plant)
+    a, b, c, d = found.matrices
+    if found.nx == 0:
+        return 1.0
+    m = b.shape[1]
+    r = np.eye(m) + d.T @ d
+    try:
+        x = scipy.linalg.solve_continuous_are(a, b, c.T @ c, r, s=c.T @ d)
+        f = -np.linalg.solve(r, d.T @ c + b.T @ x)
+        root = np.linalg.inv(np.real(scipy.linalg.sqrtm(r)))
+        norm = float(hankel(a + b @ f, b @ root, np.vstack([f, c + d @ f]))[0][0])
+        if not norm <= 1.0:
+            raise np.linalg.LinAlgError(f"the Hankel norm of the factors, below 1, comes out as {norm:.6g}")
+    except np.linalg.LinAlgError as e:
+        raise LinearizationError(
+            "the Riccati equation of the plant's normalised coprime factors is not solved",
+            where=f"linear model '{plant.name}'",
+            got=str(e),
+            hint="reduce the model first (`reduce`), or scale its inputs and outputs",
+        ) from None
+    return float(np.sqrt(1.0 - norm**2))
 
 
-def _exact_peak(plant: LinearModel, controller: LinearModel) -> Peak:
-    """Return the peak of the four blocks on a grid and beside its maximum, delays exact."""
-
-    def blocks(w: Array) -> Array:
-        p, c = transfer(plant, 1j * w), transfer(controller, 1j * w)
-        eye = np.broadcast_to(np.eye(p.shape[1]), (w.size, p.shape[1], p.shape[1]))
-        middle = np.linalg.solve(eye + p @ c, np.concatenate([eye, p], axis=2))
-        return np.linalg.svd(np.concatenate([middle, c @ middle], axis=1), compute_uv=False)[:, 0]
-
-    return peak_over(blocks, np.unique(np.concatenate([wide_omega(m, 4000) for m in (plant, controller)])))
+def _four_blocks(plant: Characteristic, controller: Characteristic, where: str) -> Characteristic:
+    """Return [I; C] (I + P C)^-1 [I, P]: v = w1 + P (w2 - C v), seen as v and C v. Raises LinearizationError for an ill-posed loop."""
+    p, m = plant.through.shape
+    both = plant.beside(controller)
+    # The plant's inputs are w2 less the controller's outputs, the controller's inputs w1 and the plant's outputs.
+    feedback = np.block([[np.zeros((m, p)), -np.eye(m)], [np.eye(p), np.zeros((p, m))]])
+    if np.linalg.cond(np.eye(p + m) - both.through @ feedback) > 1e12:
+        raise LinearizationError("the loop is ill-posed: I + D_P D_C is singular", where=where)
+    swapped = np.block([[np.zeros((m, p)), np.eye(m)], [np.eye(p), np.zeros((p, m))]])
+    closed = both.fed_back(feedback).between(swapped, np.eye(p + m))
+    through = closed.through.copy()
+    through[:p, :p] += np.eye(p)  # v is the plant's output and w1
+    return replace(closed, through=through)
 
 
 @dataclass(frozen=True)

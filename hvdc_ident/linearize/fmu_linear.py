@@ -25,6 +25,7 @@ from hvdc_ident.linearize.kinds import LinearOptions
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.stability import EPS
 from hvdc_ident.linearize.system import Array, Layout
 from hvdc_ident.model import External
 
@@ -133,6 +134,7 @@ class LinearFmu:
             name=model.name,
             provenance=FrozenMap(notes),
             gradients=FrozenMap({n: LinearFmu(model)._gradient(point, n, ins, outs) for n in asked.sensitivities}),
+            error=EPS if p.directional.all() else max(EPS, p.error),
         )  # fmt: skip
 
     def jacobian_error(self, point: OperatingPoint, outputs: Sequence[str] | None) -> float:

@@ -12,8 +12,9 @@ from hvdc_ident.codec import read_fields
 from hvdc_ident.display import Shown, Table, data_frame, first_rows
 from hvdc_ident.errors import LinearizationError, unknown_name
 from hvdc_ident.linearize import plot
-from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles, gradient_of
-from hvdc_ident.linearize.stability import ZERO
+from hvdc_ident.linearize.descriptor import Descriptor
+from hvdc_ident.linearize.linear_model import LinearModel, gradient_of
+from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:
@@ -147,9 +148,7 @@ def transfer(model: LinearModel, s: Array) -> Array:
     """
     s = np.atleast_1d(np.asarray(s, dtype=complex))
     try:
-        if model.exact is not None:
-            return model.exact.response(s)
-        return np.asarray(model.C @ np.linalg.solve(*_pencil(model, s)) + model.D)
+        return model.equation.response(s)
     except np.linalg.LinAlgError:
         raise LinearizationError(
             "a frequency lies exactly on a pole", where=f"linear model '{model.name}'", hint="leave this frequency out"
@@ -159,14 +158,6 @@ def transfer(model: LinearModel, s: Array) -> Array:
 def response(model: LinearModel, omega: Array | Sequence[float]) -> Array:
     """Return (frequencies, outputs, inputs) complex transfer matrix at omega in rad/s, delays exact."""
     return transfer(model, 1j * np.atleast_1d(np.asarray(omega, dtype=float)))
-
-
-def _pencil(model: LinearModel, s: Array) -> tuple[Array, Array]:
-    """Return P(s), (points, rows, rows), and F(s), (points, rows, inputs), of G = C P^-1 F + D."""
-    if model.exact is not None:
-        return model.exact.pencil(s)
-    drive = np.broadcast_to(model.B.astype(complex), (s.size, *model.B.shape))
-    return s[:, None, None] * model.E - model.A, drive
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,9 +174,9 @@ class _Resolved:
     rounding: Array
 
     @classmethod
-    def of(cls, model: LinearModel, s: Array) -> _Resolved:
-        pencil, drive = _pencil(model, s)
-        read, through = (model.C, model.D) if model.exact is None else (model.exact.read, model.exact.through)
+    def of(cls, equation: Characteristic | Descriptor, s: Array) -> _Resolved:
+        pencil, drive = equation.pencil(s)
+        read, through = equation.read, equation.through
         right = _refined(pencil, drive)
         seen = np.broadcast_to(read.T.astype(complex), (s.size, *read.T.shape))
         left = np.swapaxes(_refined(np.swapaxes(pencil, 1, 2), seen), 1, 2)
@@ -227,8 +218,8 @@ def wide_omega(model: LinearModel, points: int = 400) -> Array:
 
 
 def _poles_apart_from_0(model: LinearModel) -> Array:
-    poles = approximate_poles(model)
-    return poles[np.abs(poles) > ZERO * max(1.0, float(np.abs(poles).max(initial=0.0)))]
+    poles = model.approximate.roots.values
+    return poles[poles != 0]
 
 
 def _around(poles: Array, ends: Array, decades: float, points: int) -> Array:
@@ -275,11 +266,10 @@ Sloped = Callable[[Array], tuple[Array, Array, Array]]
 
 def by_s(model: LinearModel, s: Array) -> tuple[Array, Array, Array]:
     """Return the response at complex frequencies, its derivative by s and a bound on its rounding errors; delays exact."""
-    found = []
+    found, equation = [], model.equation
     for part in np.array_split(s, 1 + s.size * model.A.size // 2_000_000):
-        at = _Resolved.of(model, part)
-        slope = at.along(model.E, 0.0) if model.exact is None else at.along(*model.exact.pencil_by_s(part))
-        found.append((at.values, slope, at.rounding))
+        at = _Resolved.of(equation, part)
+        found.append((at.values, at.along(*equation.pencil_by_s(part)), at.rounding))
     values, slopes, rounding = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return values, slopes, rounding
 
@@ -328,7 +318,7 @@ def followed_phase(at: Sloped, model: LinearModel, omega: Array) -> Array:
     model: the one it is made of, whose resonances are looked at. A channel that is 0 has 0.
     """
     rising, place = np.unique(omega, return_inverse=True)
-    w = np.unique(np.concatenate([rising, _resonances(approximate_poles(model), rising[0], rising[-1])]))
+    w = np.unique(np.concatenate([rising, _resonances(model.approximate.roots.values, rising[0], rising[-1])]))
     s, change = followed(at, 1j * w)
     angle = np.angle(at(1j * rising)[0])
     turned = np.concatenate([angle[:1], angle[:1] + np.cumsum(change.imag, axis=0)])[np.searchsorted(s.imag, rising)]
@@ -390,12 +380,7 @@ def sensitivity(
     w = _checked(omega)
     s = 1j * w
     names = list(model.gradients) if parameters is None else list(parameters)
-    at = _Resolved.of(model, s)
-    found = {}
-    for name in names:
-        g = gradient_of(model, name)
-        if model.exact is not None and g.exact is not None:
-            found[name] = at.along(*model.exact.pencil_along(s, g.exact), g.exact.read, g.exact.through)
-        else:
-            found[name] = at.along(-g.A, g.B, g.C, g.D)
-    return found
+    equation = model.equation
+    at = _Resolved.of(equation, s)
+    changes = {name: gradient_of(model, name).change for name in names}
+    return {n: at.along(*equation.pencil_along(s, c), c.read, c.through) for n, c in changes.items()}

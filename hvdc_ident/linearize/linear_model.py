@@ -8,21 +8,21 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import scipy.linalg
 
 from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, ModelError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.lazy import method
 from hvdc_ident.linearize.delays import eliminate
+from hvdc_ident.linearize.descriptor import Descriptor
 from hvdc_ident.linearize.point import OperatingPoint
-from hvdc_ident.linearize.stability import Change, Characteristic
+from hvdc_ident.linearize.stability import EPS, Change, Characteristic
 from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:
     import control
 
-    from hvdc_ident.linearize import export, frequency, loops, modal, plot, reduction, transfer_function, zeros
+    from hvdc_ident.linearize import export, frequency, loops, modal, norms, plot, reduction, transfer_function, zeros
 
 
 Exact = TypeVar("Exact", Change, Characteristic)
@@ -41,13 +41,19 @@ class Gradient:
     D: Array
     exact: Change | None = None
 
+    @property
+    def change(self) -> Change:
+        """The derivatives of the model's equation: with its exact delays where it has any."""
+        return Change(self.A, self.B, self.C, self.D, ()) if self.exact is None else self.exact
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LinearModel(Shown):
     """E x' = A x + B u, y = C x + D u: deviations from the operating point, in the model's units, time in s.
 
     E is the identity unless the algebraic part had to stay. gradients: derivatives by parameter name. exact: the model
-    before its delays were approximated, where it has any: what frequency responses and stability rest on.
+    before its delays were approximated, where it has any: what frequency responses and stability rest on. error: of A, relative
+    to its size: rounding, or that of the differences it is made of.
 
     Raises LinearizationError where the matrices' sizes do not fit, or an entry is not finite.
     """
@@ -68,6 +74,7 @@ class LinearModel(Shown):
     provenance: FrozenMap[str] = field(default_factory=FrozenMap)
     gradients: FrozenMap[Gradient] = field(default_factory=FrozenMap)
     exact: Characteristic | None = None
+    error: float = EPS
     x0: tuple[float, ...] = ()
     u0: tuple[float, ...] = ()
     y0: tuple[float, ...] = ()
@@ -235,10 +242,21 @@ class LinearModel(Shown):
         )  # fmt: skip
 
     @cached_property
-    def characteristic(self) -> Characteristic:
-        """The exact characteristic equation of a model with delays; poles, modes and stability rest on one search for its roots."""
-        assert self.exact is not None
-        return self.exact.without_zero_delays()
+    def approximate(self) -> Characteristic | Descriptor:
+        """The equation of A, B, C, D and E, in which a delay stands as its Pade approximant."""
+        if self.is_descriptor:
+            return Descriptor(self.A, self.E, self.B, self.C, self.D)
+        return Characteristic.rational(self.A, self.B, self.C, self.D, self.error)
+
+    @property
+    def equation(self) -> Characteristic | Descriptor:
+        """The equation as it was linearised, its delays exact; its derivatives are `Gradient.change`."""
+        return self.approximate if self.exact is None else self.exact
+
+    @cached_property
+    def characteristic(self) -> Characteristic | Descriptor:
+        """The equation without delays of 0 s; poles, modes and stability rest on one search for its roots."""
+        return self.approximate if self.exact is None else self.exact.without_zero_delays()
 
     # --- analysis: functions of other modules, bound when they are first asked for ---
 
@@ -252,7 +270,7 @@ class LinearModel(Shown):
         bode = frequency.frequency_response
         sigma = frequency.sigma
         margins = loops.margins_of
-        norms = reduction.norms
+        norms = norms.norms
         reduce = reduction.reduced
         save = export.write
         plot = plot.draw
@@ -266,7 +284,7 @@ class LinearModel(Shown):
         bode = method("hvdc_ident.linearize.frequency.frequency_response")
         sigma = method("hvdc_ident.linearize.frequency.sigma")
         margins = method("hvdc_ident.linearize.loops.margins_of")
-        norms = method("hvdc_ident.linearize.reduction.norms")
+        norms = method("hvdc_ident.linearize.norms.norms")
         reduce = method("hvdc_ident.linearize.reduction.reduced")
         save = method("hvdc_ident.linearize.export.write")
         plot = method("hvdc_ident.linearize.plot.draw")
@@ -319,21 +337,6 @@ class LinearModel(Shown):
             raise ModelError(
                 "the linear model is incomplete", where="linear model", got=f"{type(e).__name__}: {e}"
             ) from None
-
-
-def approximate_poles(model: LinearModel) -> Array:
-    """Return (n,) complex eigenvalues of the state space, rad/s, in which a delay stands as its Pade approximant."""
-    if model.A.shape[0] == 0:
-        return np.zeros(0, dtype=complex)
-    if not model.is_descriptor:
-        return np.asarray(np.linalg.eigvals(model.A), dtype=complex)
-    alpha, beta = scipy.linalg.eigvals(model.A, model.E, homogeneous_eigvals=True)
-    return np.asarray(alpha[finite(alpha, beta)] / beta[finite(alpha, beta)], dtype=complex)
-
-
-def finite(alpha: Array, beta: Array) -> Array:
-    """Return a mask of the generalised eigenvalues alpha/beta that are finite."""
-    return np.asarray(np.abs(beta) > 1e-10 * np.maximum(np.abs(alpha), np.abs(beta)).clip(1e-300) * 1e-2)
 
 
 def gradient_of(model: LinearModel, parameter: str) -> Gradient:

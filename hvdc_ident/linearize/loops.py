@@ -25,7 +25,7 @@ from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.linearisation import linearize
 from hvdc_ident.linearize.operating_point import find_operating_point, point_at, signal_values
 from hvdc_ident.linearize.point import OperatingPoint
-from hvdc_ident.linearize.realisation import without_sliding_means
+from hvdc_ident.linearize.realisation import whole
 from hvdc_ident.linearize.stability import Characteristic, Stability, sliding_means, stability
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import Model, Output, State, driven, fresh
@@ -54,8 +54,6 @@ class Loop:
         """
         equation = open_equation(self.open)
         closed = equation.closed(np.ones(len(self.open.input_names)))
-        if not equation.channels:
-            return np.asarray(np.linalg.eigvals(closed.matrix), dtype=complex)
         values, means = closed.roots.values, sliding_means(closed)
         return np.delete(values, np.argsort(np.abs(values), kind="stable")[:means])
 
@@ -394,8 +392,7 @@ def open_equation(model: LinearModel) -> Characteristic:
 
     Raises LinearizationError where the direct part is -1.
     """
-    exact = model.exact is not None
-    found = model.characteristic if exact else Characteristic.rational(*without_sliding_means(model))
+    found = whole(model)
     through = np.eye(found.through.shape[0]) + found.through
     if np.linalg.cond(through) > 1e12 or np.abs(np.linalg.det(through)) < 1e-12:
         raise LinearizationError(
@@ -422,8 +419,13 @@ def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMa
             hint="open the model at signals: loop(model, [...])",
         )
     equation = open_equation(model)
-    found = stability(equation.closed(np.ones(len(names))))
-    sensitivity = _sensitivity(model)
+    closed = equation.closed(np.ones(len(names)))
+    found = stability(closed)
+
+    def sensitivity(w: Array) -> Array:
+        """S = 1 - T from the closed loops, which poles of L do not disturb."""
+        return np.asarray(np.eye(len(names)) - closed.response(1j * w))
+
     each = {}
     for i, n in enumerate(names):
         closing = Closing(equation, i)
@@ -433,22 +435,6 @@ def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMa
     if len(names) == 1:
         return LoopMargins(FrozenMap(each), each[names[0]].disk, found)
     return LoopMargins(FrozenMap(each), _common_disk(sensitivity, _grid(model, Closing(equation, 0), omega)), found)
-
-
-def _sensitivity(model: LinearModel) -> Curves:
-    """S = (1 + L)^-1 over rad/s; from the closed loops' state space where there is one, which poles of L do not disturb."""
-    eye = np.eye(len(model.input_names))
-    if model.exact is not None:
-        return lambda w: np.linalg.inv(eye + transfer(model, 1j * w))
-    a, b, c, d = model.standard()
-    direct = np.linalg.inv(eye + d)
-    closed, drive, seen = a - b @ direct @ c, b @ direct, direct @ c
-
-    def values(w: Array) -> Array:
-        inner = 1j * w[:, None, None] * np.eye(a.shape[0]) - closed
-        return np.asarray(direct - seen @ np.linalg.solve(inner, np.broadcast_to(drive, (w.size, *drive.shape))))
-
-    return values
 
 
 def _alone(sensitivity: Curves, i: int) -> Curves:

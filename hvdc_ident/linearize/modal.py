@@ -1,60 +1,34 @@
-"""Modes of a linear model, and root loci.
-
-Eigenvalues with damping and frequency, participation, shapes, names and derivatives by parameters; eigenvalues along a
-parameter, followed by their eigenvectors, and the values at which stability changes.
-"""
+"""Modes of a linear model: eigenvalues with damping and frequency, participation, shapes, names and derivatives by parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
-from hvdc_ident.codec import INLINE, Coded, stored_as
-from hvdc_ident.errors import LinearizationError, SteadyStateError, unknown_name
+from hvdc_ident.codec import INLINE
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import delayed_modes
-from hvdc_ident.linearize.delayed_locus import crossings, followed
-from hvdc_ident.linearize.derivatives import characteristic, state_matrix
-from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions
-from hvdc_ident.linearize.jacobian import steady
-from hvdc_ident.linearize.linear_model import LinearModel, approximate_poles
-from hvdc_ident.linearize.mode import Mode, kind_of_mode
-from hvdc_ident.linearize.plot import locus
-from hvdc_ident.linearize.stability import ZERO, Characteristic, Stability, stability
-from hvdc_ident.linearize.system import Array, CompiledSystem
+from hvdc_ident.linearize.characteristic import reaches
+from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.mode import Mode, damping_of, kind_of_mode
+from hvdc_ident.linearize.stability import Stability, stability
+from hvdc_ident.linearize.system import Array
 from hvdc_ident.model import Model
-
-ON_AXIS = (1e-9, 1e-6)
-"""1/s left and right of the imaginary axis within which an eigenvalue of A counts as on it."""
 
 
 def poles(model: LinearModel) -> Array:
-    """Return (n,) complex eigenvalues, rad/s; for a descriptor those of the pencil without the infinite ones.
+    """Return (n,) complex poles by falling real part, rad/s, hidden ones among them; for a descriptor the finite eigenvalues.
 
-    Of a model with delays the rightmost roots of its exact characteristic equation, by falling real part.
+    Of a model with delays the rightmost roots of its exact characteristic equation.
     """
-    if model.exact is not None:
-        return model.characteristic.roots.values
-    return approximate_poles(model)
+    return model.characteristic.roots.values
 
 
 def stability_of(model: LinearModel) -> Stability:
     """Return whether a model is stable: with delays by its characteristic equation, else by its eigenvalues."""
-    if model.exact is not None:
-        return stability(model.characteristic)
-    values = approximate_poles(model)
-    if not values.size:
-        return Stability("stable", 0, None)
-    first = complex(values[np.argmax(values.real + 1e-300 * values.imag)])
-    verdict = (
-        "stable" if first.real < -ON_AXIS[0] else "on the limit of stability" if first.real < ON_AXIS[1] else "unstable"
-    )
-    return Stability(verdict, int((values.real >= ON_AXIS[1]).sum()), first)
+    return stability(model.characteristic)
 
 
 def eigen(a: Array) -> tuple[Array, Array, Array]:
@@ -91,7 +65,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     slopes = {n: sensitivities(values, right, left, g.A) for n, g in model.gradients.items()}
     share = np.abs(left.T * right)
     share = share / np.maximum(share.sum(axis=0), 1e-300)
-    zero = ZERO * max(1.0, float(np.abs(values).max()))
+    values = at_rest(values, model.characteristic.roots.values)
     order = sorted(
         range(values.size), key=lambda k: (-round(float(values[k].real), 9), abs(values[k].imag), -values[k].imag)
     )
@@ -102,28 +76,32 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
             Mode(
                 complex(values[k]),
                 abs(float(values[k].imag)) / (2 * np.pi),
-                0.0 if abs(values[k]) <= zero else float(-values[k].real / abs(values[k])),
+                damping_of(complex(values[k])),
                 FrozenMap(zip(names, (float(x) for x in share[:, k]), strict=True)),
                 FrozenMap(zip(names, (complex(x) for x in v), strict=True)),
                 FrozenMap({n: complex(s[k]) for n, s in slopes.items()}),
-                _kind(model, complex(values[k]), right[:, k], left[k], zero),
+                _kind(model, complex(values[k]), right[:, k], left[k]),
             )
         )
     return tuple(found)
 
 
-def _kind(model: LinearModel, value: complex, right: Array, left: Array, zero: float) -> str:
+def at_rest(values: Array, roots: Array) -> Array:
+    """Return eigenvalues of a whole matrix, those nearest to 0 made 0: as many as roots of its parts are."""
+    values = values.copy()
+    values[np.argsort(np.abs(values), kind="stable")[: np.count_nonzero(roots == 0)]] = 0.0
+    return values
+
+
+def _kind(model: LinearModel, value: complex, right: Array, left: Array) -> str:
     """Return the kind of a mode; a zero eigenvalue whose state is held by a limit is a saturated state."""
-
-    def reaches(product: Array, vector: Array, matrix: Array) -> bool:
-        return bool(np.abs(product).max(initial=0.0) > 1e-9 * np.abs(vector).max() * np.abs(matrix).max(initial=1e-300))
-
-    driven, seen = reaches(left @ model.B, left, model.B), reaches(model.C @ right, right, model.C)
-    hidden = abs(value) <= zero and not (driven and seen)
+    right, left = right / np.linalg.norm(right), left / np.linalg.norm(left)
+    driven, seen = reaches(left @ model.B, model.B), reaches(model.C @ right, model.C)
+    hidden = value == 0 and not (driven and seen)
     held = hidden and model.point is not None and model.point.active_limits
     if held and not model.A[int(np.argmax(np.abs(right)))].any():
         return "saturated state"
-    return kind_of_mode(value, zero, driven, seen)
+    return kind_of_mode(value, driven, seen)
 
 
 def sensitivities(values: Array, right: Array, left: Array, da: Array) -> Array:
@@ -186,169 +164,3 @@ def named(mode: Mode, parts: Mapping[str, str]) -> NamedMode:
     ranked = sorted(shares.items(), key=lambda item: -item[1])
     name = " + ".join(part for part, share in ranked if share >= SHARE * ranked[0][1])
     return NamedMode(mode, name, FrozenMap(ranked))
-
-
-# --- root loci ---
-
-
-@dataclass(frozen=True)
-class StabilityLimit:
-    """A parameter value at which an eigenvalue crosses the imaginary axis, and that eigenvalue, rad/s."""
-
-    value: float
-    eigenvalue: complex
-    direction: str
-
-
-@dataclass(frozen=True, eq=False)
-class RootLocus(Coded):
-    """Eigenvalues (points, modes) in rad/s along values of a parameter; column k is one mode throughout.
-
-    limits: where stability is lost or won between the values. With delays, the columns are the rightmost roots of the exact
-    characteristic equation, and unstable is the number of all roots right of the imaginary axis, None where it is unknown.
-    """
-
-    parameter: str
-    unit: str
-    values: Array
-    eigenvalues: NDArray[np.complex128]
-    limits: tuple[StabilityLimit, ...]
-    unstable: tuple[float | None, ...] | None = field(default=None, metadata=stored_as("unstable_roots", optional=True))
-
-    @property
-    def stable(self) -> Array:
-        """(points,) True where every eigenvalue lies left of the imaginary axis, those that stay at 0 apart."""
-        if self.unstable is not None:
-            return np.array([n == 0 for n in self.unstable])
-        return np.asarray(((self.eigenvalues.real < 0) | at_zero(self.eigenvalues)).all(axis=1))
-
-    def plot(self, ax: Any = None) -> Any:
-        """Return the axes with the locus."""
-        return locus(self, ax=ax)
-
-
-def root_locus(
-    model: Model, parameter: str, values: Sequence[float] | Array, fixed: dict[str, float] | None = None
-) -> RootLocus:
-    """Return the eigenvalues of the model along values of a parameter (or input), each at its own operating point.
-
-    Raises UnknownNameError, SteadyStateError with the value at which there is no operating point, and
-    LinearizationError on a kink.
-    """
-    if parameter not in model.parameters and parameter not in model.inputs:
-        raise unknown_name(
-            "parameter or input", parameter, [*model.parameters, *model.inputs], where=f"model '{model.name}'"
-        )
-    along = np.asarray(values, dtype=float)
-    if along.ndim != 1 or along.size == 0 or not np.isfinite(along).all():
-        raise LinearizationError(
-            "a locus needs finite values", where=f"locus of '{parameter}'", expected="at least one"
-        )
-    at = _Along(model, parameter, fixed or {})
-    unit = (model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]).unit
-    if model.delays or model.sampled:
-        table, unstable = followed(at.equation, along)
-        ends = tuple(
-            StabilityLimit(v, root, "lost" if lost else "won")
-            for v, root, lost in crossings(at.equation, along, unstable)
-        )
-        return RootLocus(parameter, unit, along, table, ends, unstable)
-    found: list[Array] = []
-    left: Array | None = None
-    for value in along:
-        eigenvalues, right, left_new = eigen(at.matrix(float(value)))
-        if left is not None:
-            order = match(found[-1], left, eigenvalues, right)
-            eigenvalues, left_new = eigenvalues[order], left_new[order]
-        found.append(eigenvalues)
-        left = left_new
-    table = np.array(found)
-    return RootLocus(parameter, unit, along, table, _limits(at, along, table))
-
-
-class _Along:
-    """The state matrix at a value of the parameter."""
-
-    def __init__(self, model: Model, parameter: str, fixed: dict[str, float]) -> None:
-        self.model, self.parameter = model, parameter
-        own = model.parameters[parameter] if parameter in model.parameters else model.inputs[parameter]
-        start = {parameter: own.value}
-        self._search = EquilibriumSearch.of_model(model, PointOptions({**start, **fixed}))
-        names = self._search.system.parameters if parameter in model.parameters else self._search.system.inputs
-        self._place = names.index(parameter)
-
-    def _at(self, value: float) -> EquilibriumSearch:
-        """Return the search at a value: nothing else in it changes but the guesses that stand on parameters."""
-        key = "p" if self.parameter in self.model.parameters else "u"
-        values = getattr(self._search, key).copy()
-        values[self._place] = value
-        return replace(self._search, **{key: values})
-
-    def _rest(self, value: float) -> tuple[CompiledSystem, tuple[Array, Array, Array]]:
-        """Return the system and its vectors at the value's own operating point: where a simulation starts from there."""
-        search = self._at(value)
-        try:
-            root, _ = steady(self.model, search)
-        except SteadyStateError as e:
-            raise e.at(f"{self.parameter} = {value:g}") from None
-        assert isinstance(search.system, CompiledSystem)
-        return search.system, search.vectors(root.v)
-
-    def matrix(self, value: float) -> Array:
-        """Return A, (states, states), at the value's own operating point."""
-        system, vectors = self._rest(value)
-        return state_matrix(self.model, system, *vectors)
-
-    def equation(self, value: float) -> Characteristic:
-        """Return the characteristic equation at the value's own operating point, delays exact."""
-        system, vectors = self._rest(value)
-        return characteristic(self.model, system, *vectors)
-
-
-def at_zero(table: Array) -> Array:
-    """Return a mask (points, modes) of the eigenvalues that are 0 but for rounding."""
-    return np.asarray(np.abs(table) <= ZERO * np.maximum(1.0, np.abs(table).max(axis=1, keepdims=True)))
-
-
-def match(before: Array, left: Array, after: Array, right: Array) -> Array:
-    """Return the order that puts the new modes in the old ones' columns: by eigenvectors, distances deciding between alike."""
-    likeness = np.abs(left @ right)
-    likeness = likeness / np.maximum(likeness.max(axis=1, keepdims=True), 1e-300)
-    distance = np.abs(before[:, None] - after[None, :])
-    scale = np.maximum(np.abs(before)[:, None], 1e-6 * np.abs(before).max(initial=1.0))
-    cost = (1.0 - likeness) + np.minimum(distance / np.maximum(scale, 1e-300), 10.0)
-    order = np.argmax(-cost, axis=1)
-    return order if np.unique(order).size == order.size else np.asarray(linear_sum_assignment(cost)[1])
-
-
-def _limits(at: _Along, values: Array, table: Array) -> tuple[StabilityLimit, ...]:
-    """Return the values at which a mode's real part changes sign, to the last digits, by bisection."""
-    found = []
-    resting = at_zero(table)
-    for k in range(values.size - 1):
-        a, b = table[k].real, table[k + 1].real
-        for j in np.flatnonzero(((a < 0) != (b < 0)) & ~(resting[k] & resting[k + 1])):
-            if table[k, j].imag < 0:
-                continue
-            value, eigenvalue = _crossing(
-                at, float(values[k]), float(values[k + 1]), complex(table[k, j]), bool(a[j] < 0)
-            )
-            found.append(StabilityLimit(value, eigenvalue, "lost" if a[j] < 0 else "won"))
-    return tuple(found)
-
-
-def _crossing(at: _Along, low: float, high: float, start: complex, stable_below: bool) -> tuple[float, complex]:
-    current = start
-    for _ in range(80):
-        middle = 0.5 * (low + high)
-        if middle in (low, high):
-            break
-        eigenvalues = np.linalg.eigvals(at.matrix(middle))
-        current = complex(eigenvalues[np.argmin(np.abs(eigenvalues - current))])
-        if (current.real < 0) == stable_below:
-            low = middle
-        else:
-            high = middle
-        if abs(high - low) <= 1e-13 * max(abs(high), abs(low)):
-            break
-    return 0.5 * (low + high), current

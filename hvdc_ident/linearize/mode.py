@@ -28,19 +28,19 @@ class Mode(Coded):
     kind: str
 
     @property
-    def time_constant(self) -> float:
-        """1/|Re lambda| in s, infinite on the imaginary axis."""
-        return 1.0 / abs(self.eigenvalue.real) if self.eigenvalue.real else float("inf")
-
-    @property
     def dominant(self) -> str:
         """The state that takes part most."""
         return max(self.participation, key=lambda n: self.participation[n])
 
 
-def kind_of_mode(eigenvalue: complex, zero: float, driven: bool, seen: bool) -> str:
-    """Return the kind of a mode. zero: size below which it is at 0. driven, seen: whether inputs reach and outputs see it."""
-    if abs(eigenvalue) > zero:
+def damping_of(eigenvalue: complex) -> float:
+    """Return -Re/|lambda|, 0 for a zero eigenvalue."""
+    return float(-eigenvalue.real / abs(eigenvalue)) if eigenvalue else 0.0
+
+
+def kind_of_mode(eigenvalue: complex, driven: bool, seen: bool) -> str:
+    """Return the kind of a mode. driven, seen: whether inputs reach and outputs see it."""
+    if eigenvalue:
         if eigenvalue.imag:
             return "oscillation" if eigenvalue.real <= 0 else "growing oscillation"
         return "decay" if eigenvalue.real < 0 else "growth"

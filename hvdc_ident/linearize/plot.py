@@ -18,8 +18,8 @@ from hvdc_ident.errors import unknown_name
 if TYPE_CHECKING:
     from hvdc_ident.linearize.frequency import FrequencyResponse
     from hvdc_ident.linearize.linear_model import LinearModel
-    from hvdc_ident.linearize.modal import RootLocus
     from hvdc_ident.linearize.mode import Mode
+    from hvdc_ident.linearize.root_loci import RootLocus
 
 LINES = ("-", "--", "-.", ":")
 MARK = "#777777"

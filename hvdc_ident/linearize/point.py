@@ -17,7 +17,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.derivatives import characteristic
 from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root
 from hvdc_ident.linearize.limits import Limit
-from hvdc_ident.linearize.stability import ZERO, Characteristic, stability
+from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array, CompiledSystem
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import Equilibria, equilibria, resting
@@ -198,19 +198,14 @@ def _equation(point: OperatingPoint, y: Array, w: Array) -> Characteristic | Non
     n = s.layout.nx
     a = s.evaluate(y, w, point.p)[1][:n, :n]
     none = np.zeros((0, 0))
-    return Characteristic(a, n, (), np.zeros((n, 0)), np.zeros((0, n)), none) if np.isfinite(a).all() else None
+    return Characteristic.rational(a, np.zeros((n, 0)), np.zeros((0, n)), none, s.accuracy) if np.isfinite(a).all() else None
 
 
 def _stable(point: OperatingPoint, y: Array, w: Array) -> bool | None:
     """Return whether no root lies right of the imaginary axis; None where there is no linear model, or it cannot be told."""
     equation = _equation(point, y, w)
-    if equation is None:
-        return None
-    if equation.channels:
-        unstable = stability(equation).unstable
-        return None if unstable is None else unstable == 0
-    values = np.linalg.eigvals(equation.matrix) if equation.nx else np.zeros(1)
-    return bool(values.real.max() <= ZERO * max(1.0, float(np.abs(values).max())))
+    unstable = None if equation is None else equation.roots.unstable
+    return None if unstable is None else unstable == 0
 
 
 def _fastest(point: OperatingPoint) -> str:

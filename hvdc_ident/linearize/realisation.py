@@ -1,11 +1,15 @@
-"""Minimal realisations: the part of a linear model that its inputs reach and its outputs see, and what is hidden."""
+"""Minimal realisations: the part of a linear model that its inputs reach and its outputs see, and what is hidden; differences."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import scipy.linalg
 
+from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array
 
 TOLERANCE = 1e-10
@@ -77,17 +81,58 @@ def without_sliding_means(model: LinearModel) -> tuple[Array, Array, Array, Arra
     return keep.T @ a @ keep, keep.T @ b, c @ keep, d
 
 
-def on_axis(poles: Array, a: Array) -> Array:
-    """Return a mask of the eigenvalues of a matrix that lie on the imaginary axis, as far as rounding errors tell.
+def visible(model: LinearModel) -> Characteristic:
+    """Return the equation of what inputs reach and outputs see, the transfer function's, be the rest stable or not.
 
-    Eigenvalues computed in floating point are those of a matrix within n eps |A|, which moves a simple one by about so
-    much; 1e-9 of its size stands for worse conditioned ones.
+    Delays are exact, and what is hidden beside them is found by structure; a model without delays has a minimal realisation.
     """
-    size = float(np.linalg.norm(a, 2)) if a.size else 0.0
-    return np.asarray(np.abs(poles.real) <= 1e-9 * np.abs(poles) + 10 * len(poles) * np.finfo(float).eps * size)
+    return approximate_visible(model) if model.exact is None else whole(model).visible()
 
 
-def visible(model: LinearModel) -> tuple[Array, Array, Array, Array]:
-    """Return A, B, C, D of the part that inputs reach and outputs see, the transfer function's, be the rest stable or not."""
+def approximate_visible(model: LinearModel) -> Characteristic:
+    """Return the minimal realisation of a model in which a delay stands as its Pade approximant."""
     a, b, c, d = without_sliding_means(model)
-    return *kalman(*scaled_states(a, b, c))[0], d
+    return Characteristic.rational(*kalman(*scaled_states(a, b, c))[0], d, model.error)
+
+
+def whole(model: LinearModel) -> Characteristic:
+    """Return the equation of a model, its delays exact and its algebraic part eliminated.
+
+    Raises LinearizationError where that is not possible.
+    """
+    if model.exact is not None:
+        return model.exact.without_zero_delays()
+    return Characteristic.rational(*model.standard(), model.error)
+
+
+def same_channels(first: LinearModel, second: LinearModel) -> None:
+    """Raise LinearizationError where two models differ in their number of inputs or outputs."""
+    shapes = [(len(m.output_names), len(m.input_names)) for m in (first, second)]
+    if shapes[0] != shapes[1]:
+        raise LinearizationError(
+            "the models have other inputs or outputs",
+            where=f"'{first.name}' against '{second.name}'",
+            expected=f"{shapes[0][0]} outputs and {shapes[0][1]} inputs",
+            got=f"{shapes[1][0]} and {shapes[1][1]}",
+        )
+
+
+def difference(first: LinearModel, second: LinearModel) -> LinearModel:
+    """Return the model first - second. Raises LinearizationError where the sizes differ."""
+    same_channels(first, second)
+    a1, b1, c1, d1 = without_sliding_means(first)
+    a2, b2, c2, d2 = without_sliding_means(second)
+    found = first.with_matrices(
+        scipy.linalg.block_diag(a1, a2) if a1.size or a2.size else np.zeros((0, 0)),
+        np.concatenate([b1, b2]),
+        np.concatenate([c1, -c2], axis=1),
+        d1 - d2,
+        point=None,
+        name=f"{first.name} - {second.name}",
+        error=max(first.error, second.error),
+    )
+    if first.exact is None and second.exact is None:
+        return found
+    inputs, outputs = np.eye(len(first.input_names)), np.eye(len(first.output_names))
+    both = whole(first).beside(whole(second))
+    return replace(found, exact=both.between(np.vstack([inputs, inputs]), np.hstack([outputs, -outputs])))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg
@@ -16,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize.characteristic import NEUTRAL, Part, Undecided, spectral_radius
+from hvdc_ident.linearize.characteristic import NEUTRAL, Part, Undecided, reaches, spectral_radius
 from hvdc_ident.linearize.delays import Channel, SchurComplement, eliminate
 from hvdc_ident.linearize.sampling import multipliers
 from hvdc_ident.linearize.system import Array
@@ -24,8 +25,9 @@ from hvdc_ident.linearize.system import Array
 EIGENVALUES = "eigenvalues of A"
 COUNTED = "roots of the exact characteristic equation, counted by the argument principle"
 MULTIPLIERS = "multipliers over the period of the sampled blocks (modes: without aliases)"
-ZERO = 1e-8
-"""An eigenvalue below this share of the fastest one (or of 1 rad/s) counts as zero."""
+EPS = float(np.finfo(float).eps)
+ON_AXIS = 1e-9
+"""Damping below which rounding may hide on which side of the imaginary axis an eigenvalue lies."""
 TOLERANCES = (1e-12, 1e-10, 1e-8)
 """Distances from the imaginary axis, relative to the radius that bounds the roots, within which one counts as on it."""
 PER_DELAY = 5
@@ -36,13 +38,15 @@ CERTAIN = 1e-4
 """Share of the first root's real part by which another one may lie right of it unseen."""
 ORDERS = (12, 24, 48, 96, 192)
 """Collocation points of a delay that are tried one after the other until the roots found are as many as are counted."""
+ALIKE = 1e-7
+"""Roots nearer to each other than this share of their size are taken for one of several times."""
 LARGEST = 900
 """Rows of the largest discretisation."""
 
 
 @dataclass(frozen=True, eq=False)
 class Roots:
-    """Roots of a characteristic equation, by falling real part, with the numbers counted for it.
+    """Roots of a characteristic equation, by falling real part, with the numbers counted for it; what rounding leaves of a 0 is 0.
 
     unstable: right of the imaginary axis, None where it cannot be told and infinite for a neutral equation past its
     limit. axis: on it, as far as rounding errors tell. reason: why `unstable` is None or infinite. certain: whether it is
@@ -74,7 +78,7 @@ class Characteristic:
     """The characteristic equation of a model, delays exact, with its inputs and outputs.
 
     matrix: as in `Part`, whole. given: (rows, inputs) what the inputs add to its rows; read: (outputs, columns) and
-    through: (outputs, inputs) the outputs.
+    through: (outputs, inputs) the outputs. error: of the matrix, relative to its size: rounding, or that of differences.
     """
 
     matrix: Array
@@ -83,6 +87,7 @@ class Characteristic:
     given: Array
     read: Array
     through: Array
+    error: float = EPS
 
     @classmethod
     def of(cls, reduced: SchurComplement, nx: int, channels: tuple[Channel, ...]) -> Characteristic:
@@ -96,9 +101,14 @@ class Characteristic:
         return cls(matrix, nx, channels, given, read, through)
 
     @classmethod
-    def rational(cls, a: Array, b: Array, c: Array, d: Array) -> Characteristic:
+    def rational(cls, a: Array, b: Array, c: Array, d: Array, error: float = EPS) -> Characteristic:
         """Return the equation of a state space without delays."""
-        return cls(a, a.shape[0], (), b, c, d)
+        return cls(a, a.shape[0], (), b, c, d, error)
+
+    @property
+    def matrices(self) -> tuple[Array, Array, Array, Array]:
+        """A, B, C and D where there are no delays; with them what leaves the delays is among the states."""
+        return self.matrix, self.given, self.read, self.through
 
     def without_zero_delays(self) -> Characteristic:
         """Return the equation in which what a delay of 0 s gives is what it gets. Raises LinearizationError for a loop of gain 1."""
@@ -118,7 +128,7 @@ class Characteristic:
             raise LinearizationError("the loop through a delay of 0 s is singular", got="no solution for its signals")
         matrix, given, read, through = quartered(reduced.result, len(kept))
         channels = tuple(c for c in self.channels if c.total > 0.0)
-        return Characteristic(matrix, self.nx, channels, given, read, through)
+        return replace(self, matrix=matrix, channels=channels, given=given, read=read, through=through)
 
     def closed(self, gains: Array) -> Characteristic:
         """Return the equation with every output fed back to the input of its place, with a gain and negative sign."""
@@ -131,6 +141,11 @@ class Characteristic:
         given = self.given + self.given @ feedback @ direct
         return replace(self, matrix=self.matrix + self.given @ feedback @ read, given=given, read=read, through=direct)
 
+    def between(self, inputs: Array, outputs: Array) -> Characteristic:
+        """Return the equation with combinations of the inputs, (inputs, new ones), and of the outputs, (new ones, outputs)."""
+        through = outputs @ self.through @ inputs
+        return replace(self, given=self.given @ inputs, read=outputs @ self.read, through=through)
+
     def beside(self, other: Characteristic) -> Characteristic:
         """Return the equation of both side by side, inputs and outputs of this one first."""
         n, k = self.nx, self.matrix.shape[0]
@@ -142,7 +157,7 @@ class Characteristic:
         return Characteristic(
             both(self.matrix, other.matrix)[np.ix_(places, places)], n + other.nx, (*self.channels, *other.channels),
             both(self.given, other.given)[places], both(self.read, other.read)[:, places],
-            both(self.through, other.through),
+            both(self.through, other.through), max(self.error, other.error),
         )  # fmt: skip
 
     def visible(self) -> Characteristic:
@@ -152,14 +167,16 @@ class Characteristic:
         for _ in range(links.shape[0]):
             reached, seen = reached | (links & reached).any(axis=1), seen | (links & seen[:, None]).any(axis=0)
         keep = np.flatnonzero(reached & seen)
-        found = tuple(self.channels[i - self.nx] for i in keep if i >= self.nx)
-        return Characteristic(
-            self.matrix[np.ix_(keep, keep)],
-            len(keep) - len(found),
-            found,
-            self.given[keep],
-            self.read[:, keep],
-            self.through,
+        return self._of(keep)
+
+    def without_states(self, places: Sequence[int]) -> Characteristic:
+        """Return the equation with some states held where they are."""
+        return self._of(np.delete(np.arange(self.matrix.shape[0]), places)) if places else self
+
+    def _of(self, keep: Array) -> Characteristic:
+        own = self.part(keep)
+        return replace(
+            self, matrix=own.matrix, nx=own.nx, channels=own.channels, given=self.given[keep], read=self.read[:, keep]
         )
 
     def response(self, s: Array) -> Array:
@@ -219,7 +236,7 @@ class Characteristic:
     @cached_property
     def roots_by_part(self) -> tuple[tuple[Array, Roots], ...]:
         """The places of the unknowns of each part, and its roots."""
-        return tuple((places, _roots_of(part)) for part, places in self.parts())
+        return tuple((places, self._roots_of(part)) for part, places in self.parts())
 
     @cached_property
     def roots(self) -> Roots:
@@ -232,13 +249,13 @@ class Characteristic:
         reasons = dict.fromkeys(r.reason for r in found if r.reason)
         grows = 0.0 if unstable is None else unstable
         least = max(self.nx + PER_DELAY * len(self.whole.channels), axis + int(grows)) if np.isfinite(grows) else None
-        averaged = _first([r.values if r.averaged is None else r.averaged for r in found], least)
-        values = _first([r.values for r in found], least)
+        averaged = first_roots([r.values if r.averaged is None else r.averaged for r in found], least)
+        values = first_roots([r.values for r in found], least)
         return Roots(values, unstable, axis, "; ".join(reasons), all(r.certain for r in found), averaged)
 
     def counts(self) -> tuple[float | None, int]:
         """Return the numbers of roots right of the imaginary axis and on it, as in `Roots`, without looking for the roots."""
-        found = [_counts_of(part) for part, _ in self.parts()]
+        found = [self._counts_of(part) for part, _ in self.parts()]
         total: float | None = 0.0
         for unstable, _ in found:
             total = _sum(total, unstable)
@@ -249,13 +266,35 @@ class Characteristic:
         unstable, axis = self.counts()
         return unstable == 0 and axis <= sliding_means(self)
 
+    def _roots_of(self, part: Part) -> Roots:
+        if not part.channels:
+            return eigenvalues(part.matrix, self.error)
+        if not part.matrix.any():  # a delay outside any loop
+            return Roots(np.zeros(0, dtype=complex), 0, 0)
+        if any(c.kind == "sampled" for c in part.channels):
+            return _sampled(part)
+        return _delayed(part)
+
+    def _counts_of(self, part: Part) -> tuple[float | None, int]:
+        if any(c.kind == "sampled" for c in part.channels):
+            found = multipliers(part.matrix, part.nx, part.channels) if part.matrix.any() else (np.zeros(0), 1.0)
+            return (None, 0) if isinstance(found, str) else _on_circle(found[0])
+        if not part.channels or not part.matrix.any() or spectral_radius(part.direct) >= 1.0 - NEUTRAL:
+            roots = self._roots_of(part)
+            return roots.unstable, roots.axis
+        try:
+            _, total, right = _counted(part)
+        except Undecided:
+            return None, 0
+        return right, total - right
+
 
 def quartered(matrix: Array, size: int) -> tuple[Array, Array, Array, Array]:
     """Return the blocks of a matrix, or of a stack of them, after so many rows and columns: its corners, row by row."""
     return matrix[..., :size, :size], matrix[..., :size, size:], matrix[..., size:, :size], matrix[..., size:, size:]
 
 
-def _first(values: list[Array], least: int | None) -> Array:
+def first_roots(values: list[Array], least: int | None) -> Array:
     """Return so many values by falling real part, conjugates together and the upper one first; all of them for None."""
     found = np.concatenate([np.zeros(0, dtype=complex), *values])
     found = found[np.lexsort((-found.imag, np.abs(found.imag), -found.real))]
@@ -263,20 +302,6 @@ def _first(values: list[Array], least: int | None) -> Array:
     if 0 < count < found.size and found[count - 1].imag > 0:
         count += 1
     return found[:count]
-
-
-def _counts_of(part: Part) -> tuple[float | None, int]:
-    if any(c.kind == "sampled" for c in part.channels):
-        found = multipliers(part.matrix, part.nx, part.channels) if part.matrix.any() else (np.zeros(0), 1.0)
-        return (None, 0) if isinstance(found, str) else _on_circle(found[0])
-    if not part.channels or not part.matrix.any() or spectral_radius(part.direct) >= 1.0 - NEUTRAL:
-        roots = _roots_of(part)
-        return roots.unstable, roots.axis
-    try:
-        _, total, right = _counted(part)
-    except Undecided:
-        return None, 0
-    return right, total - right
 
 
 def _on_circle(z: Array) -> tuple[int, int]:
@@ -293,16 +318,6 @@ def _sum(first: float | None, second: float | None) -> float | None:
     return first + second
 
 
-def _roots_of(part: Part) -> Roots:
-    if not part.channels:
-        return _eigenvalues(part)
-    if not part.matrix.any():  # a delay outside any loop
-        return Roots(np.zeros(0, dtype=complex), 0, 0)
-    if any(c.kind == "sampled" for c in part.channels):
-        return _sampled(part)
-    return _delayed(part)
-
-
 def _sampled(part: Part) -> Roots:
     """The multipliers over the sampling period decide; where there are none, it is said what the averaged equation has."""
     averaged = _delayed(part)
@@ -313,8 +328,9 @@ def _sampled(part: Part) -> Roots:
         return Roots(averaged.values, None, 0, reason, False)
     z, period = found
     unstable, axis = _on_circle(z)
-    values = np.log(z[np.abs(z) > 1e-12].astype(complex)) / period
-    return Roots(values, unstable, axis, averaged=averaged.values)
+    values = np.log(z[np.abs(z) > 1e-12].astype(complex))
+    values[np.abs(values) <= ON_CIRCLE] = 0.0
+    return Roots(values / period, unstable, axis, averaged=averaged.values)
 
 
 def _delayed(part: Part) -> Roots:
@@ -331,6 +347,7 @@ def _delayed(part: Part) -> Roots:
     found = np.zeros(0, dtype=complex)
     for order in _orders(part):
         found = part.refined(np.concatenate([np.linalg.eigvals(part.discretised(order)), found]))
+        found[np.abs(found) <= tolerance] = 0.0
         near = found[found.real > -tolerance]
         if near.size < total:
             times = [part.multiplicity(v, found) for v in near]
@@ -368,10 +385,39 @@ def _orders(part: Part) -> Sequence[int]:
     return [k for k in ORDERS if k == ORDERS[0] or part.nx + k * len(part.channels) <= LARGEST]
 
 
-def _eigenvalues(part: Part) -> Roots:
-    values = np.linalg.eigvals(part.matrix).astype(complex)
-    on_it = np.abs(values.real) <= 1e-9 * np.abs(values) + 10 * part.nx * np.finfo(float).eps * part.size
-    return Roots(values, int(((values.real > 0) & ~on_it).sum()), int(on_it.sum()))
+def eigenvalues(matrix: Array, error: float = EPS) -> Roots:
+    """Return the eigenvalues of a balanced matrix, in LAPACK's order. error: of its entries, relative to each.
+
+    One that its error may have moved from 0 is 0.
+    """
+    values, off = with_errors(matrix, error)
+    values = np.where(np.abs(values) <= off, 0.0, values)
+    axis = on_axis(values, off)
+    return Roots(values, int(((values.real > 0) & ~axis).sum()), int(axis.sum()))
+
+
+def on_axis(values: Array, off: Array) -> Array:
+    """Return a mask of the eigenvalues that may lie on the imaginary axis. off: their errors."""
+    return np.asarray(np.abs(values.real) <= ON_AXIS * np.abs(values) + off)
+
+
+def with_errors(matrix: Array, error: float = EPS) -> tuple[Array, Array]:
+    """Return the eigenvalues of a balanced matrix, and how far errors of its entries may have moved each.
+
+    An error e of each entry, relative to it, moves an eigenvalue with vectors y and x by m = e |y| |A| |x| / |y x|, to first
+    order. Two that are g apart meet where an error is large enough, and move by its root: by g m / (g/2 + sqrt(g^2/4 + g m)),
+    which is m where that is small against g. Rounding in the computation stands for e = n times that of the entries.
+    """
+    n = len(matrix)
+    if n < 2:
+        return np.diag(matrix).astype(complex), np.zeros(n)
+    values, left, right = scipy.linalg.eig(matrix, left=True, right=True)
+    moved = 10.0 * n * error * ((np.abs(left).T @ np.abs(matrix)) * np.abs(right).T).sum(axis=1)
+    first = moved / np.maximum(np.abs((left.conj() * right).sum(axis=0)), 1e-300)
+    apart = np.abs(values[:, None] - values)
+    np.fill_diagonal(apart, np.inf)
+    gap = np.maximum(apart.min(axis=1), np.sqrt(moved * np.abs(values)) + 1e-300)  # of two computed as one, that of their errors
+    return values, gap * first / (0.5 * gap + np.sqrt(0.25 * gap**2 + gap * first))
 
 
 def _neutral(part: Part, direct: float) -> Roots:
@@ -424,10 +470,19 @@ class Stability(Coded):
         return f"at least {number}" if self.reason else number
 
 
-def stability(equation: Characteristic) -> Stability:
+class Equation(Protocol):
+    """What a verdict on stability rests on."""
+
+    @property
+    def channels(self) -> tuple[Channel, ...]: ...
+    @property
+    def roots(self) -> Roots: ...
+
+
+def stability(equation: Equation) -> Stability:
     """Return whether the model is stable; what a sliding mean keeps for ever does not count."""
     roots, values = equation.roots, equation.roots.values
-    hidden = sliding_means(equation)
+    hidden = sliding_means(equation) if isinstance(equation, Characteristic) else 0
     if hidden:
         values = np.delete(values, np.argsort(np.abs(values), kind="stable")[:hidden])
     first = complex(values[0]) if values.size else None
@@ -441,12 +496,48 @@ def stability(equation: Characteristic) -> Stability:
     return Stability(verdict, 0, first if roots.certain else None, roots.reason, method)
 
 
+def poles_of_transfer(equation: Characteristic, where: str) -> tuple[int, Array]:
+    """Return the number of poles of the transfer function right of the imaginary axis, and those on it.
+
+    They are the roots that the inputs reach and the outputs see, sliding means left out. Raises LinearizationError where
+    their number is not known or infinite.
+    """
+    roots = equation.roots
+    if roots.unstable is None or np.isinf(roots.unstable):
+        raise LinearizationError("the number of unstable poles is not known", where=where, got=roots.reason)
+    right = roots.values[: int(roots.unstable)]
+    nearest = roots.values[np.argsort(np.abs(roots.values.real), kind="stable")[: roots.axis]]
+    axis = nearest[np.argsort(np.abs(nearest), kind="stable")[sliding_means(equation) :]]
+    if not any(c.kind == "delay" for c in equation.channels):
+        return right.size, axis  # of a minimal realisation; or logarithms of multipliers, which are no roots of the pencil
+    whole = equation.whole
+
+    def shown(root: complex) -> bool:
+        return all(reached(equation, root, whole.null_vectors(root, times_at(roots.values, root, whole.unit))))
+
+    return sum(shown(v) for v in right), axis[[shown(v) for v in axis]]
+
+
+def reached(equation: Characteristic, root: complex, vectors: tuple[Array, Array]) -> tuple[bool, bool]:
+    """Return whether the inputs drive the mode of a root, and whether the outputs see it. vectors: right and left, of norm 1."""
+    right, left = vectors
+    given = equation.pencil(np.array([root]))[1][0]
+    return reaches(left @ given, given), reaches(equation.read @ right, equation.read)
+
+
+def times_at(roots: Array, root: complex, unit: float) -> int:
+    """Return how many of some roots are the same, as far as can be told. unit: a rate, 1/s."""
+    return int((np.abs(roots - root) <= ALIKE * max(abs(root), 1e-3 * unit)).sum())
+
+
 def sliding_means(equation: Characteristic) -> int:
     """Return how many roots at 0 are sliding means: what stays is a state less what a delay holds, and no input moves it.
 
     y' = (u - u(t - T))/T keeps y less the mean of u, which is 0 for ever where it is at the start.
     """
     n, m = equation.nx, equation.matrix
+    if not equation.channels:
+        return 0
     _, (scale, _) = scipy.linalg.matrix_balance(m, permute=False, separate=True)
     at_rest = np.diag([0.0] * n + [1.0] * (m.shape[0] - n)) - m * scale[None, :] / scale[:, None]
     rows = scipy.linalg.null_space(at_rest.T, rcond=1e-13).T

@@ -11,7 +11,7 @@ from hvdc_ident.codec import Coded
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.delays import eliminate
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.realisation import kalman, scaled_states, visible, without_sliding_means
+from hvdc_ident.linearize.realisation import approximate_visible, kalman, scaled_states, without_sliding_means
 from hvdc_ident.linearize.system import Array
 from hvdc_ident.linearize.zeros import zeros
 
@@ -73,8 +73,7 @@ def _only(model: LinearModel, kind: str, names: tuple[str, ...]) -> str:
 
 def _dc_gain(channel: LinearModel) -> float:
     """Return D - C A^-1 B; where A is singular that of what the input reaches and the output sees, infinite where it is too."""
-    for part in (without_sliding_means, visible):
-        a, b, c, d = part(channel)
+    for a, b, c, d in (without_sliding_means(channel), approximate_visible(channel).matrices):
         at_rest = eliminate(np.block([[d, c], [b, a]]), 1, 1)
         if np.isfinite(at_rest.condition):
             return float(at_rest.result[0, 0])

@@ -21,8 +21,8 @@ from hvdc_ident.linearize.distance import ModelDistance
 from hvdc_ident.linearize.gain_limits import Crossing
 from hvdc_ident.linearize.loops import disk_phase
 from hvdc_ident.linearize.modal import NamedMode
+from hvdc_ident.linearize.norms import Peak
 from hvdc_ident.linearize.point import OperatingPoint
-from hvdc_ident.linearize.reduction import Peak
 from hvdc_ident.linearize.stability import EIGENVALUES, Stability
 from hvdc_ident.summary.compared_responses import ComparedResponse, response_lines
 from hvdc_ident.text import quantity

@@ -9,8 +9,19 @@ from helpers import linear, stable
 
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError
-from hvdc_ident.linearize import balanced, find_operating_point, h2_norm, hinf_norm, linearize, nu_gap
-from hvdc_ident.linearize.reduction import difference, minimal
+from hvdc_ident.linearize import (
+    balanced,
+    compare,
+    find_operating_point,
+    h2_norm,
+    hinf_norm,
+    linearize,
+    linf_norm,
+    ncf_margin,
+    nu_gap,
+)
+from hvdc_ident.linearize.realisation import difference
+from hvdc_ident.linearize.reduction import minimal
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
 
@@ -90,14 +101,48 @@ def test_the_winding_of_a_delay_is_that_of_its_exact_response(pole, gain, time):
     assert found.value == (1.0 if found.winding else found.distance)
 
 
+def winding_from_eigenvalues(first, second):
+    """Return the count that must be 0 for the nu-gap, of minimal models: zeros less poles of det(1 + P2~ P1) from eigenvalues."""
+
+    def right(a):
+        return int((np.linalg.eigvals(a).real > 1e-9).sum())
+
+    at, bt, ct, dt = -second.A.T, -second.C.T, second.B.T, second.D.T
+    a = np.block([[first.A, np.zeros((len(first.A), len(at)))], [bt @ first.C, at]])
+    b, c = np.concatenate([first.B, bt @ first.D]), np.concatenate([dt @ first.C, ct], axis=1)
+    closed = a - b @ np.linalg.solve(np.eye(first.B.shape[1]) + dt @ first.D, c)
+    axis = int((np.abs(np.linalg.eigvals(second.A).real) <= 1e-9).sum())
+    return right(closed) - right(first.A) - right(at) + right(first.A) - right(second.A) - axis
+
+
+@pytest.mark.parametrize("spread", [0.0, 4.0, 8.0])
+def test_the_winding_is_that_of_eigenvalues(spread):
+    """60 random pairs a spread, with unstable poles, in states of units up to 10^spread apart; half wind."""
+    rng = np.random.default_rng(int(spread))
+    winds = 0
+    for _ in range(60):
+        pair = []
+        m = int(rng.integers(1, 4))
+        for _ in range(2):
+            n = int(rng.integers(1, 12))
+            a = rng.normal(size=(n, n)) - rng.uniform(-0.5, 2.0) * np.sqrt(n) * np.eye(n)
+            unit = 10 ** rng.uniform(-spread / 2, spread / 2, n)
+            b, c, d = rng.normal(size=(n, m)), rng.normal(size=(m, n)), rng.normal(size=(m, m))
+            pair.append(linear(a * unit[:, None] / unit, b * unit[:, None], c / unit, d))
+        count = winding_from_eigenvalues(*pair)
+        assert nu_gap(*pair).winding == count
+        winds += count != 0
+    assert 20 < winds < 55
+
+
 @pytest.mark.parametrize("pole", [-1.0, 0.0, 0.5])
 @pytest.mark.parametrize(("gain", "time"), [(1.0, 0.1), (1.0, 2.0), (5.0, 0.1), (5.0, 0.7), (5.0, 1.0)])
 def test_the_winding_of_a_delay_is_that_of_a_good_approximant(pole, gain, time):
     """The approximant of order 10 is right up to w T = 10, where these gains are below 1; its winding comes from eigenvalues."""
     plain, late = late_lag(pole, gain, 0.0), late_lag(pole, gain, time)
     rational = replace(linearize(late.point.model, late.point, inputs="u", outputs="y", pade_order=10), exact=None)
-    assert nu_gap(plain, late).winding == nu_gap(plain, rational).winding
-    assert nu_gap(late, plain).winding == nu_gap(rational, plain).winding
+    assert nu_gap(plain, late).winding == winding_from_eigenvalues(plain, rational)
+    assert nu_gap(late, plain).winding == winding_from_eigenvalues(rational, plain)
 
 
 def test_poles_on_the_axis_of_a_model_with_a_delay_are_passed_on_their_right():
@@ -111,7 +156,14 @@ def test_poles_on_the_axis_of_a_model_with_a_delay_are_passed_on_their_right():
     plain, seen = linearize(oscillator, **shown), linearize(late, **shown)
     growing = linearize(late.with_values({"d": -0.01}), **shown)
     damped = linearize(late.with_values({"d": 0.01}), **shown)
-    for first, second in ((plain, seen), (seen, plain), (seen, growing), (growing, seen), (damped, growing), (damped, seen)):
+    for first, second in (
+        (plain, seen),
+        (seen, plain),
+        (seen, growing),
+        (growing, seen),
+        (damped, growing),
+        (damped, seen),
+    ):
         found = nu_gap(first, second)
         assert found.winding == 0 and found.value < 0.03
 
@@ -125,7 +177,51 @@ def test_a_resonance_too_narrow_for_any_step_winds():
     )  # fmt: skip
     narrow, plain = linearize(plant), linearize(plant.with_values({"r": 0.0}))
     rational = [replace(m, exact=None) for m in (narrow, plain)]
-    assert nu_gap(narrow, plain).winding == nu_gap(*rational).winding == -nu_gap(plain, narrow).winding != 0
+    assert nu_gap(narrow, plain).winding == winding_from_eigenvalues(*rational) == -nu_gap(plain, narrow).winding != 0
+
+
+def hidden_growth(time, mixed):
+    """Return k e^(-s T)/(s + 1) in feedback round its delay, and beside it a growing state that no input drives and no output sees.
+
+    mixed: in states 2 x + h and x + h, which the equations drive and see, so that their structure does not show it.
+    """
+    states = {"a": "2*f + 0.3*g", "b": "f + 0.3*g"} if mixed else {"x": "f"}
+    signals = {"x_": "a - b", "g": "2*b - a"} if mixed else {"x_": "x"}
+    return Model(
+        name="late", parameters={"T": {"value": time, "unit": "s"}}, inputs={"u": 0.0}, states=states,
+        signals={**signals, "f": "late - x_"}, delays={"late": {"of": "u - 0.4*x_", "time": "T"}}, outputs={"y": "x_"},
+    )  # fmt: skip
+
+
+def test_a_growing_mode_hidden_by_its_numbers_does_not_count_in_the_nu_gap():
+    whole, plain = (linearize(hidden_growth(0.3, mixed)) for mixed in (True, False))
+    assert whole.stability().verdict == "unstable" and plain.stability().verdict == "stable"
+    other = linearize(hidden_growth(0.5, False))
+    for first, second in ((whole, other), (other, whole)):
+        found = nu_gap(first, second)
+        expected = nu_gap(*(plain if m is whole else m for m in (first, second)))
+        assert found.winding == expected.winding == 0
+        assert found.value == pytest.approx(expected.value, rel=1e-6)
+    assert hinf_norm(whole).value == pytest.approx(hinf_norm(plain).value, rel=1e-9)
+
+
+def test_the_difference_of_models_with_delays_is_exact():
+    """|e^(-jwT) - 1| |k/(jw - p)| on a fine grid: an approximant of order 5 leaves it beyond w T = 6."""
+    plain, late = late_lag(-50.0, 50.0, 0.0), late_lag(-50.0, 50.0, 0.5)
+    w = np.linspace(1e-3, 200.0, 400_001)
+    largest = (np.abs(np.exp(-0.5j * w) - 1.0) * np.abs(50.0 / (1j * w + 50.0))).max()
+    assert linf_norm(difference(plain, late)).value == pytest.approx(largest, rel=1e-6)
+    assert compare(plain, late).difference.value == pytest.approx(largest, rel=1e-6)
+
+
+def test_an_attainable_margin_that_cannot_be_computed_is_refused():
+    """Two channels of the average-value model, 1e6 apart in size: no number is a margin there."""
+    found = linearize(load_model("vsc-hvdc-avm"))
+    part = found.channel(found.input_names[:2], found.output_names[:2])
+    with pytest.raises(LinearizationError, match="coprime factors") as told:
+        ncf_margin(part)
+    assert "scale" in told.value.hint
+    assert compare(part, part).attainable is None and "coprime factors" in compare(part, part).notes[0]
 
 
 def test_a_winding_without_a_limit_is_refused():

@@ -10,7 +10,7 @@ from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import find_operating_point, linearize, root_locus
 from hvdc_ident.linearize.linear_model import gradient_of
-from hvdc_ident.linearize.modal import match
+from hvdc_ident.linearize.root_loci import match
 from hvdc_ident.model import Model, Output, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter
@@ -31,6 +31,36 @@ def test_modes_of_an_oscillator():
     assert modes[0].kind == "oscillation"
     assert sum(modes[0].participation.values()) == pytest.approx(1.0)
     assert modes[1].eigenvalue == modes[0].eigenvalue.conjugate()
+
+
+@pytest.mark.parametrize("rate", [-2e-3, 2e-3])
+def test_a_slow_pole_beside_a_fast_one_is_no_integrator(rate):
+    """A boiler beside a snubber: nine decades apart, both are told as they are."""
+    model = linear(np.diag([rate, -1e6]), np.ones((2, 1)), np.ones((1, 2)))
+    slow = next(m for m in model.modes() if m.dominant == "x0")
+    assert (slow.kind, slow.damping) == (("decay", 1.0) if rate < 0 else ("growth", -1.0))
+    assert model.stability().verdict == ("stable" if rate < 0 else "unstable")
+    assert model.bode().omega[0] < abs(rate)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_machines_without_a_reference_rest_at_0(seed):
+    """Undamped machines tied to one another alone: angle and speed of all, whose computed eigenvalues are 1e-7 off 0."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(2, 12))
+    ties = rng.uniform(0.2, 2.0, (n, n))
+    ties = np.triu(ties, 1) + np.triu(ties, 1).T
+    inertia = rng.uniform(2.0, 8.0, n)
+    a = np.zeros((2 * n, 2 * n))
+    a[0::2, 1::2] = 2 * np.pi * 50.0 * np.eye(n)
+    a[1::2, 0::2] = -(np.diag(ties.sum(axis=1)) - ties) / (2.0 * inertia[:, None])
+    model = linear(a, np.eye(2 * n)[:, [1]], np.eye(2 * n)[[0]])
+    assert model.stability().verdict == "on the limit of stability"
+    assert [m.eigenvalue for m in model.modes()].count(0) == 2
+    assert all(m.kind == "oscillation" or m.eigenvalue == 0 or abs(m.damping) < 1e-9 for m in model.modes())
+    damped = a - 0.02 * np.kron(np.eye(n), np.diag([0.0, 1.0]))
+    verdict = linear(damped, np.eye(2 * n)[:, [1]], np.eye(2 * n)[[0]])
+    assert [m.eigenvalue for m in verdict.modes()].count(0) == 1 and verdict.stability().unstable == 0
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -21,7 +21,8 @@ from hvdc_ident.linearize import (
     plant_and_controller,
 )
 from hvdc_ident.linearize.loops import structured_singular_value
-from hvdc_ident.linearize.reduction import difference, norms
+from hvdc_ident.linearize.norms import norms
+from hvdc_ident.linearize.realisation import difference
 from hvdc_ident.models import load_model
 
 

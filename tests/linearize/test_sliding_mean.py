@@ -5,8 +5,7 @@ import pytest
 
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.linearize import hinf_norm, linearize, loop, margins, nu_gap, root_locus
-from hvdc_ident.linearize.realisation import without_sliding_means
-from hvdc_ident.linearize.reduction import difference
+from hvdc_ident.linearize.realisation import difference, without_sliding_means
 from hvdc_ident.models import load_model
 
 W = np.logspace(-1, 2.5, 9)

@@ -1,0 +1,197 @@
+"""The norms of linear models: L-infinity, H-infinity and H2; delays exact but for H2.
+
+python-control 0.10.2 with Slycot 0.7.1 was measured (`benchmarks/linear_library.py`): on models whose states differ in their units
+by 1e8, as companion forms do, two thirds of its H2 norms are off by more than 1e-6, and it calls stable models unstable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+from scipy.optimize import minimize_scalar
+
+from hvdc_ident.codec import Coded
+from hvdc_ident.errors import LinearizationError
+from hvdc_ident.linearize.frequency import wide_omega
+from hvdc_ident.linearize.linear_model import LinearModel
+from hvdc_ident.linearize.realisation import approximate_visible, scaled_states, visible, whole
+from hvdc_ident.linearize.stability import Characteristic, poles_of_transfer
+from hvdc_ident.linearize.system import Array
+
+AXIS = 1e-2
+"""Share of its size by which an imaginary eigenvalue of a Hamiltonian matrix may be off the axis in floating point."""
+
+
+@dataclass(frozen=True)
+class Peak(Coded):
+    """The largest singular value over all frequencies and where it is, rad/s (0 and infinity are places)."""
+
+    value: float
+    omega: float = float("inf")
+
+
+def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
+    """Return the L-infinity norm, max over w of the largest singular value of G(jw), stable or not.
+
+    Raises LinearizationError where a pole that the inputs reach and the outputs see lies on the imaginary axis: the norm is
+    infinite.
+    """
+    equation = _clear_of_axis(model)
+    return largest_gain(equation, wide_omega(model, 4000 if equation.channels else 400), tolerance)
+
+
+def _clear_of_axis(model: LinearModel) -> Characteristic:
+    """Return the equation of a model without poles on the imaginary axis: the visible part where it has such hidden ones.
+
+    The bases that show what is hidden are orthogonal, and mix states of very different sizes: the model's own keep the
+    digits. Raises LinearizationError for a pole on the axis that the inputs reach and the outputs see.
+    """
+    found = whole(model)
+    if not found.channels:
+        found = Characteristic.rational(*scaled_states(found.matrix, found.given, found.read), found.through, found.error)
+    if found.channels or found.roots.axis:
+        found = visible(model)
+        axis = poles_of_transfer(found, f"linear model '{model.name}'")[1]
+        if axis.size:
+            raise LinearizationError(
+                "the L-infinity norm is infinite: a pole lies on the imaginary axis",
+                where=f"linear model '{model.name}'",
+                got=f"eigenvalue {axis[0]:.6g}",
+                hint="compare with nu_gap, which takes integrators",
+            )
+    return found
+
+
+def largest_gain(equation: Characteristic, omega: Array, tolerance: float = 1e-13) -> Peak:
+    """Return the largest singular value of a response without poles on the imaginary axis, and where it is.
+
+    omega: frequencies, rad/s, among which the search begins. Without delays, two-step bisection on the imaginary eigenvalues
+    of the Hamiltonian matrix from there (Bruinsma and Steinbuch 1990), which needs no stability; with delays the peak is
+    refined beside the largest value.
+    """
+
+    def gains(w: Array) -> Array:
+        return np.linalg.svd(equation.response(1j * w), compute_uv=False)[:, 0]
+
+    d = equation.through
+    if equation.channels:
+        return peak_over(gains, np.concatenate([[0.0], omega]))
+    top = float(np.linalg.norm(d, 2)) if d.size else 0.0
+    if not equation.nx or not d.size:
+        return Peak(top, float("inf") if top else 0.0)
+    poles = equation.roots.values
+    best = Peak(top, float("inf"))
+    at = np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag), omega])
+    for _ in range(60):
+        values = gains(at)
+        k = int(np.argmax(values))
+        if values[k] <= best.value * (1.0 + tolerance):
+            break
+        best = Peak(float(values[k]), float(at[k]))
+        crossings = _axis_crossings(equation, best.value * (1.0 + 2.0 * max(tolerance, 1e-12)))
+        if crossings.size < 2:
+            break
+        at = np.concatenate([crossings, 0.5 * (crossings[:-1] + crossings[1:])])
+    return Peak(0.0, 0.0) if best.value == 0.0 else refined(lambda w: float(gains(np.array([w]))[0]), best)
+
+
+def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
+    """Return the H-infinity norm: the L-infinity norm of a stable model.
+
+    Raises LinearizationError where a pole that inputs reach and outputs see is not stable.
+    """
+    _refuse_unstable(model, "an unstable model has no H-infinity norm")
+    return linf_norm(model, tolerance)
+
+
+def _refuse_unstable(model: LinearModel, what: str) -> None:
+    """Raise LinearizationError where a model is not stable between inputs and outputs, or cannot be told to be."""
+    right, axis = poles_of_transfer(visible(model), f"linear model '{model.name}'")
+    if right or axis.size:
+        raise LinearizationError(
+            what,
+            where=f"linear model '{model.name}'",
+            got=f"{right} poles right of the imaginary axis and {axis.size} on it",
+            hint="linf_norm takes unstable models without poles on the imaginary axis, nu_gap any",
+        )
+
+
+def h2_norm(model: LinearModel) -> float:
+    """Return the H2 norm, by a Gramian. Raises LinearizationError where it is infinite: unstable, or D not 0.
+
+    Delays stand as their Pade approximants in the value, not in the verdict on stability.
+    """
+    _refuse_unstable(model, "the H2 norm is infinite: the model is not stable")
+    found = approximate_visible(model)
+    if np.any(found.through):
+        raise LinearizationError("the H2 norm is infinite: D is not 0", where=f"linear model '{model.name}'")
+    if found.nx == 0:
+        return 0.0
+    if found.roots.unstable or found.roots.axis:
+        raise LinearizationError(
+            "the H2 norm is not known: the model is stable, and its delays' Pade approximants are not",
+            where=f"linear model '{model.name}'",
+        )
+    a, b, c, _ = found.matrices
+    gramian = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
+    return float(np.sqrt(max(np.trace(c @ gramian @ c.T), 0.0)))
+
+
+def norms(model: LinearModel) -> dict[str, Any]:
+    """Return H2, H-infinity and L-infinity norms as plain numbers; of one that does not exist, None and the reason."""
+    found: dict[str, Any] = {}
+    for name, norm in (("h2", h2_norm), ("hinf", hinf_norm), ("linf", linf_norm)):
+        try:
+            value = norm(model)
+        except LinearizationError as e:
+            found[name] = None
+            found[f"{name}_reason"] = e.what
+        else:
+            found[name] = value.to_dict() if isinstance(value, Peak) else value
+    return found
+
+
+def _axis_crossings(equation: Characteristic, level: float) -> Array:
+    """Return frequencies among which are all at which a singular value equals the level.
+
+    They are imaginary parts of imaginary eigenvalues of the Hamiltonian matrix, here of those within `AXIS` of the axis: more
+    than rounding moves them. One that is none does no harm, for the gain is computed there.
+    """
+    a, b, c, d = equation.matrices
+    r = level**2 * np.eye(d.shape[1]) - d.T @ d
+    inner = np.linalg.solve(r, d.T @ c)
+    f = a + b @ inner
+    top = b @ np.linalg.solve(r, b.T)
+    bottom = -(c.T @ c + c.T @ d @ inner)
+    # Both sides counted in units in which the two blocks off the diagonal are alike.
+    unit = np.sqrt(
+        max(float(np.abs(bottom).max(initial=0.0)), 1e-300) / max(float(np.abs(top).max(initial=0.0)), 1e-300)
+    )
+    values = np.linalg.eigvals(np.block([[f, top * unit], [bottom / unit, -f.T]]))
+    return np.unique(np.abs(values[np.abs(values.real) < AXIS * np.abs(values)].imag))
+
+
+NEAR = 0.05
+"""Logarithm of frequency either side of a peak within which it is refined: the distance of two frequencies of a grid."""
+
+
+def refined(gain: Callable[[float], float], best: Peak) -> Peak:
+    """Return the peak near a frequency at which the gain is known."""
+    if not 0.0 < best.omega < np.inf:
+        return best
+    found = minimize_scalar(
+        lambda x: -gain(float(np.exp(x))),
+        bounds=(np.log(best.omega) - NEAR, np.log(best.omega) + NEAR), method="bounded", options={"xatol": 1e-12},
+    )  # fmt: skip
+    return Peak(-float(found.fun), float(np.exp(found.x))) if -found.fun > best.value else best
+
+
+def peak_over(values: Callable[[Array], Array], grid: Array) -> Peak:
+    """Return the largest of some positive values over the frequencies of a grid, refined beside the largest."""
+    found = values(grid)
+    k = int(np.argmax(found))
+    return refined(lambda w: float(values(np.array([w]))[0]), Peak(float(found[k]), float(grid[k])))
