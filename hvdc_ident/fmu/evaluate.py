@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import ModelError
 from hvdc_ident.fmu.gradients import DifferentiatedRun, Differentiation, RunRequest, Varied
+from hvdc_ident.fmu.last_runs import LastRuns
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import Simulation, Statistics, Tolerance
@@ -19,7 +20,6 @@ from hvdc_ident.simulate import Simulation, Statistics, Tolerance
 if TYPE_CHECKING:
     from hvdc_ident.fmu.model import FmuModel
 
-KEPT = 64 * 2**20  # bytes of the runs that are kept, the last one in any case
 REUSE_NOTES = {
     "instance": "a reset does not bring the FMU back to its start: each run has a new instance",
     "process": "neither a reset nor a new instance brings the FMU back to its start: each run has a new process",
@@ -41,24 +41,21 @@ def simulate_without_effects(
 ) -> Simulation:
     """Return the run of the FMU itself.
 
-    The last runs are not run again, as many as take `KEPT` bytes: refits of effects at the outputs request the same ones
-    many times. fresh: whether it is run all the same. partial: whether the
-    rows up to an end that the FMU asks for are accepted. noise_key: shared by runs whose noise and difference steps are
+    fresh: whether one of the last runs is run all the same. partial: whether the rows up to an end that the FMU asks for are
+    accepted. noise_key: shared by runs whose noise and difference steps are
     alike though their inputs differ. directions: in which all inputs move; derivatives along them come after those of the
     sensitivities.
     """
-    cache: dict[bytes, DifferentiatedRun] = model.pool.cache
+    cache: LastRuns[DifferentiatedRun] = model.pool.cache
     signals = PackedInputs.of(list(inputs_of(model, experiment, given).values()))
     run = RunRequest(changed(model, given), signals, experiment.time, names, tolerance.rtol)
     varied = [*_varied(model, run, sensitivities), *directions]
     labels = [v.label for v in varied]
-    made = None if fresh else cache.pop(run.key, None)
+    made = None if fresh else cache.taken(run.key)
     if made is None or not made.has(labels):
         made = Differentiation(model.pool, run, varied, noise_key, partial, made).result()
     if made.end is None:
-        cache[run.key] = made
-    while sum(r.outputs.nbytes + r.gradients.nbytes for r in cache.values()) > KEPT and len(cache) > 1:
-        del cache[next(iter(cache))]
+        cache.keep(run.key, made)
     columns = [made.labels.index(label) for label in labels]
     errors = made.errors[columns]
     notes = {**_learned_notes(model.pool.learned), **made.notes}

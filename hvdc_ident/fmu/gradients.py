@@ -115,6 +115,11 @@ class DifferentiatedRun:
     end: float | None
     directional: bool
 
+    @property
+    def size(self) -> int:
+        """Bytes of its arrays."""
+        return self.outputs.nbytes + self.gradients.nbytes
+
     def has(self, labels: Sequence[str]) -> bool:
         """Return whether it has these derivatives, and is the run that is made for them: plain where none are wanted."""
         return set(labels) <= set(self.labels) and bool(labels or not self.directional)

@@ -13,7 +13,8 @@ from hvdc_ident.data import Array, InputSignal
 
 FIRST_INTERVALS = 256  # of a grid, before it is refined
 LINE_TOLERANCE = 1e-5  # deviation from lines, in shares of the signal's range
-MAX_HALVINGS = 24  # of an interval, which leave 2e-10 of the span around a jump
+MOST_PARTS = 8  # into which an interval is divided at once
+MAX_DIVISIONS = 8  # of an interval, which leave 2e-10 of the span around a jump
 MAX_POINTS = 40_000  # of a refined grid
 
 
@@ -111,28 +112,37 @@ def sampling_grid(time: Array, breaks: Array, count: int) -> Array:
 def refined_grid(run: Callable[[Array], Array], time: Array, breaks: Array) -> Array:
     """Return instants such that lines between the run's values, (n, signals), are within LINE_TOLERANCE of them.
 
-    An interval with a jump inside is halved until its length is negligible.
+    An interval is divided into as many parts as it takes where its deviation falls with the square of their length, as that of
+    a smooth signal does, and its parts are looked at in turn; one with a jump inside until its length is negligible.
     """
     begin, end = float(time[0]), float(time[-1])
     if begin == end:
         return time[:1].copy()
     grid = sampling_grid(np.array([begin, end]), breaks, FIRST_INTERVALS)
     coarse = np.diff(grid) > 0
-    for _ in range(MAX_HALVINGS):
-        middles = 0.5 * (grid[:-1] + grid[1:])[coarse]
-        if not middles.size or grid.size + middles.size > MAX_POINTS:
+    for _ in range(MAX_DIVISIONS):
+        low, length = grid[:-1][coarse], np.diff(grid)[coarse]
+        if not low.size or grid.size + low.size > MAX_POINTS:
             break
-        order = np.argsort(np.concatenate([grid, middles]), kind="stable")
-        finer = np.concatenate([grid, middles])[order]
-        new = np.flatnonzero(order >= grid.size)
+        finer, middles = _with_points(grid, low + 0.5 * length)
         values = run(finer)
         scale = np.maximum(np.ptp(values, axis=0), 1e-12)
-        deviation = np.abs(values[new] - 0.5 * (values[new - 1] + values[new + 1])) / scale
-        bent = new[(deviation > LINE_TOLERANCE).any(axis=1)]
-        coarse = np.zeros(finer.size - 1, dtype=bool)
+        deviation = np.abs(values[middles] - 0.5 * (values[middles - 1] + values[middles + 1])) / scale
+        times = deviation.max(axis=1, initial=0.0) / LINE_TOLERANCE
+        parts = np.where(times > 1.0, np.clip(np.ceil(np.sqrt(times)), 2, MOST_PARTS), 2).astype(int)
+        share = np.concatenate([np.arange(1, k) / k for k in parts])
+        grid, added = _with_points(grid, np.repeat(low, parts - 1) + share * np.repeat(length, parts - 1))
+        bent = added[np.repeat(times > 1.0, parts - 1)]
+        coarse = np.zeros(grid.size - 1, dtype=bool)
         coarse[bent - 1] = coarse[bent] = True
-        grid = finer
     return grid
+
+
+def _with_points(grid: Array, points: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Return a grid with more points, in order, and where these are in it."""
+    joined = np.concatenate([grid, points])
+    order = np.argsort(joined, kind="stable")
+    return joined[order], np.flatnonzero(order >= grid.size)
 
 
 def signal_of(time: Array, values: Array, breaks: Array) -> InputSignal:

@@ -13,6 +13,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
+from itertools import chain, count
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -63,7 +64,7 @@ def _free_prefix(model: FmuModel, use: EffectUse) -> str:
     place = re.sub(r"\W+", "_", use.at[0].removeprefix("outputs.")).strip("_")  # der(mass.v), a[1]
     first = use.prefix or f"{use.label}_{place}"
     names = effects()[use.effect].parameters
-    tried = (first, *(f"{first}_{k}" for k in range(2, 10_000)))
+    tried = chain([first], (f"{first}_{k}" for k in count(2)))
     return next(p for p in tried if not any(f"{p}_{n}" in model.parameters for n in names))
 
 

@@ -25,6 +25,7 @@ from hvdc_ident.errors import InputError, SimulationError, require_known
 from hvdc_ident.fmu.archive import Folder, shared_folder, unpacked_folder
 from hvdc_ident.fmu.description import Description, Message, Setup
 from hvdc_ident.fmu.differences import DifferenceStep
+from hvdc_ident.fmu.last_runs import LastRuns
 from hvdc_ident.parallel import Child, Ending, Watch, available_cores
 from hvdc_ident.parallel.progress import RESIDENT, SPACE, begin
 
@@ -156,10 +157,9 @@ class WorkerPool:
     learned: what workers have found out about the FMU in its first runs, for all: "restart", how it is brought back to its
     start (see `hvdc_ident.fmu.runner`), "restart at a point", and how a co-simulation is called (see
     `hvdc_ident.fmu.co_simulation`). confirmed: by parameter or input, whether a run confirmed the FMU's own derivatives.
-    steps, noise: of differences of runs, by a digest of the experiment. cache: the last runs, see
-    `hvdc_ident.fmu.evaluate`. memory: bytes of the first worker after its last answer. sensitivity_error: largest relative
-    error of a derivative by differences. started: processes so far. runs: whole runs of the FMU so far, those for
-    derivatives among them.
+    steps, noise: of differences of runs, by a digest of the experiment. cache: the last runs. memory: bytes of the first
+    worker after its last answer. sensitivity_error: largest relative error of a derivative by differences. started: processes
+    so far. runs: whole runs of the FMU so far, those for derivatives among them.
     """
 
     description: Description
@@ -179,7 +179,7 @@ class WorkerPool:
         self._busy = 1  # workers of the last request
         self.steps: dict[bytes, DifferenceStep] = {}
         self.noise: dict[bytes, Array] = {}
-        self.cache: dict[bytes, Any] = {}
+        self.cache: LastRuns[Any] = LastRuns()
         self.memory = 0
         self.sensitivity_error = 0.0
         self.started = 0
