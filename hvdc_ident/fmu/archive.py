@@ -1,4 +1,4 @@
-"""An FMU's archive: checked before anything of it is parsed or run, and the folder that it is unpacked into.
+"""An FMU's archive: checked before anything of it is run, its XML, and the folder that it is unpacked into.
 
 The checks, and the process that the FMU runs in, contain accidents: damaged archives, crashes, endless loops. They do
 not contain malice: load only FMUs you trust.
@@ -23,7 +23,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
-from xml.parsers import expat
+from xml.etree import ElementTree
 
 from hvdc_ident.errors import ModelError
 
@@ -33,9 +33,9 @@ MOST_RATIO = 200  # of unpacked to packed bytes; a zip bomb reaches 1000
 MOST_LEVELS = 100  # of elements in each other; a description has six
 MOST_XML = 64 * 2**20  # bytes of a model description; a hundred thousand variables take half of it
 DESCRIPTION = "modelDescription.xml"
-ROOTS = {DESCRIPTION: "fmiModelDescription", "sources/buildDescription.xml": "fmiBuildDescription"}
-PARSED = tuple(ROOTS)
-"""Files that are read as XML."""
+BUILDS = "sources/buildDescription.xml"
+ROOTS = {DESCRIPTION: "fmiModelDescription", BUILDS: "fmiBuildDescription"}
+"""Files that are read as XML, and the elements that they are."""
 DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
@@ -67,16 +67,11 @@ def check_archive(path: Path) -> tuple[str, ...]:
                 f"at most {MOST_RATIO} times its size",
                 f"{total / packed:.0f} times",
             )
-        names = list(dict.fromkeys(e.filename for e in entries))
-        _check_doubles(path, entries)
-        if DESCRIPTION not in names:
-            raise _refused(
-                path, "the archive is no FMU", f"a file {DESCRIPTION} in it", ", ".join(names[:5]) or "nothing"
-            )
-        for name in PARSED:
-            if name in names:
-                _check_xml(path, archive, name)
-    return tuple(names)
+    names = tuple(dict.fromkeys(e.filename for e in entries))
+    _check_doubles(path, entries)
+    if DESCRIPTION not in names:
+        raise _refused(path, "the archive is no FMU", f"a file {DESCRIPTION} in it", ", ".join(names[:5]) or "nothing")
+    return names
 
 
 def check_identifier(path: Path, identifier: str | None) -> str:
@@ -182,7 +177,7 @@ def _check_doubles(path: Path, entries: Iterable[zipfile.ZipInfo]) -> None:
     seen: dict[str, tuple[int, int]] = {}
     for entry in entries:
         name, content = _plain(entry.filename), (entry.file_size, entry.CRC)
-        used = name in PARSED or name.startswith(("binaries/", "resources/"))
+        used = name in ROOTS or name.startswith(("binaries/", "resources/"))
         if used and seen.setdefault(name, content) != content:
             raise _refused(path, "the FMU has two different files of one name", "one of each", name)
 
@@ -192,43 +187,54 @@ def _plain(name: str) -> str:
     return name.replace("\\", "/")
 
 
-def _check_xml(path: Path, archive: zipfile.ZipFile, name: str) -> None:
-    """Raise ModelError where the XML is too large or deep, not well-formed, or has a DOCTYPE, which could define entities."""
+def parsed(path: Path, name: str) -> ElementTree.Element:
+    """Return the root of an XML file in a checked archive.
+
+    Raises ModelError where it is too large or deep, not well-formed, another document, or has a DOCTYPE, which could
+    define entities.
+    """
     where = f"{path}, {name}"
-    size = archive.getinfo(name).file_size
-    if size > MOST_XML:
-        raise ModelError("the XML is too large", where=where, expected=f"at most {MOST_XML} bytes", got=f"{size} bytes")
-    parser = expat.ParserCreate()
-
-    def doctype(*_: object) -> None:
-        raise ModelError(
-            "the XML has a DOCTYPE", where=where, expected="none: no FMU needs one, and entity bombs come that way"
-        )
-
-    depth = 0
-
-    def deeper(tag: str, _: object) -> None:
-        nonlocal depth
-        depth += 1
-        if depth == 1 and tag != ROOTS[name]:
-            raise ModelError("the XML is another document", where=where, expected=ROOTS[name], got=tag[:80])
-        if depth > MOST_LEVELS:
-            raise ModelError("the XML is nested too deep", where=where, expected=f"at most {MOST_LEVELS} levels")
-
-    def higher(_: str) -> None:
-        nonlocal depth
-        depth -= 1
-
-    parser.StartDoctypeDeclHandler, parser.StartElementHandler, parser.EndElementHandler = doctype, deeper, higher
+    parser = ElementTree.XMLParser(target=_Guard(where, ROOTS[name]))
     try:
-        with archive.open(name) as source:
-            while block := source.read(1 << 16):
-                parser.Parse(block, False)
-            parser.Parse(b"", True)
-    except expat.ExpatError as e:
+        with _opened(path) as archive:
+            size = archive.getinfo(name).file_size
+            if size > MOST_XML:
+                limit = f"at most {MOST_XML} bytes"
+                raise ModelError("the XML is too large", where=where, expected=limit, got=f"{size} bytes")
+            with archive.open(name) as source:
+                while block := source.read(1 << 16):
+                    parser.feed(block)
+        root: ElementTree.Element = parser.close()
+    except ElementTree.ParseError as e:
         raise ModelError(f"the XML is not well-formed: {e}", where=where) from None
     except (*DAMAGE, LookupError) as e:
         raise ModelError(f"the XML cannot be read: {e}", where=where) from None
+    return root
+
+
+class _Guard(ElementTree.TreeBuilder):
+    """Maker of a tree that refuses what no FMU needs."""
+
+    def __init__(self, where: str, root: str) -> None:
+        super().__init__()
+        self._where, self._root, self._depth = where, root, 0
+
+    def doctype(self, *_: object) -> None:
+        hint = "none: no FMU needs one, and entity bombs come that way"
+        raise ModelError("the XML has a DOCTYPE", where=self._where, expected=hint)
+
+    def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
+        self._depth += 1
+        if self._depth == 1 and tag != self._root:
+            raise ModelError("the XML is another document", where=self._where, expected=self._root, got=tag[:80])
+        if self._depth > MOST_LEVELS:
+            limit = f"at most {MOST_LEVELS} levels"
+            raise ModelError("the XML is nested too deep", where=self._where, expected=limit)
+        return super().start(tag, attrs)
+
+    def end(self, tag: str) -> ElementTree.Element:
+        self._depth -= 1
+        return super().end(tag)
 
 
 def _refused(path: Path, what: str, expected: str, got: str) -> ModelError:

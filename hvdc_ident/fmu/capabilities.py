@@ -12,12 +12,10 @@ from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.errors import HvdcIdentError, ModelError
 from hvdc_ident.fmu.archive import check_archive
 from hvdc_ident.fmu.description import (
-    INTERFACES,
     Description,
     Variable,
     check_binary,
     has_sources,
-    parsed,
     platforms,
     read_description,
 )
@@ -171,42 +169,33 @@ def read_capabilities(path: str | Path) -> Capabilities:
     """Return an FMU's capabilities as it describes them, without running it. Raises ModelError for no FMU of FMI 2.0 or 3.0."""
     file = Path(path)
     names = check_archive(file)
-    given = parsed(file)
-    described = read_description(file, binary=False, known=given)
-    groups = _groups(described)
+    d = read_description(file, binary=False)
+    groups = _groups(d)
     try:
-        check_binary(file, names, described.version, described.identifier)
+        check_binary(file, names, d.version, d.identifier)
         problem = ""
     except ModelError as e:
         problem = f"{e.what}, but {e.got}"
-    offered = zip(INTERFACES, (given.modelExchange, given.coSimulation), strict=True)
-    default = {"start": "startTime", "stop": "stopTime", "tolerance": "tolerance", "step": "stepSize"}
-    stated = {words: getattr(given.defaultExperiment, attribute, None) for words, attribute in default.items()}
+    stated = {k: {words: s[a] for words, a in OFFERS.items() if a in s} for k, s in d.interfaces.items()}
     return Capabilities(
         file=file.name,
-        name=given.modelName or file.stem,
-        fmi=str(given.fmiVersion),
-        tool=given.generationTool or "",
-        date=given.generationDateAndTime or "",
-        description=" ".join((given.description or "").split()),
-        interfaces=FrozenMap({str(k): _offers(i) for k, i in offered if i is not None}),
+        name=d.name,
+        fmi=d.fmi,
+        tool=d.tool,
+        date=d.date,
+        description=" ".join(d.text.split()),
+        interfaces=FrozenMap({str(k): FrozenMap(s) for k, s in stated.items()}),
         platforms=FrozenMap({k: tuple(v) for k, v in platforms(names).items()}),
         sources=has_sources(names),
         problem=problem,
-        experiment=FrozenMap({k: float(v) for k, v in stated.items() if v is not None}),
-        indicators=int(given.numberOfEventIndicators or 0),
-        log_categories=tuple(c.name for c in given.logCategories),
+        experiment=d.experiment,
+        indicators=d.indicators,
+        log_categories=d.log_categories,
         groups=groups,
-        sizes=FrozenMap({g: len(vs) for g, vs in groups.items()} | {"states": len(given.derivatives)}),
-        arrays=described.arrays,
-        unused=tuple(v.name for v in given.modelVariables if v.type in ("String", "Binary", "Clock")),
+        sizes=FrozenMap({g: len(vs) for g, vs in groups.items()} | {"states": d.state_count}),
+        arrays=d.arrays,
+        unused=d.unused,
     )
-
-
-def _offers(interface: Any) -> FrozenMap[Any]:
-    """Return the values of OFFERS that one kind of interface has, by their words."""
-    values = {words: getattr(interface, attribute, None) for words, attribute in OFFERS.items()}
-    return FrozenMap({words: value for words, value in values.items() if value is not None})
 
 
 def _groups(d: Description) -> FrozenMap[FrozenMap[Variable]]:

@@ -13,12 +13,13 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from xml.etree.ElementTree import Element
 
 from hvdc_ident.errors import ComputationError, InputError, ModelError
-from hvdc_ident.fmu.archive import check_archive, check_identifier, unpack
-from hvdc_ident.fmu.description import has_sources, parsed
+from hvdc_ident.fmu.archive import BUILDS, check_archive, check_identifier, parsed, unpack
+from hvdc_ident.fmu.description import Document, has_sources, read_document
 
 LIBRARY = "compiled.library"
 COMPILERS = ("cc", "gcc", "clang")
@@ -41,11 +42,11 @@ def compiler() -> list[str] | None:
     return [found] if found else None
 
 
-def binary_folder(version: str) -> str:
-    """Return the folder under `binaries` for this machine, as the version of the standard names it."""
+def binary_folder(version: int) -> str:
+    """Return the folder under `binaries` for this machine, as the version of the standard names it: 2 or 3."""
     machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(platform.machine().lower(), platform.machine().lower())
     system = {"linux": "linux", "darwin": "darwin", "win32": "windows"}.get(sys.platform, sys.platform)
-    if version == "2.0" and machine == "x86_64":
+    if version == 2 and machine == "x86_64":
         return {"linux": "linux64", "darwin": "darwin64", "windows": "win64"}.get(system, system)
     return f"{machine}-{system}"
 
@@ -87,63 +88,89 @@ def compile_fmu(path: Path, target: Path | None = None) -> Path:
     command = compiler()
     if command is None:
         raise InputError("no C compiler is here", where="cc, gcc, clang", hint="install gcc, or set CC to a compiler")
-    description = parsed(path)
+    document = read_document(path)
+    described = _described_builds(document, parsed(path, BUILDS) if BUILDS in names and document.version == 3 else None)
     with tempfile.TemporaryDirectory(prefix="hvdc-ident-") as place:
         unpack(path, Path(place))
         binaries = {}
-        for build in description.buildConfigurations or [_default_build(description, Path(place, "sources"))]:
-            identifier = check_identifier(path, build.modelIdentifier)
-            library = f"binaries/{binary_folder(description.fmiVersion)}/{identifier}{library_suffix()}"
-            needed = _functions(description, identifier)
-            binaries[library] = _binary(command, Path(place), build.sourceFileSets, path, identifier, needed)
+        for build in described or [_default_build(document, Path(place, "sources"))]:
+            identifier = check_identifier(path, build.identifier)
+            library = f"binaries/{binary_folder(document.version)}/{identifier}{library_suffix()}"
+            binaries[library] = _binary(command, Path(place), build, path, _functions(document, identifier))
         _write(path, new, binaries)
     return new
 
 
-def _default_build(description: Any, sources: Path) -> Any:
-    """Return the build of an FMU that does not describe it: every C file that no other one includes."""
-    from fmpy.model_description import BuildConfiguration, SourceFileSet
+@dataclass(frozen=True)
+class Build:
+    """A library to be made. languages: of its sets of files. files, includes: paths below `sources`. defines: of a preprocessor."""
 
+    identifier: str | None
+    languages: tuple[str, ...]
+    files: tuple[str, ...]
+    includes: tuple[str, ...] = ()
+    defines: tuple[str, ...] = ()
+
+
+def _described_builds(document: Document, builds: Element | None) -> list[Build]:
+    """Return the builds that an FMU describes, one for each model identifier. builds: root of its description in FMI 3.0."""
+    if document.version == 2:
+        found: dict[str | None, Build] = {}
+        for kind in ("ModelExchange", "CoSimulation"):
+            for element in document.root.iterfind(kind):
+                identifier, files = element.get("modelIdentifier"), _named(element, "SourceFiles/File")
+                if files:
+                    found.setdefault(identifier, Build(identifier, ("",), files))
+        return list(found.values())
+    return [
+        Build(
+            b.get("modelIdentifier"),
+            tuple(s.get("language", "") for s in b.iterfind("SourceFileSet")),
+            _named(b, "SourceFileSet/SourceFile"),
+            _named(b, "SourceFileSet/IncludeDirectory"),
+            tuple(f"{d.get('name')}={d.get('value', '')}" for d in b.iterfind("SourceFileSet/PreprocessorDefinition")),
+        )
+        for b in (() if builds is None else builds.iterfind("BuildConfiguration"))
+    ]
+
+
+def _named(element: Element, below: str) -> tuple[str, ...]:
+    return tuple(e.get("name", "") for e in element.iterfind(below))
+
+
+def _default_build(document: Document, sources: Path) -> Build:
+    """Return the build of an FMU that does not describe it: every C file that no other one includes."""
     files = sorted(sources.glob("*.c"))
     text = "\n".join(f.read_text("utf-8", "replace") for f in files)
     included = set(re.findall(r'^\s*#\s*include\s*"([^"]+)"', text, re.MULTILINE))
-    interface = description.modelExchange or description.coSimulation
-    names = [f.name for f in files if f.name not in included]
-    return BuildConfiguration(
-        modelIdentifier=interface.modelIdentifier, sourceFileSets=[SourceFileSet(language="C99", sourceFiles=names)]
-    )
+    first = next(iter(document.interfaces.values()), {})
+    return Build(first.get("modelIdentifier"), ("C99",), tuple(f.name for f in files if f.name not in included))
 
 
-def _functions(description: Any, identifier: str) -> list[str]:
+def _functions(document: Document, identifier: str) -> list[str]:
     """Return the functions of FMI that the library of a model identifier has to have: those that FMPy binds."""
-    from fmpy.fmi2 import FMU2Model, FMU2Slave
-    from fmpy.fmi3 import FMU3Model, FMU3Slave
+    from hvdc_ident.fmu.fmi import binding
 
-    two = description.fmiMajorVersion == 2
-    bindings = {"modelExchange": FMU2Model if two else FMU3Model, "coSimulation": FMU2Slave if two else FMU3Slave}
-    offered = [
-        b for kind, b in bindings.items() if identifier == getattr(getattr(description, kind), "modelIdentifier", None)
-    ]
-    return sorted({n for b in offered for n in dir(b) if n.startswith(f"fmi{description.fmiMajorVersion}")})
+    offered = [k for k, attributes in document.interfaces.items() if attributes.get("modelIdentifier") == identifier]
+    names = {n for k in offered for n in dir(binding(document.version, k))}
+    return sorted(n for n in names if n.startswith(f"fmi{document.version}"))
 
 
-def _binary(
-    command: list[str], folder: Path, sets: list[Any], path: Path, identifier: str, needed: Sequence[str]
-) -> bytes:
-    """Return the shared library of an unpacked FMU's sets of source files, with the functions that are needed."""
+def _binary(command: list[str], folder: Path, build: Build, path: Path, needed: Sequence[str]) -> bytes:
+    """Return the shared library of an unpacked FMU's build, with the functions that are needed."""
     import fmpy
 
     sources, headers = folder / "sources", Path(fmpy.__file__).parent / "c-code"
-    if len(sets) != 1 or sets[0].language not in (None, "", *LANGUAGES):
-        got = ", ".join(str(s.language) for s in sets) or "no files"
+    if len(build.languages) != 1 or build.languages[0] not in ("", *LANGUAGES):
+        got = ", ".join(build.languages) or "no files"
         raise ModelError("the FMU's sources are not C alone", where=str(path), expected="one set of C files", got=got)
-    files = [(sources / f).resolve() for f in sets[0].sourceFiles]
+    files = [(sources / f).resolve() for f in build.files]
     outside = next((f for f in files if not f.is_relative_to(sources.resolve()) or not f.is_file()), None)
     if outside is not None:
         raise ModelError(f"the source file '{outside.name}' is not in the FMU", where=str(path))
-    includes = [f"-I{f}" for f in (sources, *(sources / d for d in sets[0].includeDirectories), headers)]
-    defines = [f"-D{d.name}={d.value or ''}" for d in sets[0].preprocessorDefinitions]
-    standard = [f"-std=gnu{sets[0].language[1:]}"] if sets[0].language else []
+    includes = [f"-I{f}" for f in (sources, *(sources / d for d in build.includes), headers)]
+    defines = [f"-D{d}" for d in build.defines]
+    standard = [f"-std=gnu{build.languages[0][1:]}"] if build.languages[0] else []
     flags = ["-shared", "-fPIC", "-O2", "-w", *standard, *PLAIN_NAMES, *defines, *includes]
     hint = "its maker knows which headers or compiler they need; else have it exported for this machine"
     refusal = "the C compiler refuses the FMU's sources", str(path), hint
@@ -151,7 +178,7 @@ def _binary(
     library = _library(command, arguments, folder, refusal)
     lacking = _lacking(command, folder, needed)
     if lacking and set(lacking) <= set(needed):  # sources that define the prefix themselves: plain names beside theirs
-        aliases = [f"-Wl,--defsym,{n}={identifier}_{n}" for n in lacking]
+        aliases = [f"-Wl,--defsym,{n}={build.identifier}_{n}" for n in lacking]
         with contextlib.suppress(ComputationError):  # there are no such functions either
             library = _library(command, [*arguments, *aliases], folder, refusal)
             lacking = _lacking(command, folder, needed)

@@ -19,7 +19,7 @@ import numpy as np
 from fmpy.fmi1 import FMICallException
 
 from hvdc_ident.data import Array
-from hvdc_ident.fmu.description import REAL, Description, Variable
+from hvdc_ident.fmu.description import REAL, Description, Interface, Variable
 from hvdc_ident.parallel.progress import NOW, START, STOP, no_progress
 
 FmiError = FMICallException
@@ -171,21 +171,26 @@ def _missing(library: Any, name: str, types: Sequence[Any]) -> Function:
     return call
 
 
+def binding(version: int, interface: Interface) -> Any:
+    """Return FMPy's class of an interface: an instance binds the functions of a library."""
+    from fmpy.fmi2 import FMU2Model, FMU2Slave
+    from fmpy.fmi3 import FMU3Model, FMU3Slave
+
+    exchange = interface == "model-exchange"
+    if version == 2:
+        return FMU2Model if exchange else FMU2Slave
+    return FMU3Model if exchange else FMU3Slave
+
+
 class FmiLibrary:
     """An FMU's library with at most one instance. Methods are the calls of FMI, without their prefixes."""
 
     def __init__(self, description: Description, folder: str) -> None:
-        from fmpy.fmi2 import FMU2Model, FMU2Slave
-        from fmpy.fmi3 import FMU3Model, FMU3Slave
-
         self.description, self.version = description, description.version
         self.exchange = description.interface == "model-exchange"
-        kind: Any = {(2, True): FMU2Model, (2, False): FMU2Slave, (3, True): FMU3Model, (3, False): FMU3Slave}[
-            self.version, self.exchange
-        ]
         self.messages: list[str] = []
         self.progress = no_progress()  # where it is noted how far a run is
-        self.fmu: Any = kind(
+        self.fmu = binding(self.version, description.interface)(
             guid=description.token,
             unzipDirectory=folder,
             modelIdentifier=description.identifier,

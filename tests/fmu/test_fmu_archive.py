@@ -7,7 +7,6 @@ import stat
 import zipfile
 from itertools import pairwise
 
-import fmpy
 import pytest
 from c_fmu import CModel, Var, description
 from fmpy import platform, platform_tuple, sharedLibraryExtension
@@ -18,6 +17,7 @@ from hvdc_ident import load_model
 from hvdc_ident.errors import InputError, ModelError
 from hvdc_ident.fmu import archive as checks
 from hvdc_ident.fmu import compile_fmu, read_capabilities, read_description
+from hvdc_ident.fmu import description as read
 
 PLAIN = CModel(
     "lag",
@@ -138,9 +138,9 @@ def test_the_xml_is_well_formed_and_has_no_doctype(tmp_path):
             load_model(written(tmp_path / "a.fmu", text))
     with pytest.raises(ModelError, match="not well-formed"):
         load_model(written(tmp_path / "b.fmu", "<fmiModelDescription>"))
-    built = written(tmp_path / "c.fmu", version=3, entries=[("sources/buildDescription.xml", bomb)])
+    sources = [("sources/lag.c", "int lag;"), ("sources/buildDescription.xml", bomb)]
     with pytest.raises(ModelError, match=r"buildDescription.*DOCTYPE"):
-        load_model(built)
+        compile_fmu(written(tmp_path / "c.fmu", version=3, entries=sources))
 
 
 HEAD = '<?xml version="1.0"?>'
@@ -207,7 +207,7 @@ def test_a_missing_binary_is_told_before_the_variables_are_read(tmp_path, monkey
     path = tmp_path / "a.fmu"
     with zipfile.ZipFile(path, "w") as z:
         z.writestr("modelDescription.xml", description(PLAIN, 2))
-    monkeypatch.setattr(fmpy, "read_model_description", lambda *_, **__: pytest.fail("the variables were read"))
+    monkeypatch.setattr(read.Document, "variables", property(lambda _: pytest.fail("the variables were read")))
     with pytest.raises(ModelError, match="no binary for this machine"):
         load_model(path)
 
@@ -336,8 +336,56 @@ def test_what_is_read(tmp_path, version):
     found = read_description(written(tmp_path / "a.fmu", version=version))
     assert (found.version, found.interface, found.identifier) == (version, "model-exchange", "lag")
     assert list(found.states) == ["x"] and found.derivatives == (1,)
-    assert found.parameters["T"].start == 0.1 and found.parameters["T"].tunable
+    assert found.parameters["T"].start == 0.1 and found.parameters["T"].variability == "tunable"
     assert list(found.outputs) == ["y"] and list(found.inputs) == ["u"]
+
+
+STATE = '<Unknown index="2"/>'
+TIME_CONSTANT = '<Real start="0.1"/>'
+SENSELESS = [
+    (2, 'valueReference="2"', 'valueReference="two"', r"variable 'T': .*a whole number as its value reference, got 'two'"),
+    (2, 'valueReference="2"', "", r"variable 'T': .*a whole number as its value reference, got None"),
+    (2, TIME_CONSTANT, "<Complex/>", "variable 'T': the type of the variable is not defined; got <ScalarVariable>"),
+    (2, TIME_CONSTANT, '<Real declaredType="Seconds"/>', "the type of the variable is not defined; got Seconds"),
+    (2, STATE, '<Unknown index="6"/>', "ModelStructure: .*a variable that is not there; got 6"),
+    (2, STATE, '<Unknown index="0"/>', "ModelStructure: .*a variable that is not there; got 0"),
+    (2, 'derivative="1"', 'derivative="x"', "ModelStructure: .*a whole number as a reference to a variable, got 'x'"),
+    (2, STATE, STATE * 2, "the state 'x' has two derivatives"),
+    (2, 'numberOfEventIndicators="0"', 'numberOfEventIndicators="-"', "a whole number as numberOfEventIndicators"),
+    (3, 'Derivative valueReference="1"', 'Derivative valueReference="7"', "a variable that is not there; got 7"),
+    (3, '<Float64 name="T"', '<Float16 name="T"', "variable 'T': the type of the variable is not defined; got <Float16>"),
+    (3, 'start="0.1"/>', 'start="1"><Dimension valueReference="7"/></Float64>', "'T': .*whole number as a size of the array"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("version", "part", "other", "message"), SENSELESS)
+def test_a_description_that_makes_no_sense_says_where(tmp_path, version, part, other, message):
+    text = description(PLAIN, version)
+    assert part in text
+    with pytest.raises(ModelError, match=f"a.fmu, {message}" if message[0] == "v" else message):
+        load_model(written(tmp_path / "a.fmu", text.replace(part, other), version=version))
+
+
+def test_attributes_of_a_declared_type_count_where_a_variable_has_none(tmp_path):
+    time = '<SimpleType name="Time" description="any"><Real unit="s" min="0" max="9" nominal="-2"/></SimpleType>'
+    types = f"<TypeDefinitions>{time}</TypeDefinitions>"
+    text = description(PLAIN, 2).replace("<ModelVariables>", f"{types}<ModelVariables>")
+    text = text.replace(TIME_CONSTANT, '<Real declaredType="Time" start="0.1" max="5"/>')
+    found = read_description(written(tmp_path / "a.fmu", text)).parameters["T"]
+    assert (found.unit, found.min, found.max, found.nominal, found.start, found.description) == ("s", 0, 5, 2, 0.1, "")
+    types = '<TypeDefinitions><UInt8Type name="Count" description="a number" min="1" max="9"/></TypeDefinitions>'
+    text = description(PLAIN, 3).replace("<ModelVariables>", f"{types}<ModelVariables>")
+    count = '<UInt8 name="n" valueReference="8" causality="parameter" declaredType="Count" start="3"><Alias name="m"/>'
+    text = text.replace("</ModelVariables>", f"{count}</UInt8></ModelVariables>")
+    found = read_description(written(tmp_path / "b.fmu", text, version=3)).parameters["n"]
+    assert (found.min, found.max, found.start, found.description) == (1, 9, 3, "a number")
+    assert found.variability == "fixed" and found.also == ("m",) and found.whole
+
+
+def test_a_parameter_that_is_constant_stays_as_it_is(tmp_path):
+    """The standard knows none, but tools write it."""
+    text = description(PLAIN, 2).replace('causality="parameter" variability="tunable"', 'causality="parameter" variability="constant"')
+    assert not read_description(written(tmp_path / "a.fmu", text)).parameters
 
 
 @settings(max_examples=60)

@@ -84,7 +84,7 @@ def export_fmu(
     folder = None
     note = "sources only, as asked" if binary is False else "sources only: no C compiler was there"
     if command:
-        folder = binary_folder(version)
+        folder = binary_folder(int(version[0]))
         sources = {n.removeprefix("sources/"): t.decode() for n, t in content.items() if n.startswith("sources/")}
         content[f"binaries/{folder}/{identifier}{library_suffix()}"] = compiled(command, sources, _TO_COMPILE)
         note = f"binary for {folder}, and sources"
