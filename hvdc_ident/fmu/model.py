@@ -226,7 +226,7 @@ def read_fmu(
         inputs = np.array([[v.start or 0.0 for v in described.inputs.values()]])
         request = {"do": "initial", "values": [{}], "time": 0.0, "tolerance": None}
         starts = pool.ask(request, {"u": inputs})[1]["parameters"][0].tolist()
-        pool.close()  # the next worker gets the starts
+        pool.rest()  # the next worker gets the starts
         parameters = {
             n: v if v.start is not None else replace(v, start=start)
             for (n, v), start in zip(described.parameters.items(), starts, strict=True)

@@ -224,6 +224,12 @@ class WorkerPool:
         with self._lock:
             self._close()
 
+    def rest(self) -> None:
+        """End the workers; the next run begins one of its own."""
+        with self._lock:
+            for worker in [*self._own_processes().workers.values()]:
+                self._end(worker)
+
     # --- several requests ---
 
     def _workers_for(self, requests: int) -> int:

@@ -7,6 +7,7 @@ of its model description. What a foreign FMU may do wrong is put in by hand.
 from __future__ import annotations
 
 import hashlib
+import os
 import shutil
 import subprocess
 import tempfile
@@ -54,34 +55,21 @@ class CModel:
 
 
 @cache
-def _build_folder() -> Path:
-    return Path(tempfile.mkdtemp(prefix="hvdc_ident_test_fmu_"))
-
-
-@cache
 def library(code: str, version: int, states: int, indicators: int, defines: tuple[str, ...]) -> bytes:
-    """The compiled binary."""
-    key = hashlib.sha256(repr((code, version, states, indicators, defines)).encode()).hexdigest()[:16]
-    source, target = _build_folder() / f"{key}.c", _build_folder() / f"{key}.so"
+    """The compiled binary, kept from one run of the tests to the next."""
+    body = f'{code}\n#include "{SOURCE}"' if code else "int nothing;"
+    text = f"#define FMI {version}\n#define NX {states}\n#define NZ {indicators}\n{body}\n"
+    command = [str(COMPILER), "-O1", "-shared", "-fPIC", "-w", *(f"-D{d}" for d in defines)]
+    key = hashlib.sha256(repr((text, SOURCE.read_bytes(), command)).encode()).hexdigest()[:24]
+    kept = Path(tempfile.gettempdir(), f"hvdc_ident_test_fmus_{os.getuid()}")
+    kept.mkdir(mode=0o700, exist_ok=True)
+    target = kept / f"{key}.so"
     if not target.exists():
-        body = f'{code}\n#include "{SOURCE}"' if code else "int nothing;"
-        text = f"#define FMI {version}\n#define NX {states}\n#define NZ {indicators}\n{body}\n"
-        source.write_text(text)
-        subprocess.run(
-            [
-                COMPILER,
-                "-O1",
-                "-shared",
-                "-fPIC",
-                "-w",
-                *(f"-D{d}" for d in defines),
-                str(source),
-                "-o",
-                str(target),
-                "-lm",
-            ],
-            check=True,
-        )
+        with tempfile.TemporaryDirectory(dir=kept) as folder:  # another process may make the same
+            source, made = Path(folder, "model.c"), Path(folder, "model.so")
+            source.write_text(text)
+            subprocess.run([*command, str(source), "-o", str(made), "-lm"], check=True)
+            made.replace(target)
     return target.read_bytes()
 
 
