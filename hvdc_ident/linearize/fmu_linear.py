@@ -24,8 +24,8 @@ from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions, so
 from hvdc_ident.linearize.kinds import LinearOptions
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
-from hvdc_ident.linearize.point import OperatingPoint
-from hvdc_ident.linearize.stability import EPS
+from hvdc_ident.linearize.point import OperatingPoint, unstable_by
+from hvdc_ident.linearize.stability import EPS, Characteristic
 from hvdc_ident.linearize.system import Array, Layout
 from hvdc_ident.model import External
 
@@ -101,7 +101,20 @@ class LinearFmu:
         at="start": the FMU stays there. Raises UnknownNameError, SteadyStateError for a free input that changes in steps.
         """
         model, search = self._search(asked)
-        return OperatingPoint.of(model, search, solved(model.name, search, asked.guess), "trimmed")
+        return OperatingPoint.of(LinearFmu(model), search, solved(model.name, search, asked.guess), "trimmed")
+
+    def equation(self, point: OperatingPoint) -> Characteristic | None:
+        """Return the characteristic equation at a point, without the delays that an FMU does not show; None where it is not finite."""
+        assert point.search is not None
+        n = len(point.states)
+        a = point.search.system.evaluate(point.y, point.w, point.p)[1][:n, :n]
+        none = np.zeros((n, 0))
+        found = Characteristic.rational(a, none, none.T, np.zeros((0, 0)), ACCURACY)
+        return found if np.isfinite(a).all() else None
+
+    def notes(self, point: OperatingPoint) -> tuple[str, ...]:
+        """Return a sentence on a point that is unstable."""
+        return (unstable_by(point.equation),) if point.stable is False else ()
 
     def linear(self, point: OperatingPoint, asked: LinearOptions) -> LinearModel:
         """Return A, B, C, D at a point; derivatives by parameters from differences of points and Jacobians.

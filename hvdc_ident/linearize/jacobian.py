@@ -9,6 +9,7 @@ import numpy as np
 
 from hvdc_ident.errors import LinearizationError, SteadyStateError, require_known
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.linearize.branches import equation_at, notes_of
 from hvdc_ident.linearize.delays import Approximants, Channel, channels, without_unknowns, without_unknowns_along
 from hvdc_ident.linearize.derivatives import PADE_ORDER, WELL_POSED, Side, constants, jacobian_at
 from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions, Root, solved, weights
@@ -32,15 +33,15 @@ class EquationModel:
         model = self.model
         search = EquilibriumSearch.of_model(model, asked)
         if search.is_plain and not asked.guess:
-            return OperatingPoint.of(model, search, *steady(model, search))
+            return OperatingPoint.of(self, search, *steady(model, search))
         own = _own(model, search)
         root = solved(model.name, search, asked.guess, own)
         if not search.is_plain:
-            return OperatingPoint.of(model, search, root, "trimmed")
+            return OperatingPoint.of(self, search, root, "trimmed")
         same = own is not None and np.allclose(
             root.v, own, rtol=1e-6, atol=1e-6 * max(1.0, float(np.abs(own).max(initial=0.0)))
         )
-        return OperatingPoint.of(model, search, root, "own" if own is None or same else "other")
+        return OperatingPoint.of(self, search, root, "own" if own is None or same else "other")
 
     def linear(self, point: OperatingPoint, asked: LinearOptions) -> LinearModel:
         """Return the linear model at a point, states that never move as inputs: a reference that the start is found with is no mode."""
@@ -51,6 +52,14 @@ class EquationModel:
         held = held.with_values({n: point.states[n] for n in fixed})
         guess = {n: v for n, v in (point.states | point.unknowns).items() if n not in fixed}
         return _linear_at(held, EquationModel(held).point(PointOptions(guess=guess)), asked)
+
+    def equation(self, point: OperatingPoint) -> Characteristic | None:
+        """Return the characteristic equation at a point; None on a kink."""
+        return equation_at(self.model, point, point.y, point.w)
+
+    def notes(self, point: OperatingPoint) -> tuple[str, ...]:
+        """Return sentences on a steady state that is unstable, not the model's own one, or far off."""
+        return notes_of(self.model, point)
 
     def jacobian_error(self, point: OperatingPoint, outputs: Sequence[str] | None) -> float:
         """Return the largest difference from the Jacobian by complex steps, relative to each row's largest entry."""

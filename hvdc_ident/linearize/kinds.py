@@ -9,7 +9,7 @@ from typing import Protocol
 from hvdc_ident.linearize.derivatives import Side
 from hvdc_ident.linearize.equilibrium import PointOptions
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.point import OperatingPoint
+from hvdc_ident.linearize.point import Judge, OperatingPoint
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class LinearOptions:
     descriptor: bool = False
 
 
-class Kind(Protocol):
+class Kind(Judge, Protocol):
     """A model that has operating points, and a linear model at each."""
 
     def point(self, asked: PointOptions) -> OperatingPoint:

@@ -1,28 +1,39 @@
-"""Operating points: values by name with their limits, and whether a point is stable, the model's own, or far off."""
+"""Operating points: values by name with their limits, and what is said of a point: whether it is stable, the model's own, far off."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 
 from hvdc_ident.codec import NOT_STORED, Coded, read_fields, stored_as
 from hvdc_ident.display import Shown, Table, first_rows
-from hvdc_ident.errors import LinearizationError, SteadyStateError
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize.derivatives import characteristic
 from hvdc_ident.linearize.equilibrium import At, EquilibriumSearch, Root
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.stability import Characteristic
-from hvdc_ident.linearize.system import Array, CompiledSystem
-from hvdc_ident.model import AnyModel, Model
-from hvdc_ident.simulate import Equilibria, equilibria, resting
+from hvdc_ident.linearize.system import Array
+from hvdc_ident.model import AnyModel
 
 Branch = Literal["own", "unconnected", "other", "trimmed"]
+
+
+class Judge(Protocol):
+    """What tells of a point of its model more than the values there."""
+
+    @property
+    def model(self) -> AnyModel: ...
+
+    def equation(self, point: OperatingPoint) -> Characteristic | None:
+        """Return the characteristic equation at a point; None where the model has no linear model there."""
+        ...
+
+    def notes(self, point: OperatingPoint) -> tuple[str, ...]:
+        """Return sentences on a steady state that is unstable, not the model's own one, or far off."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -61,7 +72,7 @@ class OperatingPoint(Shown, Coded):
     time: float = 0.0
     branch: Branch = "own"
     limits: tuple[Limit, ...] = field(default=(), metadata=NOT_STORED)
-    model: AnyModel | None = field(default=None, metadata=NOT_STORED)
+    judge: Judge | None = field(default=None, metadata=NOT_STORED)
     search: EquilibriumSearch | None = field(default=None, metadata=NOT_STORED)
     stored_properties: ClassVar[tuple[str, ...]] = ("active_limits", "margins", "stable", "notes")
 
@@ -77,8 +88,9 @@ class OperatingPoint(Shown, Coded):
         return point
 
     @classmethod
-    def of(cls, model: AnyModel, search: EquilibriumSearch, root: Root, branch: Branch) -> OperatingPoint:
+    def of(cls, judge: Judge, search: EquilibriumSearch, root: Root, branch: Branch) -> OperatingPoint:
         """Return the point of a solved search."""
+        model = judge.model
         y, w, p = search.vectors(root.v)
         s, size = search.system, search.system.layout
         values, _ = s.evaluate(y, w, p)
@@ -101,9 +113,14 @@ class OperatingPoint(Shown, Coded):
             search.time,
             branch,
             s.limits(y, w, p),
-            model,
+            judge,
             search,
         )
+
+    @property
+    def model(self) -> AnyModel | None:
+        """The model itself; None for a point read from JSON."""
+        return None if self.judge is None else self.judge.model
 
     def _screen(self) -> Iterator[str | Table]:
         yield f"Operating point of {self.name} ({self.at}, {self.method}), residual {self.residual:.2g}"
@@ -123,18 +140,23 @@ class OperatingPoint(Shown, Coded):
         """The limiters that do not hold their signal here."""
         return tuple(x for x in self.limits if not x.active and x.kind != "branch")
 
+    @property
+    def equation(self) -> Characteristic | None:
+        """The characteristic equation here; None on a kink, and for a point read from JSON."""
+        return None if self.judge is None else self.judge.equation(self)
+
     @cached_property
     def stable(self) -> bool | None:
         """True where no eigenvalue of the linear model lies right of the imaginary axis, delays exact.
 
         None on a kink, and where a gain around a delay leaves it undecided. An FMU's delays are not seen.
         """
-        return None if self.search is None else _stable(self, self.y, self.w)
+        return is_stable(self.equation)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Remarks on the point: that it is unstable, not the model's own one, or far off; with the other one's place."""
-        return _notes(self)
+        return () if self.judge is None or self.at != "steady" else self.judge.notes(self)
 
     @property
     def y(self) -> Array:
@@ -156,97 +178,17 @@ def _named(names: Sequence[str], values: Array) -> FrozenMap[float]:
     return FrozenMap(zip(names, (float(v) for v in values), strict=True))
 
 
-def _notes(point: OperatingPoint) -> tuple[str, ...]:
-    """Return sentences on a point that is unstable, not the model's own steady state, or far outside its states' own range.
-
-    Each names the other steady state where one is found: the model's own one, or those that the model runs to from here.
-    """
-    if point.search is None or point.at != "steady":
-        return ()
-    if not isinstance(point.model, Model):
-        return (f"Unstable: {_fastest(point)}.",) if point.stable is False else ()
-    model = resting(point.model)
-    at = equilibria(model)
-    v = np.array([*point.y, *point.extras.values()])
-    found = []
-    if point.branch == "unconnected":
-        found.append(
-            "Followed from the model's own values, its steady state ends at a jump before these: this one is from a new search."
-        )
-    if point.branch == "other":
-        own = at.start(model, point.p, point.w[1 : 1 + len(point.inputs)], point.time).v
-        found.append(f"This is not the model's own steady state, which stands at {at.text(own)}.")
-    far = at.far(v)
-    if far:
-        shown = ", ".join(f"'{n}' at {point.states[n]:.4g} (guess {model.states[n].guess:g})" for n in far)
-        found.append(f"Far outside the states' own range: {shown}.")
-    if point.stable is False:
-        found.append(f"Unstable: {_fastest(point)}. {_elsewhere(at, point, v)}")
-    return tuple(found)
-
-
-def _equation(point: OperatingPoint, y: Array, w: Array) -> Characteristic | None:
-    """Return the characteristic equation at values of a point's model; None where it has no linear model there."""
-    assert point.search is not None
-    s = point.search.system
-    if isinstance(point.model, Model):
-        assert isinstance(s, CompiledSystem)
-        try:
-            return characteristic(point.model, s, y, w, point.p)
-        except LinearizationError:
-            return None
-    n = s.layout.nx
-    a = s.evaluate(y, w, point.p)[1][:n, :n]
-    none = np.zeros((0, 0))
-    return Characteristic.rational(a, np.zeros((n, 0)), np.zeros((0, n)), none, s.accuracy) if np.isfinite(a).all() else None
-
-
-def _stable(point: OperatingPoint, y: Array, w: Array) -> bool | None:
-    """Return whether no root lies right of the imaginary axis; None where there is no linear model, or it cannot be told."""
-    equation = _equation(point, y, w)
+def is_stable(equation: Characteristic | None) -> bool | None:
+    """Return whether no root lies right of the imaginary axis; None where there is no equation, or it cannot be told."""
     unstable = None if equation is None else equation.roots.unstable
     return None if unstable is None else unstable == 0
 
 
-def _fastest(point: OperatingPoint) -> str:
-    equation = _equation(point, point.y, point.w)
+def unstable_by(equation: Characteristic | None) -> str:
+    """Return the sentence on an unstable point, with its first root."""
     assert equation is not None
     worst = equation.roots.values[:1]
     if not worst.size or worst[0].real <= 0:
-        return "roots of its characteristic equation grow"
+        return "Unstable: roots of its characteristic equation grow."
     turning = f" +- {abs(worst[0].imag):.3g}j" if worst[0].imag else ""
-    return f"the eigenvalue {worst[0].real:.3g}{turning} 1/s grows"
-
-
-def _direction(equation: Characteristic) -> Array:
-    """Return (states,) the shape of the rightmost mode, a delay's share in it left out."""
-    root = equation.roots.values[:1]
-    if not root.size:
-        return np.ones(equation.nx)
-    return np.asarray(np.linalg.svd(equation.whole.pencil(root)[0])[2][-1].conj()[: equation.nx].real)
-
-
-def _elsewhere(at: Equilibria, point: OperatingPoint, v: Array) -> str:
-    """Return a sentence on the nearest stable steady state that the model runs to from here, or that its guesses lead to."""
-    equation = _equation(point, point.y, point.w)
-    assert equation is not None
-    nx = len(point.states)
-    direction = _direction(equation)
-    size = np.maximum(np.abs(point.y[:nx]), 1e-2)
-    direction = 1e-2 * direction / max(float(np.abs(direction / size).max()), 1e-300)
-    u = point.w[1 : 1 + len(point.inputs)]
-    others = at.neighbours(point.p, u, point.time, v, direction)
-    with suppress(SteadyStateError):  # then the guesses offer none
-        others.append(at.search(point.p, u, point.time).v)
-    stable = [
-        x for x in others if not np.allclose(x, v, rtol=1e-6, atol=1e-6) and _stable(point, *_split(at, point, x))
-    ]
-    stable.sort(key=lambda x: float(np.abs((x[:nx] - v[:nx]) / size).max()))  # of a machine's turns the nearest
-    if not stable:
-        return "No stable steady state was found nearby."
-    return f"A stable one stands at {at.text(stable[0])}; a `guess` there in the model's states leads to it."
-
-
-def _split(at: Equilibria, point: OperatingPoint, x: Array) -> tuple[Array, Array]:
-    n = at.n
-    return x[:n].copy(), np.concatenate([point.w[: 1 + len(point.inputs)], x[n:]])
+    return f"Unstable: the eigenvalue {worst[0].real:.3g}{turning} 1/s grows."
