@@ -140,6 +140,13 @@ def difference_pair(line: ParameterRuns[Run], h: float) -> Differences[Run, tupl
     return np.asarray(first), np.asarray((middle - 2.0 * one + two) / side**2)
 
 
+def extrapolated_difference(line: ParameterRuns[Run], h: float) -> Differences[Run, Array]:
+    """Return the derivative from pairs at h and at half of it, whose errors of second order cancel."""
+    coarse, _ = yield from difference_pair(line, h)
+    fine, _ = yield from difference_pair(line, 0.5 * h)
+    return np.asarray((4.0 * fine - coarse) / 3.0)
+
+
 def _clipped(h: float, size: float) -> float:
     return float(np.clip(h, LEAST_STEP * size, LARGEST_STEP * size))
 

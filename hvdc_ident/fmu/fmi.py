@@ -10,7 +10,6 @@ import shutil
 import subprocess
 from collections.abc import Callable, Sequence
 from ctypes import CFUNCTYPE, addressof, byref, c_bool, c_double, c_int, c_size_t, c_void_p
-from functools import partial
 from math import nan
 from pathlib import Path
 from typing import Any
@@ -162,15 +161,6 @@ def _bound(library: Any, name: str, types: Sequence[Any]) -> Function:
     return call
 
 
-def _missing(library: Any, name: str, types: Sequence[Any]) -> Function:
-    """Return a stand-in for a function that the FMU's interface does not have."""
-
-    def call(*arguments: Any) -> None:
-        raise FmiError(function=name, status=ERROR)
-
-    return call
-
-
 def binding(version: int, interface: Interface) -> Any:
     """Return FMPy's class of an interface: an instance binds the functions of a library."""
     from fmpy.fmi2 import FMU2Model, FMU2Slave
@@ -213,20 +203,21 @@ class FmiLibrary:
         real, derivatives = ("Real", "Derivatives") if self.version == 2 else ("Float64", "ContinuousStateDerivatives")
         vector, sized = [c_void_p, c_size_t], [c_size_t] * self._sized
 
-        def bound(name: str, *types: Any, offered: bool = True) -> Function:
-            return (_bound if offered else _missing)(self.fmu.dll, f"fmi{self.version}{name}", types)
+        def bound(name: str, *types: Any) -> Function:
+            return _bound(self.fmu.dll, f"fmi{self.version}{name}", types)
 
-        exchange = partial(bound, offered=self.exchange)
         self._get_reals = bound(f"Get{real}", *vector, c_void_p, *sized)
         self._set_reals = bound(f"Set{real}", *vector, c_void_p, *sized)
         self._directional = bound("GetDirectionalDerivative", *vector, *vector, c_void_p, *sized, c_void_p, *sized)
-        self._set_time = exchange("SetTime", c_double)
-        self._set_states = exchange("SetContinuousStates", *vector)
-        self._get_states = exchange("GetContinuousStates", *vector)
-        self._get_derivatives = exchange(f"Get{derivatives}", *vector)
-        self._get_indicators = exchange("GetEventIndicators", *vector)
-        self._completed_step = exchange("CompletedIntegratorStep", _flag(self.version), c_void_p, c_void_p)
-        self._do_step = bound("DoStep", c_double, c_double, c_int, offered=not self.exchange)
+        if not self.exchange:
+            self._do_step = bound("DoStep", c_double, c_double, c_int)
+            return
+        self._set_time = bound("SetTime", c_double)
+        self._set_states = bound("SetContinuousStates", *vector)
+        self._get_states = bound("GetContinuousStates", *vector)
+        self._get_derivatives = bound(f"Get{derivatives}", *vector)
+        self._get_indicators = bound("GetEventIndicators", *vector)
+        self._completed_step = bound("CompletedIntegratorStep", _flag(self.version), c_void_p, c_void_p)
 
     def _made_callbacks(self) -> Any:
         if self.version == 3:

@@ -19,6 +19,7 @@ from hvdc_ident.fmu.differences import (
     ParameterRuns,
     difference,
     difference_pair,
+    extrapolated_difference,
     first_difference,
     noise_of,
     rms,
@@ -308,9 +309,7 @@ class Differentiation:
 
         def column(v: Varied) -> Differences[RunRequest, Array]:
             (middle,) = yield [self.run]
-            line, h = v.line(self.run, middle), START_STEP * v.size
-            (coarse, _), (fine, _) = (yield from difference_pair(line, h)), (yield from difference_pair(line, 0.5 * h))
-            return np.asarray((4.0 * fine - coarse) / 3.0)
+            return (yield from extrapolated_difference(v.line(self.run, middle), START_STEP * v.size))
 
         return together([column(v) for v in varied], self._initial_states)
 

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fmu import co_simulation, model_exchange
+from hvdc_ident.fmu import co_simulation
 from hvdc_ident.fmu.co_simulation import CallPattern
 from hvdc_ident.fmu.derivatives import SensitivityEquations
 from hvdc_ident.fmu.description import Message
 from hvdc_ident.fmu.fmi import VariableGroup
 from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
+from hvdc_ident.fmu.model_exchange import Counts, ModelExchangeRun, SensitivitiesLost
 from hvdc_ident.fmu.piecewise_linear import PackedInputs
 from hvdc_ident.fmu.runner import Runner, moving
 
@@ -43,52 +44,60 @@ class ExperimentRun:
         """
         if "restart" not in self.learned:
             self._find_reuse()
+        if names := tuple(self.heading.get("sensitivities", ())):
+            return self.runner.perform(lambda instance: self._with_sensitivities(instance, names))
         if self.description.interface == "model-exchange":
-            return self.runner.perform(self._integrated)
+            return self.runner.perform(self._plain)
         co_simulation.find_calls(
             self.learned, self.description, self.signals, self.time, self.tolerance, self._co_simulated
         )
-        answer, arrays = self.runner.perform(self._stepped)
+        answer, arrays = self.runner.perform(self._plain)
         if answer["end"] is None and self.description.variable_step and moving(arrays["outputs"]).any():
             calls = CallPattern.learned(self.learned)
             with contextlib.suppress(RunFailed):
                 co_simulation.find_held(self.learned, self.time, lambda time: self._co_simulated(calls, time))
         return answer, arrays
 
-    def _stepped(self, instance: Instance) -> Message:
-        try:
-            rows = co_simulation.run(instance, self.values, self.signals, self.time, self.names, self.tolerance)
-            return self._checked(rows, model_exchange.Counts(segments=1))
-        except RunEnded as e:
-            return self._checked(self._until(e), model_exchange.Counts(segments=1), e.t)
+    def _plain(self, instance: Instance) -> Message:
+        return self._checked(*self._run(instance, self.signals, self.time, self.names))
 
-    def _integrated(self, instance: Instance) -> Message:
-        names, start = self.heading.get("sensitivities", ()), self.arrays.get("start")
-        equations = SensitivityEquations(instance, names, self.heading["sizes"], self.names) if names else None
-        run = model_exchange.ModelExchangeRun(
-            instance, self.signals, self.time, self.names, self.tolerance, equations, start
-        )
-        run.max_steps = self.heading.get("max_steps") or run.max_steps
+    def _run(
+        self,
+        instance: Instance,
+        signals: PackedInputs,
+        time: Array,
+        names: tuple[str, ...],
+        calls: CallPattern | None = None,
+    ) -> tuple[Array, Counts, float | None]:
+        """Return the rows, (n, names), the counts, and the instant at which the FMU asked for the end, where that is accepted."""
+        counts = Counts(segments=int(not instance.library.exchange))
         try:
+            if not instance.library.exchange:
+                rows = co_simulation.run(instance, self.values, signals, time, names, self.tolerance, calls)
+                return rows, counts, None
+            run = ModelExchangeRun(instance, signals, time, names, self.tolerance, counts=counts)
             run.begin(self.values)
-            if names:
-                return self._with_sensitivities(instance, run, names)
             run.go()
-            return self._checked(run.outputs, run.counts)
+            return run.outputs, counts, None
         except RunEnded as e:
-            return self._checked(self._until(e), run.counts, e.t)
+            if not self.partial or e.rows is None or not e.rows.size:
+                raise
+            return e.rows, counts, e.t
 
-    def _with_sensitivities(
-        self, instance: Instance, run: model_exchange.ModelExchangeRun, names: tuple[str, ...]
-    ) -> Message:
+    def _with_sensitivities(self, instance: Instance, names: tuple[str, ...]) -> Message:
         """Return the run with its sensitivities, which are lost where the FMU moves a parameter as it gives a derivative."""
+        equations = SensitivityEquations(instance, names, self.heading["sizes"], self.names)
+        start = self.arrays["start"]
+        run = ModelExchangeRun(instance, self.signals, self.time, self.names, self.tolerance, equations, start)
+        run.max_steps = self.heading["max_steps"] or run.max_steps
+        run.begin(self.values)
         parameters = VariableGroup(instance.library, tuple(self.description.parameters.values()))
         before, lost = parameters.get().copy(), ""
         try:
             run.go()
             if not np.array_equal(before, parameters.get(), equal_nan=True):
                 lost = "the FMU moves a parameter"
-        except model_exchange.SensitivitiesLost as e:
+        except SensitivitiesLost as e:
             lost = str(e)
         instance.renew(names)
         if lost:
@@ -98,7 +107,7 @@ class ExperimentRun:
         answer, arrays = self._checked(run.outputs, run.counts)
         return {**answer, "lost": ""}, {**arrays, "gradients": run.gradients}
 
-    def _checked(self, rows: Array, counts: model_exchange.Counts, end: float | None = None) -> Message:
+    def _checked(self, rows: Array, counts: Counts, end: float | None = None) -> Message:
         """Return the answer. Raises RunFailed where a row is not finite."""
         finite = np.isfinite(rows)
         if not finite.all():
@@ -106,12 +115,6 @@ class ExperimentRun:
             what = f"output '{self.names[column]}' is not finite"
             raise RunFailed(what, float(self.time[row]), "check parameter values and limits")
         return {"counts": list(astuple(counts)), "end": end}, {"outputs": rows}
-
-    def _until(self, ended: RunEnded) -> Array:
-        """(rows, names) of a run that the FMU ended. Raises the end where such a run is not accepted."""
-        if not self.partial or ended.rows is None or not ended.rows.size:
-            raise ended
-        return ended.rows
 
     # --- trials ---
 
@@ -149,13 +152,5 @@ class ExperimentRun:
         calls: CallPattern | None = None,
     ) -> Array:
         """(n, names) of a run; NaN after an end that the FMU asked for, where such a run is accepted."""
-        try:
-            if instance.library.exchange:
-                run = model_exchange.ModelExchangeRun(instance, signals, time, names, self.tolerance)
-                run.begin(self.values)
-                run.go()
-                return run.outputs
-            return co_simulation.run(instance, self.values, signals, time, names, self.tolerance, calls)
-        except RunEnded as e:
-            rows = self._until(e)
-            return np.vstack([rows, np.full((time.size - rows.shape[0], rows.shape[1]), np.nan)])
+        rows, _, _ = self._run(instance, signals, time, names, calls)
+        return np.vstack([rows, np.full((time.size - rows.shape[0], rows.shape[1]), np.nan)])

@@ -19,13 +19,14 @@ from hvdc_ident.errors import (
     unknown_name,
 )
 from hvdc_ident.fmu import FmuModel, FmuPoint, at_point, smooth_inputs
+from hvdc_ident.fmu.differences import ParameterRuns, extrapolated_difference, together
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions, solved
 from hvdc_ident.linearize.kinds import LinearOptions
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.point import OperatingPoint, unstable_by
-from hvdc_ident.linearize.stability import EPS, Characteristic
+from hvdc_ident.linearize.stability import EPS, Characteristic, quartered
 from hvdc_ident.linearize.system import Array, Layout
 from hvdc_ident.model import External
 
@@ -128,15 +129,15 @@ class LinearFmu:
         ins, outs = _names(model, asked.inputs, asked.outputs)
         require_known("parameter", asked.sensitivities, model.parameters, f"model '{model.name}'")
         p = _at(model, point, outs)
-        a, b, c, d = _matrices(model, p, ins)
+        matrix = _matrix(model, p, ins)
         notes = {
             "method": "directional" if p.directional.all() else "finite-difference",
             "jacobian error": f"{p.error:.2g}, of each row's largest entry",
             "limits": "differences of two step sizes disagree: a limit is near" if p.near else "held as at the point",
         }
-        states = tuple(model.states)
+        states, kind = tuple(model.states), LinearFmu(model)
         return LinearModel(
-            a, b, c, d, np.eye(a.shape[0]),
+            *quartered(matrix, len(states)), np.eye(len(states)),
             states,
             ins,
             outs,
@@ -146,7 +147,7 @@ class LinearFmu:
             point=point,
             name=model.name,
             provenance=FrozenMap(notes),
-            gradients=FrozenMap({n: LinearFmu(model)._gradient(point, n, ins, outs) for n in asked.sensitivities}),
+            gradients=FrozenMap({n: kind._gradient(point, n, ins, outs, matrix) for n in asked.sensitivities}),
             error=EPS if p.directional.all() else max(EPS, p.error),
         )  # fmt: skip
 
@@ -179,29 +180,27 @@ class LinearFmu:
             asked = replace(asked, fixed=held, moving=s.states)
         return model, EquilibriumSearch.of(model, s, asked, start)
 
-    def _gradient(self, point: OperatingPoint, name: str, inputs: Sequence[str], outputs: Sequence[str]) -> Gradient:
-        """Return the total derivatives of A, B, C, D by a parameter, the shift of the operating point included."""
+    def _gradient(
+        self, point: OperatingPoint, name: str, inputs: Sequence[str], outputs: Sequence[str], matrix: Array
+    ) -> Gradient:
+        """Return the total derivatives of A, B, C, D by a parameter, the shift of the operating point included.
+
+        matrix: [A, B; C, D] at the point.
+        """
         model, parameter = self.model, self.model.parameters[name]
         held = {**point.parameters, **point.inputs}
         near = dict(point.states) if point.at == "steady" else {}
 
-        def at(value: float) -> list[Array]:
+        def at(value: float) -> Array:
             moved = {**held, name: value}
             search = self._search(PointOptions(moved, guess=near, at=point.at, time=point.time))[1]
             states = solved(model.name, search, near).v
-            return list(_matrices(model, at_point(model, moved, states, outputs, (), point.time), inputs))
+            return _matrix(model, at_point(model, moved, states, outputs, (), point.time), inputs)
 
-        def slope(h: float) -> list[Array]:
-            here = held[name]
-            if here - h >= parameter.min and here + h <= parameter.max:
-                return [(a - b) / (2 * h) for a, b in zip(at(here + h), at(here - h), strict=True)]
-            side = h if here + 2 * h <= parameter.max else -h
-            three = zip(at(here), at(here + side), at(here + 2 * side), strict=True)
-            return [(-3.0 * a + 4.0 * b - c) / (2 * side) for a, b, c in three]
-
-        coarse, fine = slope(NUDGE * parameter.size), slope(0.5 * NUDGE * parameter.size)
-        a, b, c, d = ((4.0 * f - k) / 3.0 for f, k in zip(fine, coarse, strict=True))
-        return Gradient(a, b, c, d)
+        line = ParameterRuns(float, held[name], parameter.size, parameter.min, parameter.max, matrix)
+        rule = extrapolated_difference(line, NUDGE * parameter.size)
+        (found,) = together([rule], lambda values: [at(value) for value in values])
+        return Gradient(*quartered(found, len(model.states)))
 
 
 def _check_shown(model: FmuModel, asked: LinearOptions) -> None:
@@ -240,9 +239,7 @@ def _at(model: FmuModel, point: OperatingPoint, outputs: Sequence[str]) -> FmuPo
     return at_point(model, values, np.array([*point.states.values()], dtype=float), outputs, (), point.time)
 
 
-def _matrices(model: FmuModel, p: FmuPoint, inputs: Sequence[str]) -> tuple[Array, Array, Array, Array]:
-    n = len(model.states)
-    smooth = smooth_inputs(model)
-    through = [n + smooth.index(i) for i in inputs]
-    j = p.jacobian
-    return j[:n, :n], j[:n, through], j[n:, :n], j[n:, through]
+def _matrix(model: FmuModel, p: FmuPoint, inputs: Sequence[str]) -> Array:
+    """Return [A, B; C, D] between inputs and the outputs at a point."""
+    n, smooth = len(model.states), smooth_inputs(model)
+    return p.jacobian[:, [*range(n), *(n + smooth.index(i) for i in inputs)]]
