@@ -29,7 +29,8 @@ realisation norms kinds fmu_linear jacobian operating_point linearisation mode d
 distance transfer_function formula impedance response_file export
 """,
     "fmu": """
-archive description piecewise_linear differences last_runs fmi instance runner derivatives model_exchange co_simulation worker_run worker
+archive description request piecewise_linear differences last_runs fmi instance runner derivatives model_exchange co_simulation
+worker_run worker
 worker_pool gradients evaluate terminal_effects capabilities model compile export
 """,
 }

@@ -94,12 +94,24 @@ class InputSignal:
 
     def __call__(self, t: float | Array) -> Array:
         """Return the value at t, after the jump where there is one."""
+        return self.at(t)
+
+    def at(self, t: float | Array, *, before_jump: bool = False) -> Array:
+        """Return the value at t, before the jump or after it where there is one."""
         t = np.asarray(t, dtype=float)
-        right = np.searchsorted(self.times, t, side="right")
-        i, j = np.clip(right - 1, 0, None), np.clip(right, None, self.times.size - 1)
+        index = np.searchsorted(self.times, t, side="left" if before_jump else "right")
+        i, j = np.clip(index - 1, 0, None), np.clip(index, None, self.times.size - 1)
         t0, t1 = self.times[i], self.times[j]
         share = np.where(t1 > t0, np.clip((t - t0) / np.where(t1 > t0, t1 - t0, 1.0), 0.0, 1.0), 0.0)
-        return np.where(right == 0, self.values[0], self.values[i] + share * (self.values[j] - self.values[i]))
+        return np.where(index == 0, self.values[0], self.values[i] + share * (self.values[j] - self.values[i]))
+
+    def stepped(self, by: float, at: float) -> InputSignal:
+        """Return the signal with a step added to it at an instant, s."""
+        i, j = np.searchsorted(self.times, at, side="left"), np.searchsorted(self.times, at, side="right")
+        ends = [self.at(at, before_jump=True), self.at(at) + by]
+        times = np.concatenate([self.times[:i], [at, at], self.times[j:]])
+        values = np.concatenate([self.values[:i], ends, self.values[j:] + by])
+        return InputSignal(times, values, np.union1d(self.breaks, [at]))
 
     def begun_at(self, level: float) -> InputSignal:
         """Return the signal with another first value: that until its first jump where it holds it, else at its first instant alone."""

@@ -24,7 +24,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.fmu.description import Description
 from hvdc_ident.fmu.fmi import DISCARD, ERROR, FmiError, TerminationRequested, Vector
 from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
-from hvdc_ident.fmu.piecewise_linear import PackedInputs
+from hvdc_ident.fmu.request import RunRequest
 from hvdc_ident.fmu.runner import REPEAT_TOLERANCE, difference, moving
 
 MAX_EARLY_RETURNS = 10_000  # in one communication step
@@ -59,15 +59,7 @@ class CallPattern:
         return cls(learned.get("reading", "restored"), learned.get("sloping") == "followed")
 
 
-def run(
-    instance: Instance,
-    values: Mapping[str, float],
-    signals: PackedInputs,
-    time: Array,
-    names: tuple[str, ...],
-    tolerance: float,
-    calls: CallPattern | None = None,
-) -> Array:
+def made(instance: Instance, run: RunRequest, calls: CallPattern | None = None) -> Array:
     """Return the outputs at the instants, shape (n, outputs). Two equal instants are before and after a jump.
 
     Inputs follow their slope where the FMU was found to follow it, else they are held at their mean over a step; they
@@ -81,10 +73,10 @@ def run(
     chosen, learned = calls or CallPattern.learned(instance.learned), instance.learned
 
     def attempt(stops: Array) -> Array:
-        return _run(instance, values, signals, time, stops, names, tolerance, chosen)
+        return _stepped(instance, run, stops, chosen)
 
     even = not instance.description.variable_step or learned.get("steps") == "even"
-    stops = _stops(instance.description, signals, time, even)
+    stops = _stops(instance.description, run, even)
     uneven = not even and not _is_even(stops)
     try:
         rows = attempt(stops)
@@ -94,7 +86,7 @@ def run(
             raise
         instance.abandon()
         try:
-            rows = attempt(_stops(instance.description, signals, time, even=True))
+            rows = attempt(_stops(instance.description, run, even=True))
         except (FmiError, RunFailed):
             raise e from None
         learned["steps"] = "even"
@@ -107,35 +99,33 @@ def run(
 def find_calls(
     learned: dict[str, Any],
     description: Description,
-    signals: PackedInputs,
-    time: Array,
-    tolerance: float,
-    run: Callable[[CallPattern, Array], Array],
+    run: RunRequest,
+    trial: Callable[[CallPattern, Array], Array],
 ) -> None:
     """Learn how the FMU has to be called for this experiment, where that is not known yet, from short runs of it.
 
-    run: of a pattern and the instants, returns outputs, (n, outputs). learned: gets "reading" where inputs change during
+    trial: a run of a pattern and the instants, returns outputs, (n, outputs). learned: gets "reading" where inputs change during
     the run and outputs move, and "sloping" where inputs move and the FMU offers to follow their slopes.
     """
+    time, d = run.time, description
     if time[0] == time[-1]:
         return
-    stops = _stops(description, signals, time, even=False)
-    before, after = signals.at(stops, "left"), signals.at(stops, "right")
+    stops = _stops(d, run, even=False)
+    before, after = (run.at(stops, before_jump=b) for b in (True, False))
     moves = (after[:-1] != before[1:]).any(axis=1)
     changes = moves | (before[:-1] != after[:-1]).any(axis=1)  # a jump at the end is followed by no step
-    d = description
     real = bool(d.inputs) and all(v.kind == "Real" for v in d.inputs.values())
     sloping = "sloping" not in learned and d.interpolates and d.variable_step and real and bool(moves.any())
     reading = "reading" not in learned and bool(changes.any())
     if not (sloping or reading):
         return
     last = int(np.searchsorted(time, stops[np.argmax(changes)], side="right")) + TRIAL_ROWS
-    span, allowed = time[:last], max(tolerance, REPEAT_TOLERANCE)
-    if reading and (harmless := _harmless_reading(span, allowed, run)) is not None:
+    span, allowed = time[:last], max(run.tolerance, REPEAT_TOLERANCE)
+    if reading and (harmless := _harmless_reading(span, allowed, trial)) is not None:
         learned["reading"] = harmless
     if sloping:
         held = CallPattern(learned.get("reading", "restored"))
-        learned["sloping"] = _tried_slopes(span, allowed, held, run)
+        learned["sloping"] = _tried_slopes(span, allowed, held, trial)
 
 
 def find_held(learned: dict[str, Any], time: Array, run: Callable[[Array], Array]) -> None:
@@ -200,22 +190,13 @@ def _tried_slopes(time: Array, allowed: float, held: CallPattern, run: Callable[
 # --- one run ---
 
 
-def _run(
-    instance: Instance,
-    values: Mapping[str, float],
-    signals: PackedInputs,
-    time: Array,
-    stops: Array,
-    names: tuple[str, ...],
-    tolerance: float,
-    calls: CallPattern,
-) -> Array:
+def _stepped(instance: Instance, run: RunRequest, stops: Array, calls: CallPattern) -> Array:
     """Return the outputs of a run with communication steps between the stops, (n, outputs)."""
-    sides = signals.at(stops, "left"), signals.at(stops, "right")
-    instance.begin(values, sides[0][0], float(time[0]), float(stops[-1]), tolerance)
+    time, sides = run.time, tuple(run.at(stops, before_jump=b) for b in (True, False))
+    instance.begin(run.values, sides[0][0], float(time[0]), float(stops[-1]), run.tolerance)
     before, after = (list(map(tuple, side.tolist())) for side in sides)  # compared in every step: tuples are quickest
-    outputs = instance.variables(names)
-    left, right = (np.empty((stops.size, len(names))) for _ in range(2))
+    outputs = instance.variables(run.names)
+    left, right = (np.empty((stops.size, len(run.names))) for _ in range(2))
     belongs = stops.copy()  # instants that the FMU says it has reached by steps of its own
     stepper = _Stepper(instance, calls, before[0], outputs.get)
     reads_changes = calls.reading != "never"
@@ -277,10 +258,10 @@ def _is_even(stops: Array) -> bool:
     return gaps.size < 2 or bool(np.allclose(gaps, gaps[0], rtol=1e-9, atol=0.0))
 
 
-def _stops(description: Description, signals: PackedInputs, time: Array, even: bool) -> Array:
+def _stops(description: Description, run: RunRequest, even: bool) -> Array:
     """Return the instants at which communication steps end. even: whether they have to be of one length."""
-    begin, end = float(time[0]), float(time[-1])
-    breaks = signals.breaks[(signals.breaks > begin) & (signals.breaks < end)]
+    time, begin, end = run.time, float(run.time[0]), float(run.time[-1])
+    breaks = run.breaks[(run.breaks > begin) & (run.breaks < end)]
     rows = np.unique(time)
     rows[1:-1] = _moved_to(rows[1:-1], breaks, _rounding(time))
     wanted = np.unique(np.concatenate([rows, breaks[breaks < end - _rounding(time)]]))

@@ -183,10 +183,15 @@ class Document:
     @cached_property
     def variables(self) -> list[Declared]:
         """All variables in the order of the XML, then the aliases of FMI 3.0. Raises ModelError for one that makes no sense."""
-        types = [(t.get("name"), t[0] if self.version == 2 and len(t) else t) for t in self.root.iterfind("TypeDefinitions/*")]
+        types = [
+            (t.get("name"), t[0] if self.version == 2 and len(t) else t)
+            for t in self.root.iterfind("TypeDefinitions/*")
+        ]
         declared_types = {name: t.attrib for name, t in types}
         elements = [e for e in self.root.iterfind("ModelVariables/*") if e.get("name") is not None]
-        starts = {e.get("valueReference"): e.get("start") for e in elements if e.get("causality") == "structuralParameter"}
+        starts = {
+            e.get("valueReference"): e.get("start") for e in elements if e.get("causality") == "structuralParameter"
+        }
         found, aliases = list[Declared](), list[Declared]()
         for e in elements:
             where = f"{self.path}, variable '{e.get('name')}'"

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import ModelError
-from hvdc_ident.fmu.gradients import DifferentiatedRun, Differentiation, RunRequest, Varied
+from hvdc_ident.fmu.gradients import DifferentiatedRun, Differentiation, Varied
 from hvdc_ident.fmu.last_runs import LastRuns
-from hvdc_ident.fmu.piecewise_linear import PackedInputs
+from hvdc_ident.fmu.request import RunRequest
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import Simulation, Statistics, Tolerance
 
@@ -47,8 +47,8 @@ def simulate_without_effects(
     sensitivities.
     """
     cache: LastRuns[DifferentiatedRun] = model.pool.cache
-    signals = PackedInputs.of(list(inputs_of(model, experiment, given).values()))
-    run = RunRequest(changed(model, given), signals, experiment.time, names, tolerance.rtol)
+    inputs = tuple(inputs_of(model, experiment, given).values())
+    run = RunRequest(changed(model, given), inputs, experiment.time, names, tolerance.rtol)
     varied = [*_varied(model, run, sensitivities), *directions]
     labels = [v.label for v in varied]
     made = None if fresh else cache.taken(run.key)
@@ -140,7 +140,9 @@ def _varied(model: FmuModel, run: RunRequest, names: Sequence[str]) -> list[Vari
             size, low, high = _size(model, name), parameter.min, parameter.max
             varied.append(Varied(name, name, value, size, low, high, variable))
         else:
-            points = run.signals.constant(list(model.inputs).index(name))
+            points = tuple(
+                np.full(i.times.size, float(n == name)) for n, i in zip(model.inputs, run.inputs, strict=True)
+            )
             varied.append(Varied(name, name, 0.0, _size(model, name), variable=variable, points=points))
     return varied
 

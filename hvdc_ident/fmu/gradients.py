@@ -25,7 +25,7 @@ from hvdc_ident.fmu.differences import (
     rms,
     together,
 )
-from hvdc_ident.fmu.piecewise_linear import PackedInputs
+from hvdc_ident.fmu.request import RunRequest
 from hvdc_ident.fmu.worker_pool import WorkerPool
 
 LOST_IN_NOISE = 0.5  # relative error from which a derivative is not distinguished from noise
@@ -37,39 +37,11 @@ EXCESS_STEPS = 20  # times the steps of a plain run that one with sensitivities 
 
 
 @dataclass(frozen=True, eq=False)
-class RunRequest:
-    """A run to be made: values of parameters, inputs, instants of the rows, names recorded, relative tolerance."""
-
-    values: Mapping[str, float]
-    signals: PackedInputs
-    time: Array
-    names: tuple[str, ...]
-    tolerance: float
-
-    def experiment(self, noise_key: str = "") -> bytes:
-        """Return a digest of everything but the values of parameters. noise_key: taken in the place of the inputs."""
-        inputs = noise_key.encode() or self.signals.times.tobytes() + self.signals.values.tobytes()
-        return sha256(self.time.tobytes() + inputs + repr((self.names, self.tolerance)).encode()).digest()
-
-    @property
-    def key(self) -> bytes:
-        """A digest of everything that decides the outputs."""
-        return self.experiment() + repr(sorted(self.values.items())).encode()
-
-    def message(self, arrays: Mapping[str, Array] | None = None, **heading: object) -> Message:
-        """Return the request to a worker. arrays, heading: what else is asked for."""
-        signals = self.signals
-        inputs = {"sizes": signals.sizes, "times": signals.times, "points": signals.values, "breaks": signals.breaks}
-        wanted = {"values": self.values, "outputs": self.names, "tolerance": self.tolerance}
-        return {"do": "run", **wanted, **heading}, {"time": self.time, **inputs, **(arrays or {})}
-
-
-@dataclass(frozen=True, eq=False)
 class Varied:
     """A parameter that a run is differentiated by, or a constant times which all inputs move along a direction.
 
     value: where the derivative is taken, within [low, high]. size: a typical one. variable: the FMU's parameter or input
-    that it is, None for another direction. points: of that direction, as `PackedInputs.values`; None for a parameter. key:
+    that it is, None for another direction. points: of that direction, to be added to those of each input; None for a parameter. key:
     shared by those that need the same difference step.
     """
 
@@ -80,18 +52,22 @@ class Varied:
     low: float = -math.inf
     high: float = math.inf
     variable: Variable | None = None
-    points: Array | None = None
+    points: tuple[Array, ...] | None = None
 
     @property
     def label(self) -> str:
         """Name of the column among those of a run: the parameter, and of a variable's points their digest."""
-        return self.name if self.points is None else f"{self.name} {sha256(self.points.tobytes()).hexdigest()}"
+        return (
+            self.name
+            if self.points is None
+            else f"{self.name} {sha256(np.concatenate(self.points).tobytes()).hexdigest()}"
+        )
 
     def moved(self, run: RunRequest, value: float) -> RunRequest:
         """Return the run at another value."""
         if self.points is None:
             return replace(run, values={**run.values, self.name: value})
-        return replace(run, signals=replace(run.signals, values=run.signals.values + value * self.points))
+        return run.moved(value, self.points)
 
     def line(self, run: RunRequest, middle: Array) -> ParameterRuns[RunRequest]:
         """Return the runs along it. middle: the outputs at its value."""
@@ -176,9 +152,7 @@ class Differentiation:
             self.notes["sensitivities"] = "; ".join(f"{m}: {', '.join(names)}" for m, names in methods.items())
         labels, gradients = tuple(v.label for v in self.varied), self.gradients[: outputs.shape[0]]
         integrated = bool(directional)
-        return DifferentiatedRun(
-            outputs, labels, gradients, self.errors, self.counts, self.notes, self.end, integrated
-        )
+        return DifferentiatedRun(outputs, labels, gradients, self.errors, self.counts, self.notes, self.end, integrated)
 
     def _enter(self, v: Varied, column: Array) -> None:
         self.gradients[:, :, self.varied.index(v)] = column
@@ -186,7 +160,7 @@ class Differentiation:
     def _plain(self) -> Array:
         """(n, outputs) of the run itself, which is made once."""
         if self._made is None:
-            answer, out = self.pool.ask(*self.run.message(partial=self.partial))
+            answer, out = self.pool.ask({"do": "run", "run": self.run, "partial": self.partial}, {})
             self._made, self.end = (out["outputs"], answer["counts"]), answer["end"]
             if self.end is not None:
                 self.notes["end"] = f"the FMU asked for the end of the run at {self.end:.6g} s: the rows go up to there"
@@ -195,7 +169,7 @@ class Differentiation:
 
     def _rows(self, runs: Sequence[RunRequest]) -> list[Array]:
         """(n, outputs) of each run."""
-        return [out["outputs"] for _, out in self.pool.ask_all([run.message() for run in runs])]
+        return [out["outputs"] for _, out in self.pool.ask_all([({"do": "run", "run": run}, {}) for run in runs])]
 
     # --- by differences of runs ---
 
@@ -300,9 +274,8 @@ class Differentiation:
         """Return the answer to the request of a run with its sensitivities. max_steps: after which it is given up."""
         names, sizes = [v.name for v in varied], [v.size for v in varied]
         start = np.column_stack(self._start_derivatives(varied))
-        return self.pool.ask(
-            *self.run.message({"start": start}, sensitivities=names, sizes=sizes, max_steps=max_steps)
-        )
+        wanted = {"sensitivities": names, "sizes": sizes, "max_steps": max_steps}
+        return self.pool.ask({"do": "run", "run": self.run, **wanted}, {"start": start})
 
     def _start_derivatives(self, varied: Sequence[Varied]) -> list[Array]:
         """Return each (nx,) dx0/dp, from initialisations at two steps, extrapolated."""
@@ -317,6 +290,6 @@ class Differentiation:
         """(nx,) the states that each run begins with."""
         if not runs:
             return []
-        inputs = np.array([run.signals.at(run.time[:1], "left")[0] for run in runs])
+        inputs = np.array([run.at(run.time[:1], before_jump=True)[0] for run in runs])
         heading = {"do": "initial", "values": [run.values for run in runs], "time": float(self.run.time[0])}
         return list(self.pool.ask({**heading, "tolerance": self.run.tolerance}, {"u": inputs})[1]["states"])

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warnings
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,7 +17,8 @@ from hvdc_ident.data import Array
 from hvdc_ident.fmu.derivatives import SensitivityEquations
 from hvdc_ident.fmu.fmi import DISCARD, FmiError, VariableGroup
 from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
-from hvdc_ident.fmu.piecewise_linear import Interpolant, PackedInputs
+from hvdc_ident.fmu.piecewise_linear import Interpolant
+from hvdc_ident.fmu.request import RunRequest
 
 MAX_STEPS = 200_000  # of a run
 MAX_EVENTS = 100_000  # at states, of a run
@@ -43,35 +44,32 @@ class Counts:
 
 @dataclass
 class ModelExchangeRun:
-    """One run. names: of the recorded variables. equations: of the sensitivities, or None. start: (nx, np) dx0/dp.
+    """One run. equations: of the sensitivities, or None. start: (nx, np) dx0/dp.
 
     max_steps: after which it is given up. outputs (n, names) and gradients (n, names, np) are filled row by row.
     """
 
     instance: Instance
-    signals: PackedInputs
-    time: Array
-    names: tuple[str, ...]
-    tolerance: float
+    run: RunRequest
     equations: SensitivityEquations | None = None
     start: Array | None = None
     counts: Counts = field(default_factory=Counts)
     max_steps: int = MAX_STEPS
 
     def __post_init__(self) -> None:
-        self.library = self.instance.library
+        self.library, self.time = self.instance.library, self.run.time
         self.nx = self.library.nx
-        self.inputs = [Interpolant(t, v) for t, v in self.signals.each()]
+        self.inputs = [Interpolant(i) for i in self.run.inputs]
         variables = list(self.instance.description.inputs.values())
         # Inputs that are set at every instant; the others change at events alone.
         self.continuous = [
             k for k, (m, v) in enumerate(zip(self.inputs, variables, strict=True)) if v.continuous and not m.constant
         ]
         self.continuous_inputs = VariableGroup(self.library, [variables[k] for k in self.continuous])
-        self.recorded = self.instance.variables(self.names)
+        self.recorded = self.instance.variables(self.run.names)
         self.columns = self.equations.count if self.equations else 0
-        self.outputs = np.empty((self.time.size, len(self.names)))
-        self.gradients = np.zeros((self.time.size, len(self.names), self.columns))
+        self.outputs = np.empty((self.time.size, len(self.run.names)))
+        self.gradients = np.zeros((self.time.size, len(self.run.names), self.columns))
         self.applied: list[float] | None = None  # present values of the continuous inputs
         self.flat = False  # whether they keep them until the segment's end
         self.row = 0
@@ -82,10 +80,10 @@ class ModelExchangeRun:
         self.last_digit = float(np.spacing(np.abs(self.time[[0, -1]]).max()))
         self.rounding = 0.0  # difference up to which instants are one
 
-    def begin(self, values: Mapping[str, float]) -> None:
-        """Initialise the instance with these values of parameters. Raises RunFailed or FmiError."""
+    def begin(self) -> None:
+        """Initialise the instance. Raises RunFailed or FmiError."""
         t = float(self.time[0])
-        self.instance.begin(values, self._inputs_at(t, before_jump=True), t, self.end, self.tolerance)
+        self.instance.begin(self.run.values, self._inputs_at(t, before_jump=True), t, self.end, self.run.tolerance)
 
     def go(self) -> None:
         """Fill every row. Raises RunFailed, FmiError or SensitivitiesLost; RunEnded with the rows up to the end."""
@@ -101,9 +99,9 @@ class ModelExchangeRun:
     def _go(self) -> None:
         t = float(self.time[0])
         x = self.library.get_states()
-        self.atol = 1e-2 * self.tolerance * self.instance.nominals()
+        self.atol = 1e-2 * self.run.tolerance * self.instance.nominals()
         y = np.concatenate([x, *(self.start.T if self.start is not None and self.columns else [])])
-        stops = sorted({*(s for s in self.signals.breaks.tolist() if t <= s <= self.end), self.end})
+        stops = sorted({*(s for s in self.run.breaks.tolist() if t <= s <= self.end), self.end})
         self.rounding = self._rounding(t)
         t, y = self._stop_at(t, y, stops)
         while t < self.end:
@@ -196,7 +194,7 @@ class ModelExchangeRun:
             t,
             np.zeros(1) if dummy else y,
             end,
-            rtol=self.tolerance,
+            rtol=self.run.tolerance,
             atol=1.0 if dummy else atol,
             jac=jac,
             max_step=most,
@@ -319,7 +317,7 @@ class ModelExchangeRun:
         after = self._event_at(t, y, None)
         self.positive = self.library.get_indicators() > 0.0
         x = y[: self.nx]
-        moved = step * np.abs(self.library.get_derivatives() - old) > self.atol + self.tolerance * np.abs(x)
+        moved = step * np.abs(self.library.get_derivatives() - old) > self.atol + self.run.tolerance * np.abs(x)
         if np.array_equal(after[: self.nx], x) and due == self.instance.next_time and not moved.any():
             return None
         self._count_state_event(t)

@@ -1,10 +1,9 @@
-"""Piecewise linear signals with jumps: inputs as arrays for the worker, their interpolants, and grids that represent a signal."""
+"""Piecewise linear signals with jumps: their interpolants, and grids that represent a signal."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,68 +17,12 @@ MAX_DIVISIONS = 8  # of an interval, which leave 2e-10 of the span around a jump
 MAX_POINTS = 40_000  # of a refined grid
 
 
-@dataclass(frozen=True, eq=False)
-class PackedInputs:
-    """Piecewise linear inputs with jumps, in joined arrays.
-
-    sizes: (nu,) points of each. times, values: the points, joined. breaks: instants an integrator has to stop at, s.
-    """
-
-    sizes: Array
-    times: Array
-    values: Array
-    breaks: Array
-
-    @classmethod
-    def of(cls, inputs: Sequence[InputSignal]) -> PackedInputs:
-        """Return some inputs, packed."""
-        return cls(
-            np.array([i.times.size for i in inputs], dtype=float),
-            np.concatenate([np.empty(0), *(i.times for i in inputs)]),
-            np.concatenate([np.empty(0), *(i.values for i in inputs)]),
-            np.unique(np.concatenate([np.empty(0), *(i.breaks for i in inputs)])),
-        )
-
-    def each(self) -> list[tuple[Array, Array]]:
-        """Return times and values of each input; they are views."""
-        ends = np.cumsum(self.sizes).astype(int)[:-1]
-        return (
-            list(zip(np.split(self.times, ends), np.split(self.values, ends), strict=True)) if self.sizes.size else []
-        )
-
-    def constant(self, k: int) -> Array:
-        """Return values that are 1 at the points of one input, and 0 at those of the others."""
-        return np.repeat(np.arange(self.sizes.size) == k, self.sizes.astype(int)).astype(float)
-
-    def stepped(self, by: Sequence[float], at: float) -> PackedInputs:
-        """Return the inputs with a step added to each at an instant, s."""
-        times, values = [], []
-        for (t, v), step in zip(self.each(), by, strict=True):
-            k = int(np.searchsorted(t, at, side="right"))
-            before = float(np.interp(at, t, v))
-            times.append(np.concatenate([t[:k], [at, at], t[k:]]))
-            values.append(np.concatenate([v[:k], [before, before + step], v[k:] + step]))
-        breaks = np.union1d(self.breaks, np.array([at]))
-        return PackedInputs(self.sizes + 2.0, np.concatenate(times), np.concatenate(values), breaks)
-
-    def at(self, t: Array, side: str = "right") -> Array:
-        """(n, nu) values at the instants, after the jumps ("right") or before them ("left")."""
-        result = np.empty((t.size, self.sizes.size))
-        for k, (times, values) in enumerate(self.each()):
-            index = np.searchsorted(times, t, side="right" if side == "right" else "left")
-            i, j = np.clip(index - 1, 0, None), np.clip(index, None, times.size - 1)
-            width = times[j] - times[i]
-            share = np.clip((t - times[i]) / np.where(width > 0, width, 1.0), 0.0, 1.0)
-            result[:, k] = values[i] + np.where(width > 0, share, 0.0) * (values[j] - values[i])
-        return result
-
-
 class Interpolant:
     """One input's value at any instant, for an integrator that evaluates it thousands of times."""
 
-    def __init__(self, times: Array, values: Array) -> None:
-        self._times, self._values = times.tolist(), values.tolist()
-        self.constant = bool((values == values[0]).all())
+    def __init__(self, signal: InputSignal) -> None:
+        self._times, self._values = signal.times.tolist(), signal.values.tolist()
+        self.constant = signal.is_constant
 
     def is_flat(self, begin: float, end: float) -> bool:
         """Return whether the value is constant from just after `begin` to just before `end`."""

@@ -280,7 +280,7 @@ def _direction(
     ranges = {n: max(np.ptp(s.values), 1e-6 * np.abs(s.values).max(), 1e-12) for n, s in inputs.items()}
     sizes = {n: float(np.abs(derivative[n].values).max()) / r for n, r in ranges.items()}
     size = max(sizes.values(), default=0.0)
-    points = np.concatenate([derivative[n].values for n in inputs]) / (size or 1.0)
+    points = tuple(derivative[n].values / (size or 1.0) for n in inputs)
     return Varied(name, "along " + ", ".join(n for n, s in sizes.items() if s > 0.0), points=points), size
 
 

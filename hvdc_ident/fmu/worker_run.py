@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping
-from dataclasses import astuple
+from collections.abc import Mapping
+from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from hvdc_ident.fmu.description import Message
 from hvdc_ident.fmu.fmi import VariableGroup
 from hvdc_ident.fmu.instance import Instance, RunEnded, RunFailed
 from hvdc_ident.fmu.model_exchange import Counts, ModelExchangeRun, SensitivitiesLost
-from hvdc_ident.fmu.piecewise_linear import PackedInputs
+from hvdc_ident.fmu.request import RunRequest
 from hvdc_ident.fmu.runner import Runner, moving
 
 PERTURBATION = 0.1  # step of an input that shows whether a run is repeated, in sizes of the input
@@ -29,12 +29,8 @@ class ExperimentRun:
     def __init__(self, runner: Runner, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
         self.runner, self.description, self.learned = runner, runner.description, runner.learned
         self.heading, self.arrays = heading, arrays
-        self.values: dict[str, float] = heading["values"]
-        self.names = tuple(heading["outputs"])
-        self.tolerance: float = heading["tolerance"]
+        self.run: RunRequest = heading["run"]
         self.partial = bool(heading.get("partial"))  # whether a run that the FMU ends is accepted, with its rows
-        self.time = arrays["time"]
-        self.signals = PackedInputs(arrays["sizes"], arrays["times"], arrays["points"], arrays["breaks"])
 
     def answer(self) -> Message:
         """Return outputs and, where they are asked for, their sensitivities.
@@ -48,37 +44,29 @@ class ExperimentRun:
             return self.runner.perform(lambda instance: self._with_sensitivities(instance, names))
         if self.description.interface == "model-exchange":
             return self.runner.perform(self._plain)
-        co_simulation.find_calls(
-            self.learned, self.description, self.signals, self.time, self.tolerance, self._co_simulated
-        )
+        co_simulation.find_calls(self.learned, self.description, self.run, self._co_simulated)
         answer, arrays = self.runner.perform(self._plain)
         if answer["end"] is None and self.description.variable_step and moving(arrays["outputs"]).any():
             calls = CallPattern.learned(self.learned)
             with contextlib.suppress(RunFailed):
-                co_simulation.find_held(self.learned, self.time, lambda time: self._co_simulated(calls, time))
+                co_simulation.find_held(self.learned, self.run.time, lambda time: self._co_simulated(calls, time))
         return answer, arrays
 
     def _plain(self, instance: Instance) -> Message:
-        return self._checked(*self._run(instance, self.signals, self.time, self.names))
+        return self._checked(*self._made(instance, self.run))
 
-    def _run(
-        self,
-        instance: Instance,
-        signals: PackedInputs,
-        time: Array,
-        names: tuple[str, ...],
-        calls: CallPattern | None = None,
+    def _made(
+        self, instance: Instance, run: RunRequest, calls: CallPattern | None = None
     ) -> tuple[Array, Counts, float | None]:
         """Return the rows, (n, names), the counts, and the instant at which the FMU asked for the end, where that is accepted."""
         counts = Counts(segments=int(not instance.library.exchange))
         try:
             if not instance.library.exchange:
-                rows = co_simulation.run(instance, self.values, signals, time, names, self.tolerance, calls)
-                return rows, counts, None
-            run = ModelExchangeRun(instance, signals, time, names, self.tolerance, counts=counts)
-            run.begin(self.values)
-            run.go()
-            return run.outputs, counts, None
+                return co_simulation.made(instance, run, calls), counts, None
+            integration = ModelExchangeRun(instance, run, counts=counts)
+            integration.begin()
+            integration.go()
+            return integration.outputs, counts, None
         except RunEnded as e:
             if not self.partial or e.rows is None or not e.rows.size:
                 raise
@@ -86,11 +74,10 @@ class ExperimentRun:
 
     def _with_sensitivities(self, instance: Instance, names: tuple[str, ...]) -> Message:
         """Return the run with its sensitivities, which are lost where the FMU moves a parameter as it gives a derivative."""
-        equations = SensitivityEquations(instance, names, self.heading["sizes"], self.names)
-        start = self.arrays["start"]
-        run = ModelExchangeRun(instance, self.signals, self.time, self.names, self.tolerance, equations, start)
+        equations = SensitivityEquations(instance, names, self.heading["sizes"], self.run.names)
+        run = ModelExchangeRun(instance, self.run, equations, self.arrays["start"])
         run.max_steps = self.heading["max_steps"] or run.max_steps
-        run.begin(self.values)
+        run.begin()
         parameters = VariableGroup(instance.library, tuple(self.description.parameters.values()))
         before, lost = parameters.get().copy(), ""
         try:
@@ -112,8 +99,8 @@ class ExperimentRun:
         finite = np.isfinite(rows)
         if not finite.all():
             row, column = np.argmin(finite.all(axis=1)), np.argmin(finite.all(axis=0))
-            what = f"output '{self.names[column]}' is not finite"
-            raise RunFailed(what, float(self.time[row]), "check parameter values and limits")
+            what = f"output '{self.run.names[column]}' is not finite"
+            raise RunFailed(what, float(self.run.time[row]), "check parameter values and limits")
         return {"counts": list(astuple(counts)), "end": end}, {"outputs": rows}
 
     # --- trials ---
@@ -121,36 +108,26 @@ class ExperimentRun:
     def _find_reuse(self) -> None:
         """Learn how the FMU is brought back to its start, from runs of this experiment in separate processes."""
         d = self.description
-        names = tuple(dict.fromkeys([*self.names, *d.outputs, *d.states]))
-
-        def run_on(signals: PackedInputs) -> Callable[[Instance], Array]:
-            return lambda instance: self._trial(instance, signals, self.time, names)
-
-        reuse, rows = self.runner.find_reuse(run_on(self.signals))
+        run = replace(self.run, names=tuple(dict.fromkeys([*self.run.names, *d.outputs, *d.states])))
+        reuse, rows = self.runner.find_reuse(lambda instance: self._trial(instance, run))
         steps = [PERTURBATION * max(abs(v.start or 0.0), v.nominal) * v.continuous for v in d.inputs.values()]
         if any(steps) and not moving(rows).any():  # at rest throughout: the start of a run is its end
-            third = float(self.time[0] + (self.time[-1] - self.time[0]) / 3.0)
+            third = float(run.time[0] + (run.time[-1] - run.time[0]) / 3.0)
+            moved = run.stepped(steps, third)
             with contextlib.suppress(RunFailed):
-                reuse, _ = self.runner.find_reuse(run_on(self.signals.stepped(steps, third)))
+                reuse, _ = self.runner.find_reuse(lambda instance: self._trial(instance, moved))
         self.learned["restart"] = reuse
 
     def _co_simulated(self, calls: CallPattern, time: Array) -> Array:
         """(n, outputs) of a run that calls the FMU in some way, of the outputs asked for and all others."""
-        names = tuple(dict.fromkeys([*self.names, *self.description.outputs]))
+        run = replace(self.run, time=time, names=tuple(dict.fromkeys([*self.run.names, *self.description.outputs])))
 
         def work(instance: Instance) -> Message:
-            return {}, {"rows": self._trial(instance, self.signals, time, names, calls)}
+            return {}, {"rows": self._trial(instance, run, calls)}
 
         return self.runner.perform(work)[1]["rows"]
 
-    def _trial(
-        self,
-        instance: Instance,
-        signals: PackedInputs,
-        time: Array,
-        names: tuple[str, ...],
-        calls: CallPattern | None = None,
-    ) -> Array:
+    def _trial(self, instance: Instance, run: RunRequest, calls: CallPattern | None = None) -> Array:
         """(n, names) of a run; NaN after an end that the FMU asked for, where such a run is accepted."""
-        rows, _, _ = self._run(instance, signals, time, names, calls)
-        return np.vstack([rows, np.full((time.size - rows.shape[0], rows.shape[1]), np.nan)])
+        rows, _, _ = self._made(instance, run, calls)
+        return np.vstack([rows, np.full((run.time.size - rows.shape[0], rows.shape[1]), np.nan)])
