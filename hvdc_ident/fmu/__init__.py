@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from hvdc_ident.fmu.capabilities import Capabilities, read_capabilities, tested_capabilities
     from hvdc_ident.fmu.compile import compile_fmu
     from hvdc_ident.fmu.description import INTERFACES, Description, read_description
-    from hvdc_ident.fmu.evaluate import FmuPoint, at_point, smooth_inputs
+    from hvdc_ident.fmu.evaluate import at_point, smooth_inputs
     from hvdc_ident.fmu.model import FmuModel, FmuState, read_fmu
+    from hvdc_ident.fmu.request import FmuPoint
     from hvdc_ident.fmu.worker_pool import Limits
 else:
     __getattr__ = offered(
@@ -22,8 +23,9 @@ else:
             "capabilities": "Capabilities read_capabilities tested_capabilities",
             "compile": "compile_fmu",
             "description": "INTERFACES Description read_description",
-            "evaluate": "FmuPoint at_point smooth_inputs",
+            "evaluate": "at_point smooth_inputs",
             "model": "FmuModel FmuState read_fmu",
+            "request": "FmuPoint",
             "worker_pool": "Limits",
         },
     )

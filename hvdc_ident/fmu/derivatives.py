@@ -6,7 +6,6 @@ Directional derivatives are used where the FMU offers them and they agree with d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.fmu.differences import SHORT_STEP
 from hvdc_ident.fmu.fmi import FATAL, FmiError, Vector
 from hvdc_ident.fmu.instance import Instance, RunFailed
+from hvdc_ident.fmu.request import FmuPoint
 
 CENTRAL_STEP = float(np.cbrt(np.finfo(float).eps))  # of a central difference, in sizes of the variable
 AGREEMENT = 1e-5  # of a row's largest entry: directional derivatives that differ by more from differences are not used
@@ -121,39 +121,41 @@ class PointEvaluation:
         self._enter()
         self._current_u = self.u
 
-    def evaluate(self) -> tuple[Array, Array]:
-        """x' (nx,) and y (outputs,)."""
-        return self._at(self.x, self.u)
-
     def beside(self) -> Array:
         """(nx + outputs,) x' and y a little beside the point, in every state and input: what stands still shows there."""
         x, u = self.x.copy(), self.u.copy()
         x += SHORT_STEP * np.maximum(np.abs(x), self.instance.nominals())
         u[self._continuous] += SHORT_STEP * self._input_sizes()
-        return np.concatenate(self._at(x, u))
+        return self._at(x, u)
 
     def _input_sizes(self) -> Array:
         """(continuous inputs,) sizes of the inputs that a Jacobian has columns for."""
         typical = np.array([v.nominal for v in self.instance.description.inputs.values()])
         return np.maximum(np.abs(self.u), typical)[self._continuous]
 
-    def _at(self, x: Array, u: Array) -> tuple[Array, Array]:
+    def _at(self, x: Array, u: Array) -> Array:
+        """(nx + outputs,) x' and y."""
         library = self.instance.library
         library.set_states(x)
         if (u != self._current_u).any():
             self.instance.inputs.set(u)
             self._current_u = u
-        return library.get_derivatives().copy(), self._outputs.get().copy()
+        return np.concatenate([library.get_derivatives(), self._outputs.get()])
 
-    def jacobian(self, parameters: Sequence[str], sizes: Sequence[float], *, check: bool = True) -> PointJacobian:
-        """Return the Jacobian by states, continuous inputs and parameters. sizes: of the parameters.
+    def found(self, parameters: Sequence[str], sizes: Sequence[float], *, check: bool = True) -> FmuPoint:
+        """Return the FMU here, with the Jacobian by states, continuous inputs and parameters. sizes: of the parameters.
 
         check: whether directional derivatives of states and inputs that once agreed are compared again.
         """
+        here, nx = self._at(self.x, self.u), self.x.size
+
+        def point(matrix: Array, own: NDArray[np.bool_], error: float, near: bool) -> FmuPoint:
+            return FmuPoint(self.x, here[:nx], here[nx:], matrix, own, error, near)
+
         if not check and not parameters and self.instance.directional_confirmed:
             directional = self._directional([])
             if directional is not None and np.isfinite(directional).all():
-                return PointJacobian(directional, np.ones(directional.shape[1], dtype=bool), 0.0, False)
+                return point(directional, np.ones(directional.shape[1], dtype=bool), 0.0, False)
         scale = np.concatenate([np.maximum(np.abs(self.x), self.instance.nominals()), self._input_sizes()])
         columns = [self._difference(k, CENTRAL_STEP * s) for k, s in enumerate(scale)]
         others = [self._difference(k, 0.25 * CENTRAL_STEP * s) for k, s in enumerate(scale)]
@@ -161,8 +163,8 @@ class PointEvaluation:
         if parameters:  # some FMUs move a parameter as they give a derivative by it
             self.instance.renew(parameters)
         for name, size in zip(parameters, sizes, strict=True):
-            columns.append(self._difference_by(name, CENTRAL_STEP * size))
-            others.append(self._difference_by(name, 4.0 * CENTRAL_STEP * size))
+            columns.append(self._difference(name, CENTRAL_STEP * size))
+            others.append(self._difference(name, 4.0 * CENTRAL_STEP * size))
         if parameters:  # the instance has other values: back to the point
             self._begin_again(self.values)
         numeric = np.column_stack(columns) if columns else np.zeros((self.x.size + len(self.names), 0))
@@ -173,35 +175,31 @@ class PointEvaluation:
         doubt = doubt * relative
         near = bool((doubt > KINK).any())
         if directional is None:
-            return PointJacobian(numeric, np.zeros(numeric.shape[1], dtype=bool), float(doubt.max(initial=0.0)), near)
+            return point(numeric, np.zeros(numeric.shape[1], dtype=bool), float(doubt.max(initial=0.0)), near)
         apart = np.abs(directional - numeric) * relative
         apart = np.where(np.isfinite(apart), apart, np.inf)
         agrees: NDArray[np.bool_] = np.all(apart <= AGREEMENT + 10.0 * doubt, axis=0)
         self.instance.directional_confirmed = bool(agrees[: scale.size].all())
         error = np.where(agrees, apart, doubt).max(initial=0.0)
-        return PointJacobian(np.where(agrees, directional, numeric), agrees, float(error), near)
+        return point(np.where(agrees, directional, numeric), agrees, float(error), near)
 
-    def _difference(self, k: int, h: float) -> Array:
-        """Return the central difference by state or continuous input k."""
-        ends = []
-        for sign in (1.0, -1.0):
-            x, u = self.x.copy(), self.u.copy()
-            if k < x.size:
-                x[k] += sign * h
-            else:
-                u[self._continuous[k - x.size]] += sign * h
-            ends.append(np.concatenate(self._at(x, u)))
-        self._at(self.x, self.u)
-        return (ends[0] - ends[1]) / (2.0 * h)
+    def _difference(self, by: int | str, h: float) -> Array:
+        """Return the central difference by a state or continuous input of this number, or a parameter of this name."""
+        up, down = self._displaced(by, h), self._displaced(by, -h)
+        if not isinstance(by, str):
+            self._at(self.x, self.u)
+        return (up - down) / (2.0 * h)
 
-    def _difference_by(self, name: str, h: float) -> Array:
-        """Return the central difference by a parameter."""
-        ends = []
-        value = self.values.get(name, self.instance.description.parameters[name].start or 0.0)
-        for sign in (1.0, -1.0):
-            self._begin_again({**self.values, name: value + sign * h})
-            ends.append(np.concatenate(self.evaluate()))
-        return (ends[0] - ends[1]) / (2.0 * h)
+    def _displaced(self, by: int | str, h: float) -> Array:
+        x, u = self.x.copy(), self.u.copy()
+        if isinstance(by, str):
+            value = self.values.get(by, self.instance.description.parameters[by].start or 0.0)
+            self._begin_again({**self.values, by: value + h})
+        elif by < x.size:
+            x[by] += h
+        else:
+            u[self._continuous[by - x.size]] += h
+        return self._at(x, u)
 
     def _directional(self, parameters: list[str]) -> Array | None:
         """Return the FMU's own Jacobian; None where it offers none, NaN in columns that it refuses."""
@@ -226,17 +224,3 @@ class PointEvaluation:
         unit = np.append(np.zeros(len(states)), 1.0)[None]
         by_parameters = [columns([*states, d.parameters[n].reference], unit) for n in parameters]
         return np.column_stack([columns(knowns, np.eye(len(knowns))), *by_parameters])
-
-
-@dataclass(frozen=True, eq=False)
-class PointJacobian:
-    """The Jacobian of [x', y] by [x, u, p] at a point. directional: by column, whether it is the FMU's own.
-
-    error: the largest difference from central differences (or, where those are used, between two step sizes), in
-    shares of each row's largest entry. near: whether differences of two step sizes disagree, as beside a limit.
-    """
-
-    matrix: Array
-    directional: NDArray[np.bool_]
-    error: float
-    near: bool

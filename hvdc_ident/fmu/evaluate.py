@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import ModelError
 from hvdc_ident.fmu.gradients import DifferentiatedRun, Differentiation, Varied
 from hvdc_ident.fmu.last_runs import LastRuns
-from hvdc_ident.fmu.request import RunRequest
+from hvdc_ident.fmu.request import FmuPoint, RunRequest
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import Simulation, Statistics, Tolerance
 
@@ -159,24 +157,6 @@ def _size(model: FmuModel, name: str) -> float:
     return max(abs(model.inputs[name].value), variable.nominal)
 
 
-@dataclass(frozen=True, eq=False)
-class FmuPoint:
-    """x (nx,), its derivatives (nx,), outputs (ny,), and the Jacobian of both by [x, u, p], (nx + ny, nx + nu + np).
-
-    nominals: (nx,) sizes of the states. directional: which columns are the FMU's own. error: of the Jacobian, in shares
-    of each row's largest entry. near: whether differences of two step sizes disagree, as beside a limit.
-    """
-
-    x: Array
-    derivatives: Array
-    outputs: Array
-    jacobian: Array
-    nominals: Array
-    directional: NDArray[np.bool_]
-    error: float
-    near: bool
-
-
 def smooth_inputs(model: FmuModel) -> tuple[str, ...]:
     """Return the inputs that may change continuously: those a Jacobian has columns for."""
     return tuple(n for n, v in model.fmu.inputs.items() if v.continuous)
@@ -215,14 +195,6 @@ def at_point(
         "sizes": [_size(model, name) for name in parameters],
     }
     u = np.array([float(values.get(n, i.value)) for n, i in model.inputs.items()])
-    answer, out = model.pool.ask(heading, {"u": u, **({} if states is None else {"x": states})})
-    return FmuPoint(
-        out["x"],
-        out["derivatives"],
-        out["outputs"],
-        out["jacobian"],
-        out["nominals"],
-        out["directional"] > 0.5,
-        float(answer["error"]),
-        bool(answer["near"]),
-    )
+    answer, _ = model.pool.ask(heading, {"u": u, **({} if states is None else {"x": states})})
+    point: FmuPoint = answer["point"]
+    return point

@@ -1,4 +1,4 @@
-"""A run of an FMU as it is asked for, from the pool to the worker that makes it."""
+"""What goes between the pool and the worker that makes it: a run that is asked for, and an FMU at a point."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import cached_property
 from hashlib import sha256
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, InputSignal
 
@@ -53,3 +54,21 @@ class RunRequest:
     def key(self) -> bytes:
         """A digest of everything that decides the outputs."""
         return self.experiment() + repr(sorted(self.values.items())).encode()
+
+
+@dataclass(frozen=True, eq=False)
+class FmuPoint:
+    """x (nx,), its derivatives (nx,), outputs (ny,), and the Jacobian of both by [x, u, p], (nx + ny, nx + nu + np).
+
+    directional: which columns are the FMU's own. error: of the Jacobian, in shares of each row's largest entry: the largest
+    difference from central differences or, where those are used, between two step sizes. near: whether differences of two
+    step sizes disagree, as beside a limit.
+    """
+
+    x: Array
+    derivatives: Array
+    outputs: Array
+    jacobian: Array
+    directional: NDArray[np.bool_]
+    error: float
+    near: bool

@@ -77,7 +77,7 @@ def _answered(runner: Runner, heading: Mapping[str, Any], arrays: Mapping[str, A
 
 
 def _point(runner: Runner, heading: Mapping[str, Any], arrays: Mapping[str, Array]) -> Message:
-    """Return derivatives, outputs and their Jacobian at a point."""
+    """Return the FMU at a point."""
 
     def evaluation(instance: Instance) -> PointEvaluation:
         names = tuple(heading["outputs"])
@@ -85,16 +85,7 @@ def _point(runner: Runner, heading: Mapping[str, Any], arrays: Mapping[str, Arra
 
     def work(instance: Instance) -> Message:
         point = evaluation(instance)
-        derivatives, outputs = point.evaluate()
-        jacobian = point.jacobian(heading["parameters"], heading["sizes"], check=heading["check"])
-        return {"error": jacobian.error, "near": jacobian.near}, {
-            "x": point.x,
-            "derivatives": derivatives,
-            "outputs": outputs,
-            "jacobian": jacobian.matrix,
-            "directional": jacobian.directional.astype(float),
-            "nominals": instance.nominals(),
-        }
+        return {"point": point.found(heading["parameters"], heading["sizes"], check=heading["check"])}, {}
 
     restart = _restart_at_point(runner, evaluation, heading["time"]) if heading["parameters"] else None
     return runner.perform(work, restart)
