@@ -46,7 +46,8 @@ def simulate_without_effects(
     """
     cache: LastRuns[DifferentiatedRun] = model.pool.cache
     inputs = tuple(inputs_of(model, experiment, given).values())
-    run = RunRequest(changed(model, given), inputs, experiment.time, names, tolerance.rtol)
+    values = _set_values(model, given, sensitivities)
+    run = RunRequest(values, inputs, experiment.time, names, tolerance.rtol)
     varied = [*_varied(model, run, sensitivities), *directions]
     labels = [v.label for v in varied]
     made = None if fresh else cache.taken(run.key)
@@ -94,6 +95,9 @@ def _learned_notes(learned: Mapping[str, Any]) -> dict[str, str]:
         texts["steps"] = (
             "the FMU refuses steps of different lengths: it took even ones, rows between are joined by lines"
         )
+    if learned.get("own values"):
+        listed = ", ".join(f"'{n}' = {v:.6g}" for n, v in learned["own values"].items())
+        texts["own values"] = f"the FMU's binary has values that its description does not: {listed}; runs that name none have these"
     if learned.get("outputs held"):
         texts["internal steps"] = (
             f"the FMU takes steps of its own and its outputs at a row are those of the last one, up to "
@@ -112,9 +116,14 @@ def inputs_of(model: FmuModel, experiment: Experiment, given: Mapping[str, float
     return signals
 
 
-def changed(model: FmuModel, given: Mapping[str, float]) -> dict[str, float]:
-    """Return the values of the FMU's parameters that differ from its starts. Raises ModelError where one cannot be set."""
-    values = {}
+def _set_values(model: FmuModel, given: Mapping[str, float], varied: Sequence[str] = ()) -> dict[str, float]:
+    """Return the values of parameters that the FMU is given: those that are not its starts, and starts that are named or varied.
+
+    A start that the FMU is known to have itself is left out. Raises ModelError where a value cannot be set.
+    """
+    values, learned = {}, model.pool.learned
+    doubtful = {*learned["own values"], *learned["unread"]} if "own values" in learned else model.fmu.parameters.keys()
+    asked = doubtful & {*given, *varied}
     for name, variable in model.fmu.parameters.items():
         value = float(given.get(name, model.parameters[name].value))
         if not np.isfinite(value):
@@ -123,7 +132,7 @@ def changed(model: FmuModel, given: Mapping[str, float]) -> dict[str, float]:
             raise ModelError(
                 f"parameter '{name}' takes whole numbers only", where=f"model '{model.name}'", got=f"{value:g}"
             )
-        if value != variable.start:
+        if value != variable.start or name in asked:
             values[name] = value
     return values
 
@@ -187,7 +196,7 @@ def at_point(
         )
     heading = {
         "do": "point",
-        "values": changed(model, values),
+        "values": _set_values(model, values),
         "time": time,
         "outputs": list(outputs),
         "check": check,

@@ -91,7 +91,8 @@ class Instance:
         self.inputs = VariableGroup(self.library, tuple(description.inputs.values()))
         self._running = False
         self._made = 0  # instances in this process so far
-        self._set: set[str] = set()  # parameters whose values this instance was given
+        self._set: set[str] = set()  # parameters whose values this process was given
+        self._own: dict[str, float] = {}  # values that parameters have in this process where they are not set
         self.directional_confirmed = (
             False  # whether directional derivatives agreed with differences at the last comparison
         )
@@ -104,7 +105,7 @@ class Instance:
     def begin(
         self, values: Mapping[str, float], inputs: Array, start: float, stop: float | None, tolerance: float | None
     ) -> None:
-        """Initialise the instance: parameters that differ from their start, inputs, instant in s.
+        """Initialise the instance: parameters, inputs, instant in s. Parameters without a value are left as the FMU has them.
 
         Model exchange: events at the start are processed and the instance is in continuous-time mode.
         """
@@ -114,12 +115,12 @@ class Instance:
         until = None if stop is None or stop <= start else stop  # some FMUs refuse an experiment of no length
         library.setup_experiment(start, until, tolerance)
         # A reset may keep what was set: a value of the last run must not enter this one.
-        restored = {n: s for n in self._set - values.keys() if (s := parameters[n].start) is not None}
-        given = {**restored, **values}
-        VariableGroup(library, [parameters[n] for n in given]).set(list(given.values()))
-        self._set |= given.keys()
+        own = {n: self._own.get(n, parameters[n].start) for n in self._set - values.keys()}
+        moved = {n: v for n, v in values.items() if v != parameters[n].start or n in self._set}
+        self._assign({**{n: v for n, v in own.items() if v is not None}, **moved})
         library.enter_initialization(start, until, tolerance)
         self._running = True
+        self._assign(self._held_otherwise({n: v for n, v in values.items() if n not in moved}))
         self.inputs.set(inputs)  # some FMUs refuse inputs before this mode
         library.exit_initialization()
         self._check_parameters(values, start)
@@ -127,19 +128,47 @@ class Instance:
             self.update_discrete_states(start)
             library.enter_continuous_time_mode()
 
+    def _assign(self, values: Mapping[str, float]) -> None:
+        """Set parameters."""
+        VariableGroup(self.library, [self.description.parameters[n] for n in values]).set(list(values.values()))
+        self._set |= values.keys()
+
+    def _held_otherwise(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Return those of some starts that the instance does not have: its description need not be that of its binary.
+
+        What it has itself is kept for later. Learned: "own values", where those are others, and in "unread" the parameters
+        that were set before they could be read.
+        """
+        parameters = self.description.parameters
+        wanted = values if "own values" in self.learned else parameters.keys() - self._set
+        described = {n: s for n in wanted if (s := parameters[n].start) is not None}
+        read = self._read(described)
+        if read is None:
+            return {}
+        self._own.update(read)
+        other = {n: v for n, v in read.items() if _differ(v, described[n])}
+        self.learned.setdefault("unread", tuple(sorted(self._set)))
+        self.learned["own values"] = {**self.learned.get("own values", {}), **other}
+        return {n: v for n, v in values.items() if n in other}
+
+    def _read(self, names: Iterable[str]) -> dict[str, float] | None:
+        """Return the values of parameters; None where the FMU does not show them, with which it can still be run."""
+        wanted = tuple(names)
+        try:
+            read = VariableGroup(self.library, [self.description.parameters[n] for n in wanted]).get().tolist()
+        except FmiError:
+            return None
+        return dict(zip(wanted, read, strict=True))
+
     def _check_parameters(self, values: Mapping[str, float], start: float) -> None:
         """Raise RunFailed where a parameter does not read as it was set: the run would be that of another value."""
-        parameters = VariableGroup(self.library, [self.description.parameters[n] for n in values])
-        try:
-            read = parameters.get().tolist()
-        except FmiError:  # an FMU that does not show its parameters can still be run
-            return
-        for (name, value), actual in zip(values.items(), read, strict=True):
-            if abs(actual - value) > PARAMETER_TOLERANCE * abs(value):
-                what = (
-                    f"parameter '{name}' was set to {value:.9g} and reads {actual:.9g}: the FMU does not take the value"
+        for name, actual in (self._read(values) or {}).items():
+            if _differ(actual, values[name]):
+                raise RunFailed(
+                    f"parameter '{name}' was set to {values[name]:.9g} and reads {actual:.9g}: the FMU does not take the value",
+                    start,
+                    "leave it at its start value, or export it as tunable",
                 )
-                raise RunFailed(what, start, "leave it at its start value, or export it as tunable")
 
     def _make_uninitialised(self) -> None:
         """Reset the instance, or make a new one, where it has been initialised since; make one where there is none."""
@@ -212,3 +241,8 @@ class Instance:
         given = np.abs(self.library.get_nominals())
         described = np.array([v.nominal for v in self.description.states.values()])
         return np.where(np.isfinite(given) & (given > 0.0), given, described)
+
+
+def _differ(actual: float, value: float) -> bool:
+    """Return whether a parameter reads otherwise than it was set."""
+    return abs(actual - value) > PARAMETER_TOLERANCE * abs(value)

@@ -19,8 +19,11 @@ SPRING_CODE = (
 #ifndef RELEASED
 #define RELEASED 0.0
 #endif
+#ifndef DAMPING
+#define DAMPING 0.5
+#endif
 #define INITIALIZE(r) (r[0] = r[8] + RELEASED)
-static void start(double *r) { r[4] = 2; r[5] = 0.5; r[6] = 8; r[7] = 0.25; }
+static void start(double *r) { r[4] = 2; r[5] = DAMPING; r[6] = 8; r[7] = 0.25; }
 static void equations(double *r, double t) {
     r[2] = r[1];
     r[3] = (r[6] * r[8] - r[5] * r[1] - r[6] * r[0]) / r[4];
@@ -74,6 +77,9 @@ def spring(
     defines = (f"NOMINAL={nominal}", *(["OWN_DERIVATIVES", f"WRONG={wrong}", *more] if own else []))
     return CModel(name, SPRING_CODE, SPRING_VARIABLES, 2, 0, directional=own, defines=defines)
 
+
+# Its binary begins with another damping than its description says.
+OTHERWISE = CModel("otherwise", SPRING_CODE, SPRING_VARIABLES, 2, 0, defines=("RELEASED=1.0", "DAMPING=1.5"))
 
 # The spring without derivatives of its own, let go at 1 beside its place of rest.
 RELEASED = CModel("released", SPRING_CODE, SPRING_VARIABLES, 2, 0, defines=("RELEASED=1.0",))
