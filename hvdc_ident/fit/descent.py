@@ -4,7 +4,7 @@ A step minimises |r + J p|^2 + lambda |D p|^2 in scaled coordinates with D the l
 bounds met by an active set; lambda follows the ratio of actual to predicted reduction as in Nielsen (1999), "Damping parameter
 in Marquardt's method". A step is no longer than 1 in a logarithm and than another coordinate itself, or 1, at first, and twice as
 long after each that kept half its promise: a full first step may land where no output answers any more. A simulation that fails
-shrinks the step.
+shrinks the step; one that changes no residual, as of a simulator of fixed steps that answers in jumps, is made longer.
 """
 
 from __future__ import annotations
@@ -31,6 +31,10 @@ AS_PROMISED = 0.1
 """A reduction within this share of the promised one shows no error of the simulation."""
 SMALLEST = 1e-10
 """A scaled coordinate below this counts as this large where its step is judged: an optimum may lie at 0."""
+UNCHANGED = 1e-9
+"""Change of the residuals, as a share of the largest, that is none: rounding."""
+WORTH = 1e-6
+"""Share of the cost that a step has to promise to be made longer where nothing changes."""
 LONGEST = 10.0
 """Longest first step of a descent that begins near a minimum, and along a tangent: no parabola holds over four decades of a logarithm."""
 
@@ -141,7 +145,7 @@ class DescentOptions:
 
 @dataclass
 class Descent:
-    """A descent: the best point so far (None before the first), the evaluations used, and the last one's error if it failed.
+    """A descent: the best point so far (None before the first), the evaluations used, and the last one with its error if it failed.
 
     fixed: (p,) unknowns that stay where they begin.
     """
@@ -152,6 +156,7 @@ class Descent:
     evaluations: int = 0
     failure: SimulationError | None = None
     at: LinearResiduals | None = None
+    tried: LinearResiduals | None = field(init=False, default=None)
     space: Coordinates = field(init=False)
 
     def __post_init__(self) -> None:
@@ -210,6 +215,9 @@ class Descent:
                     continue
                 if not self.failure and predicted <= self.options.reduction * here.cost:
                     return "standstill"
+                if predicted > WORTH * here.cost and self._passes_plateau(here, p, low, high):
+                    damping, growth = self.options.damping, 2.0
+                    continue
             damping = FIRST_DAMPING if damping <= LEAST_DAMPING else damping * growth
             growth = min(2.0 * growth, 1e6)
         return "spent"
@@ -217,16 +225,28 @@ class Descent:
     def _moved(self, x: Array, below: float) -> bool:
         """Return whether the simulation at x succeeds at a cost below the given one; only then x becomes the best point."""
         self.evaluations += 1
+        self.tried = None
         try:
-            there = LinearResiduals.at(self.objective, self.space, x)
+            self.tried = LinearResiduals.at(self.objective, self.space, x)
         except SimulationError as error:
             self.failure = error
             return False
         self.failure = None
-        if not there.cost < below:
+        if not self.tried.cost < below:
             return False
-        self.at = there
+        self.at = self.tried
         return True
+
+    def _passes_plateau(self, here: LinearResiduals, p: Array, low: Array, high: Array) -> bool:
+        """Return whether p changed no residual and a step twice, four times, ... as long leads to a lower cost, the best point then."""
+        while self.tried is not None and np.abs(self.tried.r - here.r).max() <= UNCHANGED * np.abs(here.r).max():
+            longer = np.clip(2.0 * p, low, high)
+            if np.array_equal(longer, p) or self.evaluations >= self.options.max_evaluations:
+                return False
+            p = longer
+            if self._moved(here.x + p, here.cost):
+                return True
+        return False
 
     def _stationary(self, here: LinearResiduals, low: Array, high: Array) -> bool:
         g = np.where(_blocked(here.gradient, low, high), 0.0, here.gradient)

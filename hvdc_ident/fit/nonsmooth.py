@@ -4,12 +4,13 @@ Events that pass rows, and adaptive steps of a solver, make the residuals jump f
 is then a sawtooth on a parabola: its lowest minimum lies anywhere within sqrt(2 roughness) standard deviations. The roughness
 is estimated by fourth differences (More and Wild, SIAM J. Sci. Comput. 33 (2011) 1292) over steps as wide as the interval.
 Where it is not small against the threshold, the optimum is that of the trend of the residuals, regressed over that width.
+A simulator of fixed steps may not answer at all over more than that: then the optimum is the middle of what is all the same.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.fit.simulator import approximate
 from hvdc_ident.fit.uncertainty import SINGULAR, TWO_SIDED
+from hvdc_ident.immutable import FrozenMap
 
 FINE = 0.05
 """Share of its half-width by which an end may be off: 1.96 times 0.95 to 1.05 standard deviations cover 94 to 96 of 100."""
@@ -46,7 +48,8 @@ class Trend:
     theta: (p,), each unknown in its unit. gain: (p, p), multiplies the covariance from the single run's derivatives from
     both sides, for these are off. scatter: (p, p) covariance of theta by the roughness alone.
     curvature: (p, p) of the cost. roughness: random change of the cost, half of chi-square, between values
-    within the interval. settled: whether the optimum lies among the places that the trend was regressed on.
+    within the interval. settled: whether the optimum lies among the places that the trend was regressed on. unchanged: ends of
+    the values between which runs are the same, by unknown.
     """
 
     theta: Array
@@ -55,6 +58,7 @@ class Trend:
     curvature: Array
     roughness: float
     settled: bool = True
+    unchanged: FrozenMap[tuple[float, float]] = field(default_factory=FrozenMap)
 
     def holds(self, theta: Array, threshold: float) -> bool:
         """Return whether theta, (p,), may be a local minimum that a search found within the interval of this optimum."""
@@ -73,6 +77,12 @@ class Trend:
     @property
     def text(self) -> str:
         """Sentence on the roughness, for the reader of a report."""
+        if self.unchanged:
+            listed = ", ".join(f"for {n} from {low:.6g} to {high:.6g}" for n, (low, high) in self.unchanged.items())
+            return (
+                f"Runs of this simulator answer in jumps and are the same {listed}: estimates are in the middle, and intervals "
+                "hold all of it"
+            )
         return (
             f"Runs of this simulator jump from one parameter value to the next, so that chi-square changes by about "
             f"{2.0 * self.roughness:.2g} at random within the intervals (their ends lie where it has risen by 3.84): "
@@ -141,7 +151,7 @@ def trend_of(problem: Problem, theta: Array, known_roughness: float | None = Non
     """
     rough = roughness(problem, theta) if known_roughness is None else known_roughness
     if rough == 0.0 or rough <= SLIGHT * threshold_of(problem, residual_at(problem, theta)):
-        return None
+        return _plateau(problem, theta) if approximate(problem.simulator) else None
     space = problem.coordinates
     low, high = space.bounds
     x = space.scaled(theta)
@@ -169,6 +179,55 @@ def trend_of(problem: Problem, theta: Array, known_roughness: float | None = Non
         elif settled:
             return trend
     return trend
+
+
+def _plateau(problem: Problem, theta: Array) -> Trend | None:
+    """Return the middle of the values about theta, (p,), at which runs are the same over more than a standard deviation.
+
+    None where every unknown changes them. The interval of the estimate is the linear one and all that is the same.
+    """
+    space = problem.coordinates
+    low, high = space.bounds
+    x = space.scaled(theta)
+    r, jacobian = problem.residual(theta)
+    length = np.linalg.norm(jacobian * space.slope(theta), axis=0)
+    ends = np.zeros((2, x.size))
+    for k in np.flatnonzero((length > 0) & (x > low) & (x < high)):
+        for side, room in enumerate((low[k] - x[k], high[k] - x[k])):
+            step = np.sign(room) * min(1.0 / length[k], abs(room))
+            ends[side, k] = _unchanged_to(problem, x, r, int(k), step, room)
+    if not ends.any():
+        return None
+    middle = space.unscaled(x + ends.mean(axis=0))
+    if threshold_of(problem, r) < 0.5 * float(np.sum(residual_at(problem, middle) ** 2) - r @ r):
+        ends, middle = np.abs(ends).max(axis=0) * np.array([[-1.0], [1.0]]), theta  # the middle of each is not that of all
+    half = 0.5 * np.ptp(ends, axis=0) * space.slope(middle)
+    scatter = np.diag(half**2) / (2.0 * TWO_SIDED)  # 1.96 standard deviations are half of it
+    unchanged = {n: (m - h, m + h) for n, m, h in zip(problem.names, middle.tolist(), half.tolist(), strict=True) if h > 0.0}
+    return Trend(middle, np.eye(x.size), scatter, jacobian.T @ jacobian, 0.0, unchanged=FrozenMap(unchanged))
+
+
+def _unchanged_to(problem: Problem, x: Array, r: Array, k: int, step: float, room: float) -> float:
+    """Return how far the k-th scaled coordinate can move to one side with the same residuals r, (N,), 0 where not by a step."""
+
+    def same(distance: float) -> bool:
+        moved = x.copy()
+        moved[k] += distance
+        try:
+            change = residual_at(problem, problem.coordinates.unscaled(moved)) - r
+        except SimulationError:
+            return False
+        return bool(change @ change <= FINE**2)  # a standard deviation changes them by 1
+
+    if not same(step):
+        return 0.0
+    while abs(step) < abs(room) and same(further := np.sign(room) * min(2.0 * abs(step), abs(room))):
+        step = further
+    inner, outer = step, np.sign(room) * min(2.0 * abs(step), abs(room))
+    while abs(outer - inner) > FINE * abs(inner):
+        middle = 0.5 * (inner + outer)
+        inner, outer = (middle, outer) if same(middle) else (inner, middle)
+    return float(outer)
 
 
 @dataclass(frozen=True, eq=False)

@@ -130,3 +130,36 @@ def test_the_profile_of_a_rough_cost_is_its_trends():
         width = np.subtract(*plain.parameters[name].ci95[::-1])
         assert low <= truth <= high
         assert high - low == pytest.approx(width, rel=0.2)
+
+
+def in_steps(width: float):
+    """The decay with a rate in steps, as of a simulator that acts at the instants of a fixed step only."""
+
+    def jumping(t, p):
+        return decay(t, {**p, "k": width * (np.floor(p["k"] / width) + 0.5)})
+
+    return jumping
+
+
+def test_where_nothing_changes_over_more_than_the_interval_all_of_it_is_in_the_interval():
+    """Steps of 0.25 at a standard deviation of about 0.03: a short step finds no fall, and the linear interval is a tenth of one."""
+    width, told = 0.25, 0
+    for seed in range(20):
+        truth = {"a": 2.0, "k": 1.5 + width * np.random.default_rng(seed).random()}
+        y = in_steps(width)(T, truth)[0] + SIGMA * np.random.default_rng(100 + seed).standard_normal(T.size)
+        simulator = Rough(parameters(a=1.0, k=1.0), {"y": in_steps(width)})
+        found = fit(Problem(simulator, (recorded("e", T, {"y": SIGMA}, y=y),), FREE), starts=1)
+        low, high = found.estimates["k"].ci95
+        assert found.status == "converged"
+        assert low - 0.01 <= 1.5 < 1.75 <= high + 0.01 or "answer in jumps" not in found.roughness["text"]
+        assert high - low < 1.5 * width
+        told += "answer in jumps" in found.roughness["text"] and low - 0.01 <= truth["k"] <= high + 0.01
+    assert told >= 17  # elsewhere the run ended beside a jump, and the trend's optimum is given
+
+
+def test_a_smooth_simulator_has_no_plateau():
+    simulator = Rough(parameters(a=1.0, k=1.0), {"y": decay})
+    y = decay(T, TRUTH)[0] + SIGMA * np.random.default_rng(1).standard_normal(T.size)
+    smooth = Problem(simulator, (recorded("e", T, {"y": SIGMA}, y=y),), FREE)
+    found = fit(smooth, starts=1)
+    assert trend_of(smooth, np.array([found.values["a"], found.values["k"]])) is None
