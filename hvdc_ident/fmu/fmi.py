@@ -104,7 +104,6 @@ class VariableGroup:
     def __init__(self, library: FmiLibrary, variables: Sequence[Variable]) -> None:
         self._library = library
         self.variables = tuple(variables)
-        self.values: Array = np.zeros(len(self.variables))
         self._fast = all(v.kind in ("Real", "Float64") for v in variables)
         self._vector = Vector(len(self.variables))
         self._references = library.references([v.reference for v in variables])
@@ -121,8 +120,8 @@ class VariableGroup:
             return self._vector.values
         for kind, indices in self._groups.items():
             values = self._accessor("get", kind)([self.variables[i].reference for i in indices])
-            self.values[indices] = [float(x) for x in values]
-        return self.values
+            self._vector.values[indices] = [float(x) for x in values]
+        return self._vector.values
 
     def set(self, values: Array | Sequence[float]) -> None:
         """Set the variables to the values."""

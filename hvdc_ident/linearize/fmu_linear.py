@@ -1,7 +1,4 @@
-"""Equations and linear model of a model-exchange FMU, on its derivatives, and on its own Jacobian where that agrees.
-
-Effects at the FMU's ends are linearised by themselves and put in series with it.
-"""
+"""Equations and linear model of a model-exchange FMU, on its derivatives, and on its own Jacobian where that agrees."""
 
 from __future__ import annotations
 
@@ -10,14 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hvdc_ident.errors import (
-    LinearizationError,
-    ModelError,
-    SimulationError,
-    SteadyStateError,
-    require_known,
-    unknown_name,
-)
+from hvdc_ident.errors import LinearizationError, ModelError, SimulationError, SteadyStateError, require_known
 from hvdc_ident.fmu import FmuModel, FmuPoint, at_point, smooth_inputs
 from hvdc_ident.fmu.differences import ParameterRuns, extrapolated_difference, together
 from hvdc_ident.immutable import FrozenMap
@@ -165,9 +155,7 @@ class LinearFmu:
         known = [*model.parameters, *model.inputs]
         model = model.recording(n for n in fixed if n not in known and model.records(n))
         everything = [*known, *model.states, *model.outputs]
-        for name in (*fixed, *asked.guess, *asked.bounds):
-            if name not in everything:
-                raise unknown_name("variable", name, everything, where=f"model '{model.name}'")
+        require_known("variable", (*fixed, *asked.guess, *asked.bounds), everything, f"model '{model.name}'")
         for name in asked.free:
             if name in model.inputs and name not in smooth_inputs(model):
                 raise SteadyStateError(f"'{name}' changes in steps only and cannot be sought", where="free")
@@ -226,9 +214,8 @@ def _names(
     smooth = smooth_inputs(model)
     ins = smooth if inputs is None else tuple(inputs)
     outs = tuple(model.outputs) if outputs is None else tuple(outputs)
+    require_known("input", ins, model.inputs, f"model '{model.name}'")
     for n in ins:
-        if n not in model.inputs:
-            raise unknown_name("input", n, model.inputs, where=f"model '{model.name}'")
         if n not in smooth:
             raise LinearizationError(f"input '{n}' changes in steps only", where=f"model '{model.name}'")
     return ins, outs

@@ -70,6 +70,14 @@ def test_jumps_arrive_and_rows_at_them_are_after_them(load, kind, version):
         assert not found.notes
 
 
+def test_two_rows_at_one_instant_have_what_was_before_the_jump_and_after_it(load):
+    time = np.array([0.0, 0.25, 0.25, 0.5, 0.6, 0.6, 1.0])
+    found = run(load(latch()), JUMPS, time)
+    before = found["through"] - found["out"]
+    assert before == pytest.approx([0.5, 0.5, 2.0, 2.0, 2.0, -1.0, -1.0], abs=1e-12)
+    assert np.abs(found["out"] - lagging(time, JUMPS)).max() < 1e-5
+
+
 @pytest.mark.parametrize("kind", ["plain", "changed", "compared"])
 def test_ramps_arrive_on_coarse_rows_as_held_at_their_mean(load, kind):
     found = run(load(latch(kind)), RAMP)
@@ -170,10 +178,12 @@ def test_slopes_that_are_not_followed_are_not_used_and_that_is_said(load, does):
 @pytest.mark.parametrize("own", [0.1, 0.04])
 @pytest.mark.parametrize("version", [2, 3])
 def test_internal_steps_that_rows_do_not_suit(load, version, own):
-    """A row has what the last internal step ended with; FMI 3.0 says how old that is."""
-    found = run(load(latch("plain", f"#define INTERNAL {own}\n", "inner"), version), [(0.0, 1.0)], TIME)
+    """A row has what the last internal step ended with; FMI 3.0 says how old that is, after a jump as before it."""
+    jump = 3.0 * own
+    model = load(latch("plain", f"#define INTERNAL {own}\n", "inner"), version)
+    found = run(model, [(0.0, 0.0), (jump, 0.0), (jump, 1.0)], TIME)
     ended = own * np.floor(TIME / own + 1e-6)
-    assert np.abs(found["out"] - (1.0 - np.exp(-ended / T)) * 1.0).max() < 1e-6
+    assert np.abs(found["out"] - (1.0 - np.exp(-np.maximum(ended - jump, 0.0) / T))).max() < 1e-6
     assert ("internal steps" in found.notes) == (version == 3)
     if version == 3:
         assert f"up to {(TIME - ended).max():.3g} s earlier" in found.notes["internal steps"]

@@ -11,6 +11,7 @@ from hvdc_ident import find_operating_point, linearize, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError
+from hvdc_ident.fmu import at_point
 from hvdc_ident.fmu.differences import SUFFICIENT, ParameterRuns, difference, first_difference, noise_of, together
 from hvdc_ident.linearize import continuation, jacobian_error, point_at
 
@@ -41,6 +42,20 @@ def test_the_linear_model(fmu, way, version):
     assert found.gradients["m"].A.ravel() == pytest.approx([0, 0, 2.25, 0.125], abs=1e-5)
     assert found.gradients["k"].B.ravel() == pytest.approx([0, 0.5], abs=1e-5)
     assert [p.real for p in found.poles()] == pytest.approx([-0.125, -0.125], abs=1e-8)
+
+
+@needs_compiler
+@pytest.mark.parametrize("way", WAYS)
+def test_derivatives_by_parameters_at_a_point(fmu, way):
+    """v' = (k (u - x) - d v)/m, of which a wrong derivative by m has to be found out beside another step's."""
+    model = fmu(WAYS[way])
+    x, v, m, d, k = 0.5, 0.2, 2.0, 0.5, 8.0
+    found = at_point(model, {}, np.array([x, v]), ["twice"], ["m", "k", "b"])
+    force = -k * x - d * v
+    assert found.derivatives == pytest.approx([v, force / m]) and found.outputs == pytest.approx([2 * v + 0.25])
+    wanted = [[0.0, 0.0, 0.0], [-force / m**2, -x / m, 0.0], [0.0, 0.0, 1.0]]
+    assert found.jacobian[:, 3:] == pytest.approx(np.array(wanted), abs=1e-7)
+    assert found.directional.tolist()[3:] == [way == "own"] * 3 and found.error < 1e-7 and not found.near
 
 
 @needs_compiler

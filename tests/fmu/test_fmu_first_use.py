@@ -101,6 +101,16 @@ def test_a_run_at_rest_does_not_judge_a_reset(tmp_path):
     found.pool.close()
 
 
+def test_outputs_that_are_small_judge_a_reset_by_their_size(tmp_path):
+    spoilt = begun("small", "SPOILT 0.1")
+    small = replace(spoilt, code=spoilt.code.replace("r[0] = 1;", "r[0] = 1e-6;"))
+    found = read_fmu(build(small, tmp_path), interface="co-simulation", limits=PATIENT)
+    for _ in range(2):
+        assert simulate(found, FREE, outputs=["out"])["out"] == pytest.approx(1e-6 * np.exp(-TIME / 0.1), rel=1e-5)
+        assert found.pool.learned["restart"] == "process"
+    found.pool.close()
+
+
 def test_values_are_set_after_the_experiment_is_told(tmp_path):
     """Some FMUs put their own values back as the experiment is set up."""
     found = read_fmu(build(begun("setup", "AT_SETUP(r, t, e, end) start(r)"), tmp_path), interface="co-simulation")

@@ -85,6 +85,8 @@ def test_a_linear_model_has_any_variable_as_output(fmu, own):
     assert np.allclose(linear.D, [[0.0], [4.0]], atol=1e-6)
     point = find_operating_point(model, outputs={"mass.s": 0.5}, free=["force[1,2]"])
     assert point.inputs["force[1,2]"] == pytest.approx(0.5, abs=1e-8)
+    moving = find_operating_point(model, {"a[1]": 1.25}, moving=["mass.s"])  # 2 v + b, where k x + d v = 0
+    assert moving.states == pytest.approx({"mass.v": 0.5, "mass.s": -0.5 * 0.5 / 8.0}, abs=1e-9)
 
 
 def test_an_effect_sits_at_what_is_recorded(fmu, step, twin):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import fmpy
 import numpy as np
 import pytest
 from c_fmu import build, needs_compiler
-from c_models import BALL, COUNTER, FAULTY, TRIANGLE, response, spring
+from c_models import BALL, COUNTER, DECAY, FAULTY, TRIANGLE, response, spring
 from scipy.signal import lsim
 
 from hvdc_ident import load_model, simulate
@@ -118,6 +119,16 @@ def test_time_events_without_a_state(fmu, version):
     assert simulate(model, experiment("count", time), {"period": 0.5})["count"].tolist() == [0, 0, 0, 1, 2, 2]
 
 
+def test_a_point_that_the_fmu_discards_asks_for_shorter_steps(fmu):
+    """It takes no point beyond 0.05 s from where the last step was completed."""
+    code = "#define AT_SLOPES(r) do { if (M->t > r[5] + 0.05) return 2; } while (0)\n#define STEP_EVENT(r) (r[5] = M->t, 0)\n"
+    careful = replace(DECAY, name="careful", code=DECAY.code.replace("#define NR 4", "#define NR 8") + code)
+    time = np.linspace(0.0, 10.0, 51)
+    found = simulate(fmu(careful, 2, "model-exchange"), experiment("decay", time))
+    assert np.abs(found["y"] - np.exp(-time)).max() < 1e-6
+    assert 200 <= found.statistics.accepted < 20_000
+
+
 def test_a_nominal_of_zero_is_floored(fmu):
     found = simulate(fmu(spring("nothing", nominal="0.0"), 2, "model-exchange"), STEP)
     assert np.abs(found["y"] - response(TIME)).max() < 2e-7
@@ -145,8 +156,6 @@ def test_a_model_travels_without_its_worker(fmu):
 
 def test_an_instance_that_forgets_to_reset_is_made_anew(tmp_path):
     """Its reset leaves the parameters as they were set."""
-    from dataclasses import replace
-
     lazy = replace(spring("lazy"), code=spring().code + "#define AT_RESET return 0\n")
     model = load_model(build(lazy, tmp_path))
     for values in ({"k": 20.0}, {}, {"k": 20.0}, {}):
