@@ -240,6 +240,9 @@ def fit(path: Path, interface: str, told: Told) -> None:
     planted = moving[0]
     truth = PLANTED * planted.start
     record = recorded(peer, inputs, {planted.name: truth})
+    if not (np.nanmax(record.outputs, axis=0) > np.nanmin(record.outputs, axis=0)).any():
+        told({"not_applicable": "no output moves in the record", "stage": "done"})
+        return
     told({"stage": "run", "parameter": planted.name, "truth": truth})
     with tempfile.TemporaryDirectory() as folder:
         study = write_study(Path(folder), peer, [record], scale, [planted], "[fit]")
