@@ -1,5 +1,7 @@
 """Modes, their derivatives, and loci."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers import linear, stable
@@ -58,6 +60,9 @@ def test_machines_without_a_reference_rest_at_0(seed):
     assert model.stability().verdict == "on the limit of stability"
     assert [m.eigenvalue for m in model.modes()].count(0) == 2
     assert all(m.kind == "oscillation" or m.eigenvalue == 0 or abs(m.damping) < 1e-9 for m in model.modes())
+    # Derivatives by differences are off by more than rounding: the model knows by how much.
+    noisy = linear(a * (1.0 + 1e-8 * rng.uniform(-1.0, 1.0, a.shape)), np.eye(2 * n)[:, [1]], np.eye(2 * n)[[0]])
+    assert replace(noisy, error=1e-8).stability().verdict == "on the limit of stability"
     damped = a - 0.02 * np.kron(np.eye(n), np.diag([0.0, 1.0]))
     verdict = linear(damped, np.eye(2 * n)[:, [1]], np.eye(2 * n)[[0]])
     assert [m.eigenvalue for m in verdict.modes()].count(0) == 1 and verdict.stability().unstable == 0
