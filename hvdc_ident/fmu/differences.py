@@ -18,7 +18,9 @@ import numpy as np
 
 from hvdc_ident.data import Array
 
-SHORT_STEP = 1e-3  # of the differences that show a run's noise, in sizes of the parameter: as long as those of a search
+SHORT_STEP = 1e-3 / 2**0.5
+"""Step of the differences that show a run's noise, in sizes of the parameter: about as long as those of a search, and irrational,
+for a parameter is often a whole number of a simulator's fixed steps, and jumps at even distances would look smooth."""
 SECOND_STEP = 4.0  # the second pair's step, in those of the first
 LEAST_STEP, LARGEST_STEP = 1e-6, 5e-2  # that are chosen from, in sizes of the parameter
 SUFFICIENT = 1e-3
@@ -76,7 +78,8 @@ def noise_of(run: Callable[[float], Run], middle: Array) -> Differences[Run, Arr
 
     run: a run at a number of short steps, all parameters moved at once: one that changes nothing shows no noise. Fourth
     differences over half a step and over a whole one hold the same noise, and the curvature 16 times: their squares tell
-    both. So what jumps over a few steps, as a row does that an event passes, counts as noise, and what bends does not.
+    both. So what jumps over a few steps, as a row does that an event passes, counts as noise, and what bends does not; nor
+    does a jump that the longer ones alone show look like a bend, for it is more than 16 times what the shorter ones show.
     """
     steps = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
     rows = yield [run(k) for k in steps]
@@ -84,7 +87,8 @@ def noise_of(run: Callable[[float], Run], middle: Array) -> Differences[Run, Arr
     half, whole = (at[0.0] - 4.0 * at[k] + 6.0 * at[2 * k] - 4.0 * at[3 * k] + at[4 * k] for k in (0.5, 1.0))
     rounding = np.finfo(float).eps * np.abs(middle).max(axis=0, initial=0.0)
     # 1 + 16 + 36 + 16 + 1 times the square of one run's noise.
-    square = (256.0 * np.mean(half**2, axis=0) - np.mean(whole**2, axis=0)) / (255.0 * 70.0)
+    unbent = 256.0 * np.mean(half**2, axis=0) - np.mean(whole**2, axis=0)
+    square = np.where(unbent > 0.0, unbent / 255.0, -unbent) / 70.0
     return np.asarray(np.sqrt(np.maximum(square, rounding**2)))
 
 
@@ -103,7 +107,7 @@ def first_difference(line: ParameterRuns[Run], noise: Array) -> Differences[Run,
     near, second_derivative = yield from difference_pair(line, close)
     strength, curvature = _largest(near, scale), _largest(second_derivative, scale)
     if strength == 0.0:
-        return near, DifferenceStep(close, 0.0, 1)
+        return (yield from _over_steps(line, size))
     h = _clipped(2.0 * float(np.sqrt(level / curvature)) if curvature > 0.0 else LARGEST_STEP * size, size)
     error = (0.5 * curvature * h + 2.0 * level / h) / strength
     pair_error = level / (close * strength) + (close / size) ** 2 / 6.0
@@ -117,6 +121,20 @@ def first_difference(line: ParameterRuns[Run], noise: Array) -> Differences[Run,
     if min(ratios) < np.log(2.0):  # within a factor of two of the best step the error is within twice the least
         return (near if ratios[0] < ratios[1] else far), step
     return (yield from difference(line, step)), step
+
+
+def _over_steps(line: ParameterRuns[Run], size: float) -> Differences[Run, tuple[Array, DifferenceStep]]:
+    """Return the derivative and the step for later where a short step changes nothing: over the longest one.
+
+    A simulator of fixed steps may answer in jumps, between which all is the same; one that does not answer at all has 0.
+    """
+    h = LARGEST_STEP * size
+    far, _ = yield from difference_pair(line, h)
+    strength = _largest(far, scale := _ranges(line.middle))
+    if strength == 0.0:
+        return far, DifferenceStep(h, 0.0, 1)
+    nearer, _ = yield from difference_pair(line, 0.5 * h)
+    return far, DifferenceStep(h, _largest(far - nearer, scale) / strength)
 
 
 def difference(line: ParameterRuns[Run], step: DifferenceStep) -> Differences[Run, Array]:

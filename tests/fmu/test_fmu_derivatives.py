@@ -12,7 +12,15 @@ from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import InputError, LinearizationError, ModelError, SteadyStateError
 from hvdc_ident.fmu import at_point
-from hvdc_ident.fmu.differences import SUFFICIENT, ParameterRuns, difference, first_difference, noise_of, together
+from hvdc_ident.fmu.differences import (
+    SHORT_STEP,
+    SUFFICIENT,
+    ParameterRuns,
+    difference,
+    first_difference,
+    noise_of,
+    together,
+)
 from hvdc_ident.linearize import continuation, jacobian_error, point_at
 
 TIME = np.linspace(0.0, 5.0, 251)
@@ -197,3 +205,31 @@ def test_noise_asks_for_both_sides():
     assert step.sides == 2 and step.error < 1e-2
     for found in (begun, done(difference(line, step), runs)):
         assert np.sqrt(np.mean((found[:, 0] - wanted) ** 2) / np.mean(wanted**2)) < 2.0 * step.error
+
+
+@pytest.mark.parametrize("width", [1e-4, 1e-3, 2.5e-3, 2e-2, 0.05])
+@pytest.mark.parametrize("at", [0.37, 0.4, 0.40005])
+def test_a_simulator_of_fixed_steps_is_differentiated_over_many_of_them(width, at):
+    """A ramp that begins at p, but at a fixed step only: its slope by p is -1 after that, whatever the step."""
+    t = np.linspace(0.0, 1.0, 401)
+    counted = []
+
+    def runs(p):
+        counted.append(p)
+        return np.maximum(t - width * np.round(p / width), 0.0)[:, None]
+
+    middle = runs(at)
+    level = done(noise_of(lambda k: at + k * SHORT_STEP * 0.4, middle), runs)
+    line = ParameterRuns(float, at, 0.4, -np.inf, np.inf, middle)
+    begun, step = done(first_difference(line, level), runs)
+    later = done(difference(line, step), runs)
+    for found in (begun, later):
+        assert found[-1, 0] == pytest.approx(-1.0, abs=max(0.1, 1.5 * width / 0.02))
+    assert len(counted) <= 1 + 6 + 2 + 4 + 2
+
+
+def test_a_parameter_that_nothing_answers_to_has_no_derivative():
+    middle = np.linspace(0.0, 1.0, 20)[:, None]
+    line = ParameterRuns(float, 1.0, 1.0, -np.inf, np.inf, middle)
+    found, step = done(first_difference(line, np.zeros(1)), lambda p: middle)
+    assert not found.any() and step.error == 0.0
