@@ -70,6 +70,19 @@ def test_directional_derivatives_that_the_description_states_are_told(tmp_path, 
     assert ("directional ones agree" in told) == own
 
 
+@pytest.mark.parametrize(
+    ("stop", "told"), [("21", "equal, 2 s from 1 s"), ("1", "equal, 0.1 s from 1 s"), (None, "equal, 0.1 s from 1 s")]
+)
+def test_the_short_runs_are_a_tenth_of_the_default_experiment(tmp_path, stop, told):
+    said = "" if stop is None else f' stopTime="{stop}"'
+    text = description(spring(), 2).replace(
+        "<ModelVariables>", f'<DefaultExperiment startTime="1"{said}/><ModelVariables>'
+    )
+    found = load_model(build(spring(), tmp_path, **{"modelDescription.xml": text.encode()}))
+    assert found.capabilities.found["two short runs"] == told
+    found.pool.close()
+
+
 def test_an_output_that_no_run_repeats_is_told(tmp_path):
     """The second short run is run: the time that the computation took is another one."""
     found = read_fmu(build(begun("timed", more=(CLOCK,)), tmp_path), interface="co-simulation")
