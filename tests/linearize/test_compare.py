@@ -272,3 +272,13 @@ def test_balanced_reduction_to_a_bound_and_its_refusals():
         balanced(model, 9)
     with pytest.raises(LinearizationError, match="neither"):
         balanced(model)
+
+
+@pytest.mark.parametrize("through", [0.3, 2.0, -5.0])
+def test_the_attainable_margin_of_a_plant_is_that_of_its_inverse(through):
+    """The graphs of P and 1/P are one, inputs and outputs exchanged."""
+    plant = linear([[-1.0]], [[1.0]], [[3.0]], [[through]])  # P = through + 3/(s + 1)
+    inverse = linear([[-1.0 - 3.0 / through]], [[1.0 / through]], [[-3.0 / through]], [[1.0 / through]])
+    np.testing.assert_allclose(plant.response([2.0]) * inverse.response([2.0]), 1.0)
+    assert ncf_margin(plant).value == pytest.approx(ncf_margin(inverse).value, rel=1e-9)
+    assert 0.0 < ncf_margin(plant).value < 1.0

@@ -196,3 +196,14 @@ def test_locus_without_an_operating_point_names_the_value():
 def test_point_of_a_locus_is_the_search_s(link):
     point = find_operating_point(link, {"KIVDC": 900.0})
     assert point.parameters["KIVDC"] == 900.0
+
+
+def test_a_state_behind_a_limit_is_saturated_and_without_it_an_integrator():
+    held = Model(
+        name="held", parameters={"top": Parameter(1.0)}, inputs={"u": Input(2.0)},
+        states={"x": {"derivative": "lim - top", "start": 0.3}}, signals={"lim": "clip(u, 0, top)"}, outputs={"y": "x"},
+    )  # fmt: skip
+    (saturated,) = linearize(held, find_operating_point(held, at="start")).modes()
+    (free,) = linearize(held, find_operating_point(held, {"u": 0.5}, at="start")).modes()
+    assert (saturated.eigenvalue, saturated.kind) == (0, "saturated state")
+    assert (free.eigenvalue, free.kind) == (0, "free integrator")

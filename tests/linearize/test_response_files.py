@@ -83,6 +83,18 @@ def test_repeated_sweeps_tell_the_noise(tmp_path):
     np.testing.assert_allclose(found.std["Z"] / np.abs(z) * np.sqrt(3), 0.02, rtol=0.25)
 
 
+def test_from_many_sweeps_on_each_frequency_has_its_own_standard_deviation(tmp_path):
+    rng = np.random.default_rng(2)
+    f = np.geomspace(1, 100, 5)
+    size = 0.01 * np.arange(1, 6)  # noise that differs from frequency to frequency
+    sweeps = np.array([1.0 + size * (rng.normal(size=5) + 1j * rng.normal(size=5)) for _ in range(12)])
+    path = tmp_path / "z.csv"
+    path.write_text("f,Z_re,Z_im\n" + "".join(rows(f.tolist(), s.real.tolist(), s.imag.tolist()) for s in sweeps))
+    found = read_response(path)
+    spread = np.sqrt(np.var(sweeps.real, axis=0, ddof=1) + np.var(sweeps.imag, axis=0, ddof=1))
+    np.testing.assert_allclose(found.std["Z"], spread / np.sqrt(12), rtol=1e-9)
+
+
 @pytest.mark.parametrize("form", ["RI", "MA", "DB"])
 def test_touchstone_of_one_port_by_the_definition_of_s(tmp_path, form):
     """S = (Z - R)/(Z + R)."""
