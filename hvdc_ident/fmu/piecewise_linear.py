@@ -73,9 +73,11 @@ def refined_grid(run: Callable[[Array], Array], time: Array, breaks: Array) -> A
         deviation = np.abs(values[middles] - 0.5 * (values[middles - 1] + values[middles + 1])) / scale
         times = deviation.max(axis=1, initial=0.0) / LINE_TOLERANCE
         parts = np.where(times > 1.0, np.clip(np.ceil(np.sqrt(times)), 2, MOST_PARTS), 2).astype(int)
-        share = np.concatenate([np.arange(1, k) / k for k in parts])
-        grid, added = _with_points(grid, np.repeat(low, parts - 1) + share * np.repeat(length, parts - 1))
-        bent = added[np.repeat(times > 1.0, parts - 1)]
+        inner = parts - 1
+        of = np.repeat(np.arange(parts.size), inner)  # the interval of each point inside one
+        share = (np.arange(1, of.size + 1) - (np.cumsum(inner) - inner)[of]) / parts[of]
+        grid, added = _with_points(grid, low[of] + share * length[of])
+        bent = added[times[of] > 1.0]
         coarse = np.zeros(grid.size - 1, dtype=bool)
         coarse[bent - 1] = coarse[bent] = True
     return grid
