@@ -11,7 +11,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.characteristic import Part
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.mode import Mode, damping_of, kind_of_mode
-from hvdc_ident.linearize.stability import ALIKE, Change, Characteristic, reached, sliding_means
+from hvdc_ident.linearize.stability import ALIKE, Change, Characteristic, reached, sliding_means, times_at
 from hvdc_ident.linearize.system import Array
 
 Along = tuple[Array, Sequence[Array]]
@@ -50,14 +50,16 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
         place = int((~apart[:k]).sum())  # among the roots that are alike
         right, left = whole.null_vectors(complex(root), int((~apart).sum()))
         shape = _shape(right, place)
-        own = _unknowns(equation, complex(root), whole.unit)
+        own, times, place_of_own = _owner(equation, complex(root), whole.unit, place)
         part = equation.part(own)
-        right_of_own, left_of_own = part.null_vectors(complex(root), int((~apart).sum()))
+        right_of_own, left_of_own = part.null_vectors(complex(root), times)
         share = np.zeros(len(names))
         share[own] = _participation(part, complex(root), right_of_own, left_of_own)
         radius = 0.3 * float(np.abs(roots - root)[apart].min(initial=whole.unit))
         slopes = {
-            name: _slope(part, _of_part(g.exact, own, part.nx), complex(root), right_of_own, left_of_own, place, radius)
+            name: _slope(
+                part, _of_part(g.exact, own, part.nx), complex(root), right_of_own, left_of_own, place_of_own, radius
+            )
             for name, g in model.gradients.items()
             if g.exact is not None
         }
@@ -78,14 +80,18 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     return tuple(found)
 
 
-def _unknowns(equation: Characteristic, root: complex, unit: float) -> Array:
-    """Return the unknowns of the part that a root belongs to; all of them where several parts have it."""
-    owners = []
+def _owner(equation: Characteristic, root: complex, unit: float, place: int) -> tuple[Array, int, int]:
+    """Return the unknowns of the part that a root belongs to, how many times it has it, and which of these it is.
+
+    place: of the root among those that are alike, which may be of several parts: the first ones are of the first part.
+    """
     for places, found in equation.roots_by_part:
         values = found.values if found.averaged is None else found.averaged
-        if (np.abs(values - root) <= ALIKE * max(abs(root), 1e-3 * unit)).any():
-            owners.append(places)
-    return owners[0] if len(owners) == 1 else np.arange(equation.matrix.shape[0])
+        times = times_at(values, root, unit)
+        if place < times:
+            return places, times, place
+        place -= times
+    return np.arange(equation.matrix.shape[0]), place + 1, place
 
 
 def _participation(part: Part, root: complex, right: Array, left: Array) -> Array:

@@ -287,3 +287,23 @@ def test_the_response_has_its_derivative_by_a_delay_at_0():
     assert np.isnan(linear.gradients["T"].A).all() and np.isfinite(linear.gradients["k"].A).all()
     with pytest.raises(LinearizationError, match="no computed derivative by a delay of 0 s"):
         linear.modes()
+
+
+def test_roots_that_two_loops_have_alike_are_each_its_own():
+    """Two late integrators alike, one after the other: each mode has its own delay, and moves with its own gain alone."""
+    both = hi.Model(
+        name="two", parameters={"k1": 2.0, "k2": 2.0, "T": {"value": 0.3, "unit": "s"}}, inputs={"r": 0.0},
+        states={"x1": "k1*(r - late1)", "x2": "k2*(x1 - late2)"},
+        delays={"late1": {"of": "x1", "time": "T"}, "late2": {"of": "x2", "time": "T"}}, outputs={"x2": "x2"},
+    )  # fmt: skip
+    alone = hi.linearize(integrator(2.0, 0.3), sensitivities=["k"]).modes()
+    modes = hi.linearize(both, sensitivities=["k1", "k2"]).modes()
+    for one in alone[:4]:
+        pair = [m for m in modes if abs(m.eigenvalue - one.eigenvalue) < 1e-6]
+        assert {m.dominant.rstrip("12") for m in pair} == {one.dominant} and len({m.dominant for m in pair}) == 2
+        for mode in pair:
+            own = mode.dominant[-1]
+            other = {"1": "2", "2": "1"}[own]
+            assert mode.sensitivity[f"k{own}"] == pytest.approx(one.sensitivity["k"], rel=1e-6)
+            assert mode.sensitivity[f"k{other}"] == 0.0
+            assert mode.participation[f"x{other}"] == 0.0
