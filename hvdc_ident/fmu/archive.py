@@ -194,7 +194,7 @@ def parsed(path: Path, name: str) -> ElementTree.Element:
     define entities.
     """
     where = f"{path}, {name}"
-    parser = ElementTree.XMLParser(target=_Guard(where, ROOTS[name]))
+    parser = ElementTree.XMLParser(target=_CheckedTree(where, ROOTS[name]))
     try:
         with _opened(path) as archive:
             size = archive.getinfo(name).file_size
@@ -212,7 +212,7 @@ def parsed(path: Path, name: str) -> ElementTree.Element:
     return root
 
 
-class _Guard(ElementTree.TreeBuilder):
+class _CheckedTree(ElementTree.TreeBuilder):
     """Maker of a tree that refuses what no FMU needs."""
 
     def __init__(self, where: str, root: str) -> None:

@@ -22,7 +22,7 @@ Branch = Literal["own", "unconnected", "other", "trimmed"]
 
 
 class Judge(Protocol):
-    """What tells of a point of its model more than the values there."""
+    """A kind of model, which tells the equation at a point of it, and remarks on the point."""
 
     @property
     def model(self) -> AnyModel: ...
@@ -140,7 +140,7 @@ class OperatingPoint(Shown, Coded):
         """The limiters that do not hold their signal here."""
         return tuple(x for x in self.limits if not x.active and x.kind != "branch")
 
-    @property
+    @cached_property
     def equation(self) -> Characteristic | None:
         """The characteristic equation here; None on a kink, and for a point read from JSON."""
         return None if self.judge is None else self.judge.equation(self)

@@ -471,7 +471,7 @@ class Stability(Coded):
 
 
 class Equation(Protocol):
-    """What a verdict on stability rests on."""
+    """An equation with its roots and its delays: all that a verdict on stability rests on."""
 
     @property
     def channels(self) -> tuple[Channel, ...]: ...
