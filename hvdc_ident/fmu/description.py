@@ -347,7 +347,7 @@ def _interface(path: Path, offered: Sequence[Interface], asked: Interface | None
         "the FMU does not offer what is asked for",
         where=str(path),
         expected=asked or "model exchange or co-simulation",
-        got=", ".join(offered) or "scheduled execution only",
+        got=", ".join(offered) or "neither",
     )
 
 
