@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 
 from hvdc_ident.linearize.delays import Channel
-from hvdc_ident.linearize.stability import EPS, Change, Roots, first_roots, on_axis
+from hvdc_ident.linearize.stability import EPS, Change, Roots, counted_eigenvalues, first_roots
 from hvdc_ident.linearize.system import Array
 
 
@@ -50,6 +50,5 @@ class Descriptor:
         finite = np.abs(beta) > 1e-12 * largest
         values = np.asarray(alpha[finite] / beta[finite], dtype=complex)
         off = np.full(values.size, 10.0 * len(self.e) * EPS * float(np.abs(values).max(initial=0.0)))
-        values = np.where(np.abs(values) <= off, 0.0, values)
-        axis = on_axis(values, off)
-        return Roots(first_roots([values], None), int(((values.real > 0) & ~axis).sum()), int(axis.sum()))
+        found = counted_eigenvalues(values, off)
+        return replace(found, values=first_roots([found.values], None))

@@ -386,11 +386,12 @@ def _orders(part: Part) -> Sequence[int]:
 
 
 def eigenvalues(matrix: Array, error: float = EPS) -> Roots:
-    """Return the eigenvalues of a balanced matrix, in LAPACK's order. error: of its entries, relative to each.
+    """Return the eigenvalues of a balanced matrix, in LAPACK's order. error: of its entries, relative to each."""
+    return counted_eigenvalues(*with_errors(matrix, error))
 
-    One that its error may have moved from 0 is 0.
-    """
-    values, off = with_errors(matrix, error)
+
+def counted_eigenvalues(values: Array, off: Array) -> Roots:
+    """Return eigenvalues, in their order, with their numbers; one that its error may have moved from 0 is 0. off: their errors."""
     values = np.where(np.abs(values) <= off, 0.0, values)
     axis = on_axis(values, off)
     return Roots(values, int(((values.real > 0) & ~axis).sum()), int(axis.sum()))
