@@ -179,6 +179,15 @@ class Experiment(Shown):
         """Return a copy with some fields changed."""
         return replace(self, **changes)
 
+    def until(self, instant: float) -> Experiment:
+        """Return the experiment without the rows after an instant, s."""
+        rows = self.time <= instant
+        return self.with_(
+            time=self.time[rows],
+            measured=None if self.measured is None else self.measured.rows(rows),
+            noise_profile=FrozenMap({o: profile[rows] for o, profile in self.noise_profile.items()}),
+        )
+
     @property
     def recording(self) -> dict[str, Any]:
         """Return what became of the file's rows: {rows, dropped, jumps, time_unit, time_column, converted, notes, not_recorded}.

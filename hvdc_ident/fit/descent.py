@@ -35,6 +35,9 @@ UNCHANGED = 1e-9
 """Change of the residuals, as a share of the largest, that is none: rounding."""
 WORTH = 1e-6
 """Share of the cost that a step has to promise to be made longer where nothing changes."""
+OPENING = 10
+"""Evaluations after which a descent's rate counts: its reach, doubled with each good step, is by then longer than any range, and one
+that began near its optimum has ended."""
 LONGEST = 10.0
 """Longest first step of a descent that begins near a minimum, and along a tangent: no parabola holds over four decades of a logarithm."""
 
@@ -120,7 +123,7 @@ class LinearResiduals:
         return Evaluated(self.cost, self.gradient / self.slope, triangle.T @ triangle)
 
 
-DescentEnd = Literal["inadmissible", "flat", "stationary", "settled", "enough", "standstill", "spent"]
+DescentEnd = Literal["inadmissible", "flat", "stationary", "settled", "enough", "standstill", "spent", "crawling"]
 
 
 @dataclass(frozen=True)
@@ -147,12 +150,14 @@ class DescentOptions:
 class Descent:
     """A descent: the best point so far (None before the first), the evaluations used, and the last one with its error if it failed.
 
-    fixed: (p,) unknowns that stay where they begin.
+    fixed: (p,) unknowns that stay where they begin. noise_cost: the cost that noise alone leaves; where it is given, a descent that
+    will not come near it ends early, as `crawling`.
     """
 
     objective: Residuals
     options: DescentOptions
     fixed: NDArray[np.bool_] | None = None
+    noise_cost: float | None = None
     evaluations: int = 0
     failure: SimulationError | None = None
     at: LinearResiduals | None = None
@@ -176,7 +181,8 @@ class Descent:
 
         inadmissible: the start cannot be simulated; flat: no output answers to any unknown there; stationary: the gradient is
         zero; settled: the cost does not fall any more; enough: no fall worth a step is left; standstill: no step lowers the
-        cost although one should; spent: the evaluations are used up.
+        cost although one should; spent: the evaluations are used up; crawling: at the rate so far they would be, far from the
+        noise.
         """
         theta = np.asarray(start, dtype=float)
         x = self.space.scaled(theta)
@@ -184,6 +190,7 @@ class Descent:
             return "inadmissible"
         assert self.at is not None
         size, damping, growth, reach = self.at.norms, self.options.damping, 2.0, self.options.reach
+        first = self.at.cost
         while self.evaluations < self.options.max_evaluations:
             here = self.at
             if not here.triangle[:, ~self._held].any():
@@ -191,6 +198,8 @@ class Descent:
             low, high = self.room()
             if self._stationary(here, low, high):
                 return "stationary"
+            if self._crawls(here.cost, first):
+                return "crawling"
             size = np.maximum(size, here.norms)
             with np.errstate(over="ignore"):  # beyond the largest number a step has no limit
                 far = reach * np.where(self.space.log, 1.0, np.maximum(np.abs(here.x), 1.0))
@@ -237,6 +246,13 @@ class Descent:
         self.at = self.tried
         return True
 
+    def _crawls(self, cost: float, first: float) -> bool:
+        """Return whether the evaluations left do not lead to the noise at the rate at which the cost has fallen since the first."""
+        if self.noise_cost is None or self.evaluations < OPENING or cost <= self.noise_cost:
+            return False
+        rate = np.log(first / cost) / (self.evaluations - 1)
+        return bool(rate * (self.options.max_evaluations - self.evaluations) < np.log(cost / self.noise_cost))
+
     def _passes_plateau(self, here: LinearResiduals, p: Array, low: Array, high: Array) -> bool:
         """Return whether p changed no residual and a step twice, four times, ... as long leads to a lower cost, the best point then."""
         while self.tried is not None and np.abs(self.tried.r - here.r).max() <= UNCHANGED * np.abs(here.r).max():
@@ -275,7 +291,9 @@ def descend(
     For descents that begin near a minimum, as each of a profile's hundreds does: by Gauss-Newton steps until a
     predicted fall of the cost is less than `enough`. Raises SimulationError where theta is inadmissible.
     """
-    down = Descent(objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough, reach=LONGEST), fixed)
+    down = Descent(
+        objective, DescentOptions(max_evaluations, damping=LEAST_DAMPING, enough=enough, reach=LONGEST), fixed
+    )
     down.go(theta)
     if down.at is None:
         assert down.failure is not None

@@ -36,6 +36,9 @@ from hvdc_ident.fit.simulator import Simulator, approximate, unknown_of, unknown
 from hvdc_ident.fit.whitening import AR
 from hvdc_ident.immutable import FrozenMap
 
+TELLING = 4
+"""Rows after the events for each unknown, below which a cut record tells too little."""
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
@@ -344,6 +347,32 @@ class Problem:
             weights=self.weights if weights is None else FrozenMap(weights),
             experiments=self.experiments if experiments is None else tuple(experiments),
         )
+
+
+def shortened(problem: Problem, share: float) -> Problem | None:
+    """Return the problem with the recordings cut after a share of the time from their event to their end.
+
+    None where the rows after the events would be too few to tell the unknowns, and for residuals that need a record as a whole: of
+    spectra, of measured responses, and with unknown initial states.
+    """
+    if problem.band is not None or problem.free_initial_states or len(problem.outputs_in_time) < len(problem.outputs):
+        return None
+    cut = [_first_part(e, share) if e.role == "fit" else e for e in problem.experiments]
+    moving = sum(
+        int(np.count_nonzero(e.compared & (e.time > _begin(e)))) * len(e.outputs) for e in cut if e.role == "fit"
+    )
+    if moving < TELLING * len(problem.unknowns) or any(not e.compared.any() for e in cut if e.role == "fit"):
+        return None
+    return problem.with_(experiments=cut)
+
+
+def _first_part(e: Experiment, share: float) -> Experiment:
+    begin = _begin(e)
+    return e.until(begin + share * (float(e.time[-1]) - begin))
+
+
+def _begin(e: Experiment) -> float:
+    return float(e.time[0]) if e.event is None else e.event
 
 
 # Hundreds of problems on the same records stand side by side in a search: what hangs on these alone they have in common.

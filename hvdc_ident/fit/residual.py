@@ -339,39 +339,53 @@ def passed_draws(
     random: np.random.Generator,
 ) -> Array:
     """Return (N, count) what draws of the noise that an experiment's inputs pass on add to the treated values of its blocks."""
-    drawn = np.zeros((sum(b.residual.size for b in blocks), count))
-    for part in _parts(blocks, times, treatment):
-        drawn[part.at] = part.caused @ random.standard_normal((part.caused.shape[1], count))
-    return drawn
+    passed = treatment.passed.get(blocks[0].experiment)
+    if passed is None:
+        return np.zeros((sum(b.residual.size for b in blocks), count))
+    caused, _ = _causes(passed, _outputs(blocks, times), treatment)
+    return caused @ random.standard_normal((caused.shape[1], count))
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Rows of an experiment's blocks that are whitened together. at: (m,) their places, in the order of time.
+    """Rows of an experiment's blocks that are whitened together.
 
-    caused: (m, k) what independent causes of standard deviation 1 make of them; lower: (m, m) the factor of their covariance.
+    at: (m,) their places, in the order of time; lower: (m, m) the factor of their covariance.
     """
 
     at: NDArray[np.intp]
-    caused: Array
     lower: Array
+
+
+_Outputs = tuple[tuple[str, bytes, float, bytes | None], ...]
+"""Of each block its output, the instants of its rows, standard deviation and profile."""
+
+
+def _outputs(blocks: Sequence[ResidualBlock], times: Sequence[Array]) -> _Outputs:
+    profiles = [None if b.profile is None else b.profile.tobytes() for b in blocks]
+    return tuple((b.output, t.tobytes(), b.sigma, p) for b, t, p in zip(blocks, times, profiles, strict=True))
 
 
 def _parts(blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: Treatment) -> tuple[_Part, ...]:
     """Return the parts of an experiment's blocks; none where its inputs pass on no noise."""
     passed = treatment.passed.get(blocks[0].experiment)
-    if passed is None:
-        return ()
-    profiles = [None if b.profile is None else b.profile.tobytes() for b in blocks]
-    outputs = [(b.output, t.tobytes(), b.sigma, p) for b, t, p in zip(blocks, times, profiles, strict=True)]
-    return _parts_of(passed, tuple(outputs), treatment)
+    return () if passed is None else _parts_of(passed, _outputs(blocks, times), treatment)
 
 
-@lru_cache(maxsize=4)
-def _parts_of(
-    passed: PassedNoise, outputs: tuple[tuple[str, bytes, float, bytes | None], ...], treatment: Treatment
-) -> tuple[_Part, ...]:
-    """Return the parts. outputs: of each block its output, the instants of its rows, standard deviation and profile."""
+# A search goes back and forth between a few records and their first parts.
+@lru_cache(maxsize=12)
+def _parts_of(passed: PassedNoise, outputs: _Outputs, treatment: Treatment) -> tuple[_Part, ...]:
+    whole, order = _causes(passed, outputs, treatment)
+    found = []
+    for at in np.array_split(order, -(-order.size // MOST)):
+        covariance = whole[at] @ whole[at].T
+        covariance[np.diag_indices(at.size)] += 1.0
+        found.append(_Part(at, cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)))
+    return tuple(found)
+
+
+def _causes(passed: PassedNoise, outputs: _Outputs, treatment: Treatment) -> tuple[Array, NDArray[np.intp]]:
+    """Return (N, k) what independent causes of standard deviation 1 make of the treated values, and the order of time of these."""
     answers, places = [], []
     for k, (output, instants, sigma, profile) in enumerate(outputs):
         time = np.frombuffer(instants)
@@ -381,13 +395,7 @@ def _parts_of(
         caused = per_deviation(caused, sigma, None if profile is None else np.frombuffer(profile))
         answers.append(treatment.applied(caused, time, output, "the noise of inputs"))
         places.append(time if treatment.band is None else np.zeros(answers[-1].shape[0]))
-    whole, order = np.vstack(answers), np.argsort(np.concatenate(places), kind="stable")
-    found = []
-    for at in np.array_split(order, -(-order.size // MOST)):
-        covariance = whole[at] @ whole[at].T
-        covariance[np.diag_indices(at.size)] += 1.0
-        found.append(_Part(at, whole[at], cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)))
-    return tuple(found)
+    return np.vstack(answers), np.argsort(np.concatenate(places), kind="stable")
 
 
 def transformed(signal: Array, time: Array, band: Band, where: str) -> Array:

@@ -156,15 +156,16 @@ def test_a_model_without_a_steady_state_in_all_of_its_ranges_is_wrong_input(tmp_
         hi.fit(str(path))
 
 
-def wave_record() -> hi.Experiment:
-    time = np.linspace(0.0, 3.0, 1501)
+def wave_record(begin: float = 0.0) -> hi.Experiment:
+    """3 s of a sine: begun late, no part of it is short of an optimum in every band of the frequency."""
+    time = begin + np.linspace(0.0, 3.0, 1501)
     y = np.sin(2.0 * np.pi * 7.0 * time) + 0.01 * np.random.default_rng(6).standard_normal(time.size)
     return hi.Experiment(time, outputs={"y": y}, noise={"y": 0.01}, role="fit")
 
 
 def test_an_optimum_that_one_start_alone_reached_is_told_with_doubt():
     """The cost over a frequency has an optimum in every band of 1/3 Hz: of eight starts the nearest alone finds the lowest."""
-    found = hi.fit(parse_card(WAVE), wave_record(), ["f", "a"], starts=8)
+    found = hi.fit(parse_card(WAVE), wave_record(2.0), ["f", "a"], starts=8)
     assert found.estimates["f"].value == pytest.approx(7.0, abs=0.01)
     costs = sorted(s.cost for s in found.starts)
     assert costs[1] > 10.0 * costs[0]  # the others did end elsewhere
@@ -175,7 +176,7 @@ def test_an_optimum_that_one_start_alone_reached_is_told_with_doubt():
 
 
 def test_where_one_start_alone_reached_the_lowest_cost_more_follow_by_themselves():
-    problem = wave_problem()
+    problem = wave_problem(2.0)
     found = fit(problem, assess=False)
     assert found.search_doubt == "" and found.values["f"] == pytest.approx(7.0, abs=0.01)
     lowest = min(s.cost for s in found.starts)
@@ -223,9 +224,9 @@ def test_starts_that_agree_leave_no_doubt():
     assert alone.search_doubt == ""  # one start was asked for
 
 
-def wave_problem() -> Problem:
+def wave_problem(begin: float = 0.0) -> Problem:
     free = (FitParameter("f", 7.1, 1.0, 60.0), FitParameter("a", 1.0, 0.2, 3.0))
-    return Problem(ModelSimulator(parse_card(WAVE)), (wave_record(),), free)
+    return Problem(ModelSimulator(parse_card(WAVE)), (wave_record(begin),), free)
 
 
 def test_starts_along_a_valley_agree():

@@ -1,5 +1,9 @@
 """Bounded Levenberg-Marquardt on exact sensitivities, with a verdict on where it ended.
 
+A run that cannot begin, or whose cost hardly falls from far off, as where a simulation grows without bounds or loses the record's
+phase, goes on from where the records' first quarters lead it: over a shorter time a model's answer grows less, and is closer to a linear
+one in its parameters.
+
 A run that stands still although the sensitivities promise a fall has met the simulation's own error, or a jump: the scatter of
 the cost over tiny steps tells which.
 """
@@ -11,15 +15,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.fit.descent import LEAST_DAMPING, Descent, DescentOptions
+from hvdc_ident.fit.descent import LEAST_DAMPING, Descent, DescentEnd, DescentOptions
+from hvdc_ident.fit.noise import MISFIT
 from hvdc_ident.fit.nonsmooth import LUCK, RUNS, roughness, scatter_along
 from hvdc_ident.fit.optimiser import OptimiserResult, OptimiserStatus
-from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.problem import Problem, shortened
 from hvdc_ident.fit.simulator import approximate
 
 NAME = "trust-region"
 SUMMARY = "bounded Levenberg-Marquardt with exact sensitivities"
 
+FIRST_PART = 0.25
+"""Share of the records' time after their events that a run from far off begins with; again and again a share of that, as needed."""
 PROBE = 1e-9
 """Length in scaled coordinates of the tiny step along which the scatter of the cost is estimated."""
 
@@ -30,8 +37,10 @@ class TrustRegion(DescentOptions):
 
     def run(self, problem: Problem, start: Array) -> OptimiserResult:
         """Return the end of the run from `start`: converged, max-evaluations, stalled, flat, or failed with the reason."""
-        down = Descent(problem, self)
+        down = Descent(problem, self, noise_cost=_noise_cost(problem))
         end = down.go(start)
+        if end in ("crawling", "inadmissible"):
+            down, end = self._from_first_part(problem, start, down, end)
         verdicts: dict[str, tuple[OptimiserStatus, str]] = {
             "inadmissible": ("failed", f"the start cannot be simulated: {down.failure}"),
             "flat": ("flat", "no compared output answers to any of the unknowns there"),
@@ -45,8 +54,33 @@ class TrustRegion(DescentOptions):
             return OptimiserResult(np.asarray(start, dtype=float), None, status, message, down.evaluations)
         return OptimiserResult(down.at.theta, down.at.cost, status, message, down.evaluations)
 
+    def _from_first_part(
+        self, problem: Problem, start: Array, first: Descent, end: DescentEnd
+    ) -> tuple[Descent, DescentEnd]:
+        """Return the descent from where the records' first part leads and its end, else the first one, gone on with where it crawled."""
+        used = first.evaluations
+        if (short := shortened(problem, FIRST_PART)) is not None:
+            led = self.run(short, start)
+            used += led.evaluations
+            if led.cost is not None:
+                # What a short record does not tell may be anywhere within its bounds: the descent may have to come back from there.
+                down = Descent(problem, self, evaluations=used)
+                end_of_second = down.go(led.theta)
+                if down.at is not None and (first.at is None or down.at.cost < first.at.cost):
+                    return down, end_of_second
+                used = down.evaluations
+        if first.at is None:
+            return first, end
+        down = Descent(problem, self, evaluations=used)
+        return down, down.go(first.at.theta)
+
 
 OPTIMISER = TrustRegion
+
+
+def _noise_cost(problem: Problem) -> float | None:
+    """Return half the number of rows, the cost of their noise alone; None where the noise is not known."""
+    return None if MISFIT in problem.noise_source.values() or not problem.loss.linear else 0.5 * problem.rows
 
 
 def _standstill(down: Descent, problem: Problem) -> tuple[OptimiserStatus, str]:
