@@ -75,7 +75,7 @@ def new_unit_study(folder: str | Path, recordings: str | Path | Sequence[str | P
                 NextStep("option", "base = MVA", "states it"),
             ),
         )
-    frequency = asked.frequency or (raw.frequency if raw is not None else 50.0)
+    frequency = asked.frequency or (raw and raw.frequency) or 50.0
     unit = recorded_unit(records, base)
     card = folder / "unit.toml"
     if card.exists():
