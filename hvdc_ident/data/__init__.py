@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hvdc_ident.data.contradiction import Contradiction
 from hvdc_ident.data.experiment import Experiment, SignalLike, experiment, recording_lines
 from hvdc_ident.data.noise import (
     FEWEST_QUIET,
@@ -40,6 +41,7 @@ __all__ = [
     "PREFIXES",
     "UNITS",
     "Array",
+    "Contradiction",
     "Experiment",
     "InputNoise",
     "InputSignal",
