@@ -40,7 +40,7 @@ def _words_of(text: str) -> frozenset[str]:
 _KINDS: dict[Quantity, str] = {
     "voltage": "v u volt volts voltage spannung spannungen tension tensione spanning vt ut etrm eterm kv vrms urms",
     "current": "i amp amps current strom courant corriente corrente stroom ka irms",
-    "frequency": "f fq frq freq frequency frequenz frequence frecuencia frequenza frequentie netzfrequenz hz",
+    "frequency": "f fq frq freq frequency frequenz frequence frecuencia frequenza frequentie netzfrequenz hz fehz",
     "rate of frequency": "df dfdt dfreq rocof roc rcf freqrate frequenzgradient",
     "active power": "p mw kw gw powr power pwr watt watts active activepower realpower wirk wirkleistung leistung activa attiva "
     "ptot psum p3ph pelec pe",
@@ -73,8 +73,8 @@ _PHASES = {
 }
 _QUALIFIERS = _words_of(
     "ref reference order setpoint set sp soll sollwert consigne cmd command limit lim max min maximum minimum err error fehler std sigma "
-    "thd vdc udc idc status stat flag flags quality valid dc field fd mech mechanical rotor neutral delta angl angle_diff spread factor pf cosphi cos "
-    "harmonic h3 h5 h7 target forecast demand rating rated nominal nom base bias integral sqrt count rate_limit real imag im re "
+    "vdc udc idc thd status stat flag flags quality valid dc field fd mech mechanical rotor neutral delta angl angle_diff spread factor pf cosphi "
+    "cos harmonic h3 h5 h7 target forecast demand rating rated nominal nom base bias integral sqrt count rate_limit real imag im re "
     "internal efd ifd oel uel avg_err"
 )
 """Words from which a column is not the measured quantity itself, or a part of it that is not its magnitude or angle."""
@@ -294,9 +294,8 @@ class _Words:
             subject, plain = "angle", plain and by_unit in ("", "angle")
         elif self._side == "angle":
             subject, plain = "angle", False  # of a power or a frequency there is none
-        if by_unit and not compatible(subject, by_unit) and (subject, by_unit) not in _SHARED:
-            subject, plain = by_unit, False
-        elif by_unit and not subject:  # of which place's or part's it is only a word tells that says nothing
+        contradicted = bool(subject) and not compatible(subject, by_unit) and (subject, by_unit) not in _SHARED
+        if by_unit and (contradicted or not subject):  # the name says another quantity, or none: of what it is is open
             subject, plain = by_unit, False
         words = tuple(word for _, word in sorted(place) if word)
         return Reading(subject, self._phase, words, self._unit, plain, self._deviation)
