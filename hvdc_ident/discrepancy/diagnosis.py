@@ -24,6 +24,7 @@ from hvdc_ident.discrepancy.location import localise
 from hvdc_ident.discrepancy.moves import clock_sentence, clocks, stated
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
+from hvdc_ident.discrepancy.remainder import share_left
 from hvdc_ident.discrepancy.residual_checks import Binned
 from hvdc_ident.discrepancy.result import AUGMENTED, Diagnosis, FoundEffect, StandIn
 from hvdc_ident.discrepancy.rounds import Round
@@ -38,6 +39,7 @@ from hvdc_ident.discrepancy.verdict import (
     keeps_tolerance,
     leaves_a_gap,
     leaves_more_than_noise,
+    noise_floor,
     tests_of,
 )
 from hvdc_ident.errors import StudyError, unknown_name
@@ -276,12 +278,12 @@ def _own(refit: Refit) -> dict[str, float]:
 def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: SearchContext) -> dict[str, Any]:
     """Return the remaining residual: a test against noise, the explained share, and where it lies."""
     rest: Nominal = last.nominal()
-    excess, left = first.chi2 - first.rows, max(last.chi2 - last.rows, 0.0)
+    left = share_left(first, last, noise_floor(last, rest, tests, search.options.significance))
     place = localise(rest)
     worst = min(tests, key=lambda b: b.p, default=None)
     return {
         "adequate": worst is None or worst.p > 0.05 / max(len(tests), 1),
-        "explained_share": float(np.clip(1.0 - left / excess, 0.0, 1.0)) if excess > 0 else None,
+        "explained_share": None if left is None else 1.0 - left,
         "band_hz": place["band_hz"],
         "block": next(iter(place["outputs"]), None),
         "material": louder_than_noise(last, search.options.holdout_share),

@@ -90,14 +90,22 @@ class _LatentJob:
     place: str
 
 
+def share_left(first: Refit, last: Refit, floor: float) -> float | None:
+    """Return the share of the nominal model's gap that the hypothesis `last` leaves, 0 to 1; None where `first` leaves no gap.
+
+    A gap is the squared misfit beyond noise, on the fitted data. floor: mean square of what noise alone leaves.
+    """
+    gap = first.chi2 - floor * first.rows
+    return float(np.clip((last.chi2 - floor * last.rows) / gap, 0.0, 1.0)) if gap > 0 else None
+
+
 def remainder_of(search: SearchContext, first: Refit, last: Refit, floor: float) -> Remainder:
     """The remainder of the hypothesis `last`, as a share of the gap of the nominal model `first`.
 
     floor: mean square of what noise alone leaves.
     """
     was, now = first.unseen, last.unseen
-    gap = first.chi2 - floor * first.rows
-    share = float(np.clip((last.chi2 - floor * last.rows) / gap, 0.0, 1.0)) if gap > 0 else 0.0
+    share = share_left(first, last, floor) or 0.0
     held, held_p = None, 1.0
     if was is not None and now is not None and np.isfinite(was) and was**2 > floor:
         held = float(np.clip((now**2 - floor) / (was**2 - floor), 0.0, 1.0)) if np.isfinite(now) else 1.0

@@ -67,11 +67,7 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
     tests = tests_of(search, last)
     if not outcome.kept:
         return _nothing(search, last, outcome, tests)
-    floor = noise_left(left)
-    # What looks like noise is the noise, as loud as it is: that of rounded records is not known beforehand.
-    if all(b.p > options.significance for b in tests):
-        floor = max(floor, last.chi2 / last.rows)
-    remainder = remainder_of(search, first, last, floor)
+    remainder = remainder_of(search, first, last, noise_floor(last, left, tests, options.significance))
     labels = ", ".join(p.candidate.label for p in last.placed)
     if remainder.share > 1.0 - LEAST_EXPLAINED:
         text = f"Something is missing; the best of the catalogue ({labels}) explains only {percentage(1 - remainder.share)} of the gap."
@@ -272,6 +268,13 @@ def _all_of_one_kind(sets: tuple[tuple[Rival, ...], ...]) -> bool:
 def _one_kind(group: Sequence[Rival]) -> bool:
     """Return True where the members of a set are one effect at several places, or delays of one kind or another."""
     return len({r.effect for r in group}) == 1 or all(effects()[r.effect].equivalent_delay is not None for r in group)
+
+
+def noise_floor(last: Refit, left: Nominal, tests: Sequence[Binned], significance: float) -> float:
+    """The mean square of the residuals of `last` that counts as noise. left: its residuals, tests: those of them."""
+    floor = noise_left(left)
+    # What looks like noise is the noise, as loud as it is: that of rounded records is not known beforehand.
+    return max(floor, last.chi2 / last.rows) if all(b.p > significance for b in tests) else floor
 
 
 def noise_left(left: Nominal) -> float:

@@ -16,6 +16,7 @@ from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import percentage
 
 FEW = ["lag", "delay", "limit", "gain", "offset", "deadband", "second-order"]
 
@@ -85,6 +86,13 @@ def test_the_json_has_what_the_contract_names(lagged: Diagnosis) -> None:
     assert {"adequate", "explained_share", "band_hz", "block", "material"} <= set(told["remaining"])
     assert {"effect", "at", "score", "p", "delta_bic", "holdout_rmse", "status"} <= set(told["candidates"][0])
     assert {"value", "ci95", "unit"} == set(told["effects"][0]["parameters"]["T"])
+
+
+def test_one_share_of_the_gap_is_told(lagged: Diagnosis) -> None:
+    left = lagged.remainder["share"]
+    assert lagged.remaining["explained_share"] == pytest.approx(1.0 - left)
+    assert all(f.share == pytest.approx(1.0 - left) for f in lagged.findings)
+    assert f"{percentage(1.0 - left, 1)} of the gap" in lagged.text
 
 
 def test_the_augmented_card_loads_and_runs(lagged: Diagnosis, tmp_path) -> None:  # type: ignore[no-untyped-def]
