@@ -15,6 +15,7 @@ from hvdc_ident.report.page import write_report
 from hvdc_ident.study.export import write
 
 MODELS = {
+    ".dyr": "The unit's .dyr file with its values, the other records as they are",
     ".fmu": "The model for other simulators (FMI 2.0)",
     ".mo": "The model in Modelica",
     ".toml": "The model as a card",
@@ -40,8 +41,10 @@ class ExportButtons:
             letter.tooltip(
                 "One page for the model's owner on what the model lacks; runs the diagnosis where none stands."
             )
+            of_a_unit = self._of()[0].settings.model.dyr is not None
             for ending, words in MODELS.items():
-                self._model_button(ending, words)
+                if ending != ".dyr" or of_a_unit:
+                    self._model_button(ending, words)
 
     def _model_button(self, ending: str, words: str) -> None:
         async def export() -> None:
@@ -66,7 +69,9 @@ class ExportButtons:
 
     async def _export(self, ending: str) -> None:
         study, folder = self._of()
-        name = safe_name(f"{study.model.name}{ending}")  # the model's own: that of the study is another file's beside it
+        name = safe_name(
+            f"{study.model.name}{ending}"
+        )  # the model's own: that of the study is another file's beside it
 
         def made() -> tuple[bytes, str]:
             with tempfile.TemporaryDirectory() as place:

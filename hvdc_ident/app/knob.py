@@ -17,7 +17,7 @@ class Knob(ui.element, component="knob.js"):  # type: ignore[call-arg]
     """A slider between the ends of a span, in the parameter's unit, logarithmic where that is above 0 and wide.
 
     moved: takes each value; began: called when a change by hand begins; spanned: takes another span. fitted: whether the parameter is
-    one of those to estimate, which `chosen` takes when it changes; None offers no choice.
+    one of those to estimate, which `chosen` takes when it changes; None offers no choice. title: what it is called where not by its name.
     """
 
     def __init__(
@@ -32,10 +32,13 @@ class Knob(ui.element, component="knob.js"):  # type: ignore[call-arg]
         spanned: Callable[[tuple[float, float]], None],
         fitted: bool | None = None,
         chosen: Callable[[bool], None] | None = None,
+        title: str = "",
     ) -> None:
         super().__init__()
         self._value = value
-        self._props.update(name=name, title=parameter.description or name, unit=parameter.unit, low=span[0], high=span[1])
+        self._props.update(
+            name=title or name, title=parameter.description or name, unit=parameter.unit, low=span[0], high=span[1]
+        )
         self._props.update(value=value, fit=fitted)
 
         def changed(event: Any) -> None:

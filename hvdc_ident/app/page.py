@@ -12,6 +12,7 @@ from hvdc_ident.app.desk import Desk
 from hvdc_ident.app.page_errors import show_errors
 from hvdc_ident.app.plot import HEAD
 from hvdc_ident.app.results import FoundResults
+from hvdc_ident.app.runs import StudyRun
 from hvdc_ident.report.first_screen import tiles
 from hvdc_ident.report.html import text
 from hvdc_ident.summary.phrases import values_line
@@ -42,14 +43,20 @@ class Tab:
 
 
 class Page:
-    """The page in one browser. desk: what lies on it. explore: opens a model that the results come to, by name, with its sliders."""
+    """The page in one browser.
+
+    desk: what lies on it. explore: opens a model that the results come to, by name, with its sliders. start: starts a stage in the
+    folder of results that is open, and returns the run; None where it cannot.
+    """
 
     def __init__(self, desk: Desk) -> None:
         self.desk = desk
         self._found: FoundResults | None = None
         self._told: list[Callable[[FoundResults], None]] = []
+        self._told_run: list[Callable[[StudyRun | None], None]] = []
         self._panels: Any = None
         self.explore: Callable[[str], None] = lambda name: None
+        self.start: Callable[[str], StudyRun | None] = lambda stage: None
 
     def build(self, tabs: tuple[Tab, ...]) -> None:
         """Build the head and the tabs."""
@@ -99,6 +106,15 @@ class Page:
         for tell in self._told:
             tell(found)
 
+    def on_run(self, tell: Callable[[StudyRun | None], None]) -> None:
+        """Have the run told that is at work in the folder of results, or was the last; None where there was none."""
+        self._told_run.append(tell)
+
+    def tell_run(self, found: StudyRun | None) -> None:
+        """Tell all parts of the page how the run stands."""
+        for tell in self._told_run:
+            tell(found)
+
     def _show_answers(self, found: FoundResults) -> None:
         """Show the four answers of the report in short; opened, as the report has them."""
         s = found.summary
@@ -112,4 +128,6 @@ class Page:
         )
         verdict, values, missing, step = (t.html for t in every)
         whole = f"<div class='first'>{verdict}{values}{missing}{step}</div>"
-        self._answers.content = f"<details><summary aria-label='The answers'>{brief}</summary><div>{whole}</div></details>"
+        self._answers.content = (
+            f"<details><summary aria-label='The answers'>{brief}</summary><div>{whole}</div></details>"
+        )

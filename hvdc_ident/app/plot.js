@@ -70,7 +70,10 @@ const named = (x, y) => {
   return `${text(time * scale)} ${unit}${x > 0 ? ", unstable" : ""}`;
 };
 const label = (u, k, ctx) => {
-  const taken = [], tall = 14 * devicePixelRatio;
+  const px = devicePixelRatio, tall = 14 * px, apart = 9 * px;
+  const places = [...u.data[0]].flatMap((x, n) => (u.data[k][n] == null ? [] : [[u.valToPos(x, "x", true), u.valToPos(u.data[k][n], "y", true)]]));
+  const taken = places.map(([a, b]) => [a - 6 * px, b - 6 * px, a + 6 * px, b + 6 * px]);  // no words on a cross
+  const free = (box) => box[0] >= u.bbox.left && box[2] <= u.bbox.left + u.bbox.width && !taken.some((o) => box[0] < o[2] && box[2] > o[0] && box[1] < o[3] && box[3] > o[1]);
   ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
   ctx.fillStyle = paint("var(--ink)");
   ctx.textAlign = "left";
@@ -79,11 +82,11 @@ const label = (u, k, ctx) => {
     const y = u.data[k][n];
     if (y == null || y < 0) return;  // the other of a pair says the same
     const words = named(x, y), wide = ctx.measureText(words).width, a = u.valToPos(x, "x", true), b = u.valToPos(y, "y", true);
-    const edge = u.bbox.left + u.bbox.width, left = a + 9 * devicePixelRatio + wide > edge ? a - wide - 9 * devicePixelRatio : a + 9 * devicePixelRatio;
-    const box = [left, b - tall, left + wide, b];
-    if (taken.some((o) => box[0] < o[2] && box[2] > o[0] && box[1] < o[3] && box[3] > o[1])) return;
+    const lefts = [a + apart, a - apart - wide, a - wide / 2], feet = [b, b - apart, b + apart + tall, b - apart - tall, b + apart + 2 * tall];
+    const box = feet.flatMap((foot) => lefts.map((left) => [left, foot - tall, left + wide, foot])).find(free);
+    if (!box) return;
     taken.push(box);
-    ctx.fillText(words, left, b - 3 * devicePixelRatio);
+    ctx.fillText(words, box[0], box[3] - 3 * px);
   });
 };
 
@@ -132,7 +135,7 @@ export default {
           scales: { x: { time: false, distr: this.log ? 3 : 1, ...this.ends() }, y: { range: this.plane ? around : spread } },
           axes: [{ ...axis(g === last ? this.xtitle : "", 2), size: g === last ? 34 : 8, values: g < last ? () => [] : this.log ? decades : digits }, { ...axis(grid.title, 3), values: digits }],
           cursor: { sync: { key: this.sync.key }, drag: { x: true, y: this.plane } },
-          legend: { show: true, live: !this.plane }, focus: { alpha: 1 },
+          legend: { show: true, live: !this.plane, markers: { dash: (u, k) => (k && grid.curves[k - 1].mark ? "dotted" : u.series[k].dash ? "dashed" : "solid") } }, focus: { alpha: 1 },
           hooks: this.plane ? { drawAxes: [upright] } : this.markers?.length ? this.marking(g) : {},
         };
         const empty = [[], ...grid.curves.map(() => [])];

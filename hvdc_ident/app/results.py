@@ -29,6 +29,10 @@ class FoundResults:
         """Return the JSON of a stage; empty where it has not run."""
         return self.data.get(stage, {})
 
+    def is_of_the_study(self, stage: str) -> bool:
+        """Return whether a stage has run since the study and its files were changed last."""
+        return self.of(stage).get("sources") == dict(self.study.sources)
+
     @cached_property
     def _by_file(self) -> dict[str, Mapping[str, Any]]:
         return {Path(stage(n).file).stem: data for n, data in self.data.items()}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 
 import hvdc_ident as hi
 from hvdc_ident.data import Array, Experiment, SignalLike
+from hvdc_ident.effects import EffectUse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import FrequencyResponse, LinearModel
 from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import Simulation
+from hvdc_ident.text import listed
 
 Kind = Literal["constant", "step", "ramp", "multisine"]
+ROUNDING = 1e-12
+"""Share of the largest eigenvalue below which one is a zero: the error of an eigenvalue is some 1e-16 of the matrix's norm."""
 KINDS: tuple[Kind, ...] = ("constant", "step", "ramp", "multisine")
 
 
@@ -48,8 +52,9 @@ class InputCourse:
 class Setting:
     """A model with values, courses of its inputs and what is looked at, of which the tab Explore shows the answers.
 
-    base: the model without what is added here; effects: that, as `hvdc_ident.apply_effects` takes it; model: with it. values: of its
-    parameters, where they differ from the model's, in their units. courses: of
+    start: the name of the values that it began with, "" for the given ones. base: the model without what is added here; effects: that,
+    as `hvdc_ident.apply_effects` takes it; model: with it. titles: of parameters that are not called by their names. values: of
+    its parameters, where they differ from the model's, in their units. courses: of
     its inputs. end: of the run, s, with so many rows. outputs: whose waveforms are shown. channel: input and output of the
     frequency response. opened: the signal at which the loop is opened for it instead; port: at which an impedance is seen
     instead. record: an experiment of the study in place of the courses.
@@ -67,6 +72,8 @@ class Setting:
     opened: str = ""
     port: hi.linear.Port | None = None
     record: Experiment | None = None
+    start: str = ""
+    titles: FrozenMap[str] = field(default_factory=FrozenMap)
 
     @classmethod
     def of(cls, model: AnyModel, record: Experiment | None = None) -> Setting:
@@ -75,10 +82,29 @@ class Setting:
         first = next(iter(inputs), "")
         if first:
             inputs[first] = replace(inputs[first], kind="step", size=0.02 * (abs(inputs[first].level) or 1.0))
-        outputs = tuple(record.outputs if record else model.outputs)
-        end = float(record.time[-1]) if record else 1.0
-        return cls(
-            model, model, courses=FrozenMap(inputs), end=end, outputs=outputs[:3], channel=(first, outputs[0]), record=record
+        plain = cls(
+            model,
+            model,
+            courses=FrozenMap(inputs),
+            outputs=tuple(model.outputs)[:3],
+            channel=(first, next(iter(model.outputs))),
+        )
+        return plain if record is None else plain.of_record(record)
+
+    def of_record(self, record: Experiment) -> Setting:
+        """Return the setting that looks at an experiment: its outputs, and the response from an input that moves to one of them."""
+        driven = [n for n in record.inputs if n in self.model.inputs]
+        moved = [n for n in driven if np.ptp(record.inputs[n](record.time)) > 0.0]
+        source = next(iter((*moved, *driven)), self.channel[0])
+        outputs = tuple(record.outputs) or self.outputs
+        return replace(
+            self,
+            record=record,
+            end=float(record.time[-1]),
+            outputs=outputs[:3],
+            channel=(source, outputs[0]),
+            opened="",
+            port=None,
         )
 
     @property
@@ -117,7 +143,8 @@ class Setting:
         """Return the operating point of the inputs before any event. Raises as `hvdc_ident.find_operating_point`."""
         levels = {n: c.level for n, c in self.courses.items()}
         if self.record is not None:
-            levels |= {n: float(s(float(self.time[0]))) for n, s in self.record.inputs.items()}
+            levels |= {n: float(s(float(self.time[0]))) for n, s in self.record.inputs.items() if n in levels}
+            levels |= {n: v for n, v in self.record.values.items() if n in levels}
         own = {n: v for n, v in self.values.items() if n in self.model.parameters}
         return hi.find_operating_point(self.model, levels, values=own)
 
@@ -137,6 +164,19 @@ class Setting:
                 omega = hi.bode(self.model, point=point).omega
             return hi.linear.port_impedance(self.model, self.port, omega, point)
         return hi.bode(self.linear(point), omega)
+
+    @property
+    def response_text(self) -> str:
+        """What the frequency response is of, where, and what 0 dB is of it."""
+        where = f"at the start of {self.record.name}" if self.record else "at the levels of the inputs"
+        if self.port is not None:
+            return f"Impedance at the source {self.port.source}, {where}."
+        if self.opened:
+            return f"Open loop at {self.opened}, {where}."
+        source, output = self.channel
+        up, down = self.model.outputs[output].unit, self.model.inputs[source].unit
+        one = f"1 {up}" if up else "1"
+        return f"From {source} to {output}, {where}; 0 dB is {f'{one}/{down}' if down else one}."
 
     def sensitivities(self) -> dict[str, dict[str, float]]:
         """Return, by parameter and shown output, the RMS of the derivative times the value. Raises as `hvdc_ident.sensitivities`."""
@@ -168,7 +208,9 @@ def with_effects(setting: Setting, effects: Iterable[Mapping[str, Any]]) -> Sett
     Raises ModelError or UnknownNameError for one that does not fit.
     """
     uses = tuple(FrozenMap(use) for use in effects)
-    return of_model(setting, setting.base, hi.apply_effects(setting.base, uses) if uses else setting.base, uses)
+    found = of_model(setting, setting.base, hi.apply_effects(setting.base, uses) if uses else setting.base, uses)
+    of_base = FrozenMap({n: t for n, t in setting.titles.items() if n in setting.base.parameters})
+    return replace(found, titles=of_base | size_titles(setting.base, uses))
 
 
 def of_model(
@@ -182,16 +224,33 @@ def of_model(
 
 def effects_with_sizes(setting: Setting) -> list[dict[str, Any]]:
     """Return the effects of a setting with its values, as a study's [[model.effect]] states them."""
-    found = []
-    for k, use in enumerate(setting.effects):
-        before = with_effects(setting, setting.effects[:k]).model.parameters
-        now = with_effects(setting, setting.effects[: k + 1]).model.parameters
-        sizes = dict(use["parameters"])
-        for name in (n for n in now if n not in before):
-            key = next(key for key in sizes if name.endswith(f"_{key}"))
-            sizes[key] = setting.parameters[name]
-        found.append({**use, "parameters": sizes})
+    names = sizes_of(setting.base, setting.effects)
+    return [
+        {**use, "parameters": dict(use["parameters"]) | {key: setting.parameters[n] for n, key in own.items()}}
+        for use, own in zip(setting.effects, names, strict=True)
+    ]
+
+
+def sizes_of(base: AnyModel, effects: Sequence[EffectUse | Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Return, by effect, the parameters that it adds to a model, with their keys among the effect's own. Raises as `with_effects`."""
+    found: list[dict[str, str]] = []
+    before = base
+    for k, use in enumerate(effects):
+        now = hi.apply_effects(base, effects[: k + 1])
+        added = [n for n in now.parameters if n not in before.parameters]
+        own = EffectUse.of(use).parameters
+        found.append({n: next((key for key in own if n.endswith(f"_{key}")), n.rpartition("_")[2]) for n in added})
+        before = now
     return found
+
+
+def size_titles(base: AnyModel, effects: Sequence[EffectUse | Mapping[str, Any]]) -> FrozenMap[str]:
+    """Return, by parameter that effects add to a model, what a reader calls it: "T of the lag at P"."""
+    uses = [EffectUse.of(use) for use in effects]
+    names = zip(uses, sizes_of(base, uses), strict=True)
+    return FrozenMap(
+        {n: f"{key} of the {use.effect} at {listed(use.at)}" for use, own in names for n, key in own.items()}
+    )
 
 
 def span_of(model: AnyModel, name: str, stated: Mapping[str, tuple[float, float]]) -> tuple[float, float]:
@@ -212,7 +271,14 @@ def equations_of(model: AnyModel) -> Model | None:
 
 
 def near(poles: NDArray[Any]) -> NDArray[Any]:
-    """Return the poles that a picture shows: those within 30 times the slowest; faster ones would press them into a line."""
+    """Return the poles that a picture shows: those within 30 times the slowest, and up to the slowest pair that resonates.
+
+    Faster ones would press them into a line. A pair resonates where its damping is below 1/sqrt(2): its response has a peak then.
+    """
     sizes = np.abs(poles)
-    slowest = np.min(sizes, where=sizes > 0, initial=np.inf)
-    return np.asarray(poles[sizes <= 30.0 * slowest])
+    moves = sizes > ROUNDING * sizes.max(initial=0.0)  # an integrator's is 0 but for rounding, and slower than nothing
+    rings = moves & (np.abs(poles.imag) > 0.0) & (-poles.real < sizes / math.sqrt(2.0))
+    slowest = np.min(sizes, where=moves, initial=np.inf)
+    first = np.min(sizes, where=rings, initial=np.inf)
+    reach = max(30.0 * slowest, first * (1.0 + ROUNDING) if rings.any() else 0.0)
+    return np.asarray(poles[sizes <= reach])

@@ -62,9 +62,9 @@ def slider_values(
 
 
 def write_slider_values(file: Path, asked: SliderValues) -> str:
-    """Write the changes into the study file as it is now, and return what was written, in words.
+    """Write the changes into the study file as it is now, and return what was written, in words; "" where it states them all.
 
-    Raises StudyError where nothing was changed, where a value lies outside its bounds, and where the file cannot be changed.
+    Raises StudyError where a value lies outside its bounds, and where the file cannot be changed.
     """
     seen = Seen.now(file)
     now = parse_study((seen.text or "").encode(), file).parameters
@@ -76,17 +76,15 @@ def write_slider_values(file: Path, asked: SliderValues) -> str:
             raise StudyError(
                 f"the value of '{name}' lies outside its bounds; nothing was written",
                 where=file.name,
-                expected=" and ".join(f"{word} {v:g}" for word, v in (("at least", low), ("at most", high)) if v is not None),
+                expected=" and ".join(
+                    f"{word} {v:g}" for word, v in (("at least", low), ("at most", high)) if v is not None
+                ),
                 got=f"{start:g}",
                 hint="move the slider, or type another bound beside it",
             )
     text = with_parameters(seen.text or "", asked.parameters, asked.values, asked.effects, file.name)
     if text == seen.text:
-        raise StudyError(
-            "nothing was changed here that the study does not state",
-            where=file.name,
-            hint="move a slider, type a bound, or tick a parameter first",
-        )
+        return ""
     parse_study(text.encode(), file)
     write_study(seen, text)
     return f"{file.name}: {_told(asked)}."
@@ -99,7 +97,9 @@ def _told(asked: SliderValues) -> str:
     ]
     said += [f"{n} = {v:g}" for n, v in asked.values.items()]
     said += [f"effect {use['effect']} at {use['at']}" for use in asked.effects]
-    left = f"; not written, for the study's model does not have them: {listed(asked.elsewhere)}" if asked.elsewhere else ""
+    left = (
+        f"; not written, for the study's model does not have them: {listed(asked.elsewhere)}" if asked.elsewhere else ""
+    )
     return f"{'; '.join(said)}{left}"
 
 

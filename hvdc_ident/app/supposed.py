@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 import hvdc_ident as hi
+from hvdc_ident.app.setting import size_titles
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.discrepancy.result import FoundEffect, Rival
@@ -16,6 +17,7 @@ from hvdc_ident.errors import ComputationError, HvdcIdentError
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.identifiability.experiment_design import ExperimentDesign, single_input_designs
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.augmented import use_of
@@ -26,13 +28,15 @@ from hvdc_ident.text import listed
 class Supposition:
     """A model that may lie behind the recordings.
 
-    sizes: names of its parameters that say how large what is missing is. fitted: its values are those of its own best fit.
+    sizes: names of its parameters that say how large what is missing is, titles: what a reader calls those that the study's model lacks.
+    fitted: its values are those of its own best fit.
     """
 
     name: str
     model: AnyModel
     sizes: tuple[str, ...] = ()
     fitted: bool = True
+    titles: FrozenMap[str] = field(default_factory=FrozenMap)
 
 
 def suppositions(study: hi.Study, diagnosis: Diagnosis | None, folder: Path) -> tuple[Supposition, ...]:
@@ -46,9 +50,9 @@ def suppositions(study: hi.Study, diagnosis: Diagnosis | None, folder: Path) -> 
         return ()
     best = hi.load_model(card)
     found: Sequence[FoundEffect | Rival] = diagnosis.effects
-    rivals = [Supposition(_named(found), best, _sizes(study, best))]
     gains = {n: v for n, v in diagnosis.parameters_after.items() if n in study.model.parameters}
     plant = study.model.with_values(gains)
+    rivals = [Supposition(_named(found), best, _sizes(study, best), titles=_titles(plant, found))]
     for k, group in enumerate(diagnosis.ambiguity):
         for other in (r for r in group if k >= len(found) or _place_of(r) != _place_of(found[k])):
             effects = [*found[:k], other, *found[k + 1 :]]
@@ -57,7 +61,8 @@ def suppositions(study: hi.Study, diagnosis: Diagnosis | None, folder: Path) -> 
                 model = hi.apply_effects(plant.with_values(own), [use_of(e) for e in effects])
             except HvdcIdentError:  # a formula, or an unknown input: no effect that can be put in by its name
                 continue
-            rivals.append(Supposition(_named(effects), model, _sizes(study, model), fitted=False))
+            titles = _titles(plant, effects)
+            rivals.append(Supposition(_named(effects), model, _sizes(study, model), fitted=False, titles=titles))
     return tuple(rivals)
 
 
@@ -93,6 +98,14 @@ def _named(effects: Sequence[FoundEffect | Rival]) -> str:
         source = f" from {e.source}" if e.source else ""
         parts.append(f"{e.name} at {listed(e.at)}{source}")
     return "; ".join(parts) or "as found"
+
+
+def _titles(plant: AnyModel, effects: Sequence[FoundEffect | Rival]) -> FrozenMap[str]:
+    """Return what a reader calls the parameters that effects add; none where they cannot be put in by their names."""
+    try:
+        return size_titles(plant, [use_of(e) for e in effects])
+    except HvdcIdentError:
+        return FrozenMap()
 
 
 def _sizes(study: hi.Study, model: AnyModel) -> tuple[str, ...]:

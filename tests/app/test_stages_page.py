@@ -124,11 +124,11 @@ def test_the_answers_are_those_of_the_summary(ran: Any, study: Path) -> None:
 def test_the_size_that_was_found_moves_the_record(ran: Any) -> None:
     opened(ran, "Diagnosis")
     ran.get_by_role("button", name="Explore it with sliders").click()
-    name = re.compile("lag_.*_T$")
-    slider, value = ran.get_by_role("slider", name=name), ran.get_by_label(re.compile("lag_.*_T, value"))
+    name = re.compile("T of the lag at")
+    slider, value = ran.get_by_role("slider", name=name), ran.get_by_label(re.compile("T of the lag at .*, value"))
     slider.wait_for()
     assert float(value.input_value()) == pytest.approx(LATE, rel=0.2)
-    drawn = "() => getElement(+document.querySelector('[aria-label=Waveforms]').id.slice(1)).plots[0].data[2]"
+    drawn = "() => getElement(+document.querySelector('[aria-label=Waveforms]').id.slice(1)).plots[0].data[3]"
     told = ran.locator(".live td.n").nth(1)  # the RMSE now
     ran.wait_for_function(f"({drawn})()?.length === 201")
     sync_api.expect(told).to_have_text(re.compile(r"0\.00[45]"), timeout=LONG)  # the noise

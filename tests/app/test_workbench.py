@@ -89,10 +89,10 @@ def test_an_effect_becomes_a_slider_of_its_size_and_goes_again(page: Any) -> Non
     page.get_by_text("Effects", exact=True).click()
     _choose(page, "at", "Ir1")
     page.get_by_role("button", name="Add", exact=True).click()
-    page.get_by_role("slider", name="lag_Ir1_T", exact=True).wait_for()
+    page.get_by_role("slider", name="T of the lag at Ir1", exact=True).wait_for()
     page.wait_for_function(f"before => JSON.stringify(({NOW})()) !== before", arg=_json(page, before))
     page.get_by_role("button", name="Remove lag at Ir1").click()
-    page.get_by_role("slider", name="lag_Ir1_T", exact=True).wait_for(state="detached")
+    page.get_by_role("slider", name="T of the lag at Ir1", exact=True).wait_for(state="detached")
     page.wait_for_function(f"before => JSON.stringify(({NOW})()) === before", arg=_json(page, before))
 
 

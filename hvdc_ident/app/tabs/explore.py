@@ -16,6 +16,7 @@ from hvdc_ident.app.live import Live
 from hvdc_ident.app.page import Page, Tab
 from hvdc_ident.app.plot import GIVEN, NOW, RECORDED, Grid, Plot, Trace, scattered, thinned
 from hvdc_ident.app.results import FoundResults
+from hvdc_ident.app.runs import StudyRun
 from hvdc_ident.app.setting import (
     KINDS,
     InputCourse,
@@ -45,6 +46,9 @@ LOCUS = 41
 TALL = 130
 """Height of one output's picture, px."""
 SIGNALS, ERRORS = "signals", "errors"
+NOTHING_CHANGED = (
+    "Nothing was changed here that the study does not state: move a slider, type a bound, or tick a parameter first."
+)
 NONE = np.empty(0, complex)
 
 
@@ -112,6 +116,8 @@ class Explorer:
         self._kind = SIGNALS
         self._answers: tuple[Answer | None, Answer | None] = (None, None)
         self._starts: dict[str, Supposition] = {}
+        self._began = self._setting
+        self._awaits_fit = False
 
     def _both(self, asked: tuple[Setting | None, Setting, Array | None]) -> tuple[Answer | None, Setting, Answer]:
         """Return the answers of the setting as given, where it is asked for, and of the one as it is now, at the same frequencies."""
@@ -141,6 +147,7 @@ class Explorer:
                     self._waves = ui.element("div").classes("w-full")
                 with ui.element("div").classes("two"):
                     with ui.element("div").classes("tile"):
+                        self._channel = ui.label("").classes("small")
                         two = (Trace("given", GIVEN, dashed=True), Trace("now", NOW))
                         grids = [Grid("gain, dB", two), Grid("phase, degrees", two)]
                         self._bode = Plot(grids, "frequency, Hz", 340, "Frequency response", log=True)
@@ -162,6 +169,7 @@ class Explorer:
                         self._sensitivities = ui.html("", sanitize=False)
         self._build_waves()
         self._page.on_results(self._offer_starts)
+        self._page.on_run(self._take_run)
         self._page.explore = self._open
         self._ask()
 
@@ -172,25 +180,26 @@ class Explorer:
             if study is not None and setting.record is not None:
                 records = [e.name for e in study.experiments]
                 self._choice("experiment", records, setting.record.name, self._choose_record)
-            self._choice("waveforms of", list(model.outputs), list(setting.outputs), self._choose_outputs)
+            self._of = self._choice("waveforms of", list(model.outputs), list(setting.outputs), self._choose_outputs)
             if setting.record is None:
                 ui.number("up to, s", value=setting.end, min=1e-6, on_change=self._choose_end).props("dense")
             else:
                 self._choice("drawn", [SIGNALS, ERRORS], SIGNALS, self._choose_kind)
             from_, to = setting.channel
-            self._choice("response from", list(model.inputs), from_, lambda v: self._look_into(source=v))
-            self._choice("to", list(model.outputs), to, lambda v: self._look_into(output=v))
+            self._from = self._choice("response from", list(model.inputs), from_, lambda v: self._look_into(source=v))
+            self._to = self._choice("to", list(model.outputs), to, lambda v: self._look_into(output=v))
             if equations_of(model) is not None:
                 opened = ["", *(n for n in model.insertion_points if n in model.signals or n in model.states)]
                 self._choice("or loop opened at", opened, "", lambda v: self._look(opened=v or "", port=None))
             if ports := self._page.desk.ports:
                 self._choice("or impedance at", ["", *ports], "", lambda v: self._look(port=ports.get(v), opened=""))
 
-    def _choice(self, label: str, options: list[str], value: Any, chosen: Callable[[Any], None]) -> None:
+    def _choice(self, label: str, options: list[str], value: Any, chosen: Callable[[Any], None]) -> ui.select:
         several = isinstance(value, list)
         field = ui.select(options, value=value, label=label, multiple=several, with_input=not several)
         field.on_value_change(lambda event: chosen(event.value))
-        field.props("dense options-dense")
+        field.props("dense options-dense stack-label")
+        return field
 
     def _look(self, **changes: Any) -> None:
         """Change what is looked at, of the setting as it is now and of the one as given."""
@@ -210,8 +219,14 @@ class Explorer:
     def _choose_record(self, name: str) -> None:
         study = self._page.desk.study
         record = next((e for e in (study.experiments if study else ()) if e.name == name), None)
-        if record is not None:
-            self._look(record=record)
+        before = self._setting.record
+        if record is None or before is None:
+            return
+        now, own = self._setting.of_record(record), self._setting.of_record(before)
+        self._look(record=record, end=now.end)
+        if (now.outputs, now.channel) != (own.outputs, own.channel):  # another test: what was looked at is not of it
+            self._of.value = list(now.outputs)
+            self._from.value, self._to.value = now.channel
 
     def _choose_kind(self, kind: str) -> None:
         self._kind = kind or SIGNALS
@@ -224,18 +239,31 @@ class Explorer:
     def _build_bar(self) -> None:
         with ui.element("div").classes("line"):
             ui.button("Undo", on_click=self._back).props("flat dense").tooltip("Ctrl-Z")
-            ui.button("As given", on_click=lambda: self._set(self._given)).props("flat dense")
+            ui.button("As given", on_click=lambda: self._set(replace(self._given, **self._looks()))).props("flat dense")
+            ui.space()
+            if self._page.desk.study is not None:
+                self._fit_button = ui.button("Fit", on_click=self._fit).props("unelevated dense").classes("q-px-md")
+                self._fit_button.tooltip(
+                    "Writes what was set here to the study, fits the ticked parameters within their bounds to its recordings, and "
+                    "shows the fitted values."
+                )
+        self._progress = ui.label("").classes("small").props('aria-live="polite"').style("overflow-wrap: anywhere")
         self._start = ui.select({"": "given values"}, value="", label="model with").props("dense options-dense")
         self._start.classes("w-full").on_value_change(lambda event: self._choose_start(event.value))
-        self._start.visible = False
+        self._start.visible = self._progress.visible = False
         ui.keyboard(on_key=self._on_key)
 
     def _offer_starts(self, found: FoundResults) -> None:
         """Offer the models that the results come to: the fitted one, and those with what a diagnosis found."""
         self._starts = {m.name: m for m in found.models}
         names = {"": "given values", **{n: n for n in self._starts}}
-        self._start.set_options(names, value=self._start.value if self._start.value in names else "")
+        self._start.set_options(names, value=self._setting.start if self._setting.start in names else "")
         self._start.visible = len(names) > 1
+        asked, self._awaits_fit = self._awaits_fit, False
+        untouched = self._setting is self._began and found.is_of_the_study("fit")
+        if found.fitted is not None and (asked or untouched):
+            self._begin_with(found.fitted)
+            self._began = self._setting
 
     def _open(self, name: str) -> None:
         """Open the tab with a model that the results come to."""
@@ -244,16 +272,50 @@ class Explorer:
 
     async def _choose_start(self, name: str | None) -> None:
         study = self._page.desk.study
+        if (name or "") == self._setting.start:
+            return  # the choice follows what is shown
         if not name or study is None:
-            self._set(of_model(replace(self._given, **self._looks()), self._given.base))
+            self._set(replace(self._given, **self._looks()))
             return
         found = await run.io_bound(refitted, study, self._starts[name])
         if found is not None:  # None: the server is ending
             self._starts[name] = found
-            self._set(replace(of_model(replace(self._given, **self._looks()), found.model), values=self._given.values))
+            self._begin_with(found)
+
+    def _begin_with(self, found: Supposition) -> None:
+        """Show a model that the results come to, with its values."""
+        shown = of_model(replace(self._given, **self._looks()), found.model)
+        self._set(replace(shown, start=found.name, titles=found.titles))
+
+    async def _fit(self) -> None:
+        """Write what was set here to the study and run its fit; the page is told when that ends."""
+        if await self._write(quiet=True):
+            self._awaits_fit = self._page.start("fit") is not None
+
+    def _take_run(self, found: StudyRun | None) -> None:
+        """Show how the run stands, and why a fit that was asked for here has none."""
+        if self._page.desk.study is None:
+            return
+        working = found is not None and found.outcome == "running"
+        self._fit_button.set_enabled(not working)
+        ended = self._awaits_fit and found is not None and not working
+        if ended and found is not None and found.outcome != "done":
+            self._awaits_fit = False
+            ui.notify(
+                found.message or "The fit was cancelled.",
+                type="negative",
+                multi_line=True,
+                timeout=0,
+                close_button="Close",
+            )
+        self._progress.visible = working
+        if found is not None and working:
+            self._progress.text = found.text
 
     def _looks(self) -> dict[str, Any]:
-        return {n: getattr(self._setting, n) for n in ("courses", "end", "outputs", "channel", "opened", "port", "record")}
+        return {
+            n: getattr(self._setting, n) for n in ("courses", "end", "outputs", "channel", "opened", "port", "record")
+        }
 
     def _build_knobs(self) -> None:
         self._rail.clear()
@@ -286,6 +348,7 @@ class Explorer:
             name, model.parameters[name], span_of(model, name, self._spans), self._setting.parameters[name], moved,
             began=self._remember, spanned=spanned, chosen=chosen,
             fitted=None if study is None or name not in study.model.parameters else name in self._fitted,
+            title=self._setting.titles.get(name, ""),
         )  # fmt: skip
 
     def _build_effects(self) -> None:
@@ -346,13 +409,18 @@ class Explorer:
 
     def _build_writing(self) -> None:
         if self._page.desk.study is not None:
-            button = ui.button("Write to the study", on_click=self._write).props("outline").classes("w-full q-mt-sm")
+            button = (
+                ui.button("Write to the study", on_click=lambda: self._write())
+                .props("outline")
+                .classes("w-full q-mt-sm")
+            )
             button.tooltip(
                 "Writes what was changed here: which parameters are fitted, their bounds, and the sliders' values, "
                 "of fitted parameters as starts, of others as values of the model; effects that were added."
             )
 
-    async def _write(self) -> None:
+    async def _write(self, *, quiet: bool = False) -> bool:
+        """Write what was set here to the study, and return whether it states it then. quiet: says nothing where nothing was changed."""
         desk = self._page.desk
         assert desk.study is not None
         asked = slider_values(desk.study, self._setting, self._fitted, {n: self._spans[n] for n in self._stretched})
@@ -360,17 +428,26 @@ class Explorer:
             said = await run.io_bound(write_slider_values, desk.file, asked)
         except HvdcIdentError as error:
             ui.notify(str(error), type="negative", multi_line=True)
-            return
-        if said is not None:  # None: the server is ending
+            return False
+        if said is None:
+            return False  # the server is ending
+        if said:
             self._page.desk = await run.io_bound(desk.renewed) or desk
             ui.notify(said, type="positive", multi_line=True)
+        elif not quiet:
+            ui.notify(NOTHING_CHANGED, type="info", multi_line=True)
+        return True
 
     def _build_waves(self) -> None:
         self._waves.clear()
         units = {n: self._setting.model.outputs[n].unit for n in self._setting.outputs}
-        curves = [Trace("given", GIVEN, dashed=True), Trace("now", NOW)]
-        curves += [Trace("recorded", RECORDED)] if self._setting.record else []
-        grids = [Grid(with_unit(n, u), tuple(curves)) for n, u in units.items()]
+        recorded = [Trace("recorded", RECORDED)] if self._setting.record else []
+        curves = (
+            *recorded,
+            Trace("given", GIVEN, dashed=True),
+            Trace("now", NOW),
+        )  # the last one lies above the others
+        grids = [Grid(with_unit(n, u), curves) for n, u in units.items()]
         with self._waves:
             self._wave = Plot(grids, "time, s", max(260, TALL * len(grids)), "Waveforms").classes("w-full")
 
@@ -385,6 +462,8 @@ class Explorer:
             self._show_effects()
         for name, knob in ({} if moving else self._knobs).items():
             knob.put(setting.parameters[name])
+        if self._start.value != setting.start and setting.start in ("", *self._starts):
+            self._start.value = setting.start
         self._ask()
 
     def _remember(self) -> None:
@@ -421,7 +500,9 @@ class Explorer:
         if given is None:
             ran = answer.run is not None and setting.outputs == self._setting.outputs
             for k, name in enumerate(setting.outputs if ran else ()):
-                self._wave.put(k, 2, thinned(setting.time, self._drawn(setting, answer, name))[1])
+                self._wave.put(
+                    k, 3 if setting.record else 2, thinned(setting.time, self._drawn(setting, answer, name))[1]
+                )
             for k, column in enumerate(() if answer.bode is None else _gain_and_phase(answer.bode)):
                 self._bode.put(k, 2, column)
         else:
@@ -451,7 +532,7 @@ class Explorer:
             columns = [self._drawn(setting, given, name), self._drawn(setting, now, name)]
             if setting.record:
                 recorded = setting.recorded(name)
-                columns.append(np.full(recorded.size, np.nan) if self._kind == ERRORS else recorded)
+                columns.insert(0, np.full(recorded.size, np.nan) if self._kind == ERRORS else recorded)
             self._wave.whole(k, thinned(setting.time, *columns))
 
     def _draw_bode(self) -> None:
@@ -461,6 +542,7 @@ class Explorer:
             pairs = zip(_gain_and_phase(given or now), _gain_and_phase(now or given), strict=True)
             for k, (one, other) in enumerate(pairs):
                 self._bode.whole(k, [first.frequency_hz, one, other])
+        self._channel.text = self._shown.response_text
 
     def _show_errors(self, verdicts: Judgement | None = None) -> None:
         """Show the error of every recorded signal of the experiment; the verdicts once all recordings are judged.
@@ -514,7 +596,7 @@ class Explorer:
                 locus = hi.linear.root_locus(model, name, np.linspace(low, high, LOCUS), fixed)
             except HvdcIdentError as error:
                 return verdicts, f"{words} No locus of {name}: {error}", NONE
-            return verdicts, words, near(locus.eigenvalues.ravel())
+            return verdicts, words, np.concatenate([near(poles) for poles in locus.eigenvalues])
 
         found = await run.io_bound(slow)
         if found is not None and setting is self._setting:
@@ -536,7 +618,9 @@ def _sensitivity_table(setting: Setting) -> Table:
         return Table(header, ())  # the page says already why the model does not run
     units = {n: setting.model.outputs[n].unit for n in setting.outputs}
     order = sorted(found, key=lambda n: -max(found[n].values(), default=0.0))
-    return Table(header, tuple((n, *(quantity(found[n].get(o, 0.0), units[o]) for o in setting.outputs)) for n in order))
+    return Table(
+        header, tuple((n, *(quantity(found[n].get(o, 0.0), units[o]) for o in setting.outputs)) for n in order)
+    )
 
 
 def _gain_and_phase(response: Any) -> tuple[Array, Array]:

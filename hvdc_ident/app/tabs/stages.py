@@ -86,6 +86,7 @@ class StageDesk:
                 with ui.element("div").classes("tile") as self._results:
                     self._build_panels()
         self._results.visible = self._nothing.visible = False
+        self._page.start = self._start
         ui.timer(LOOK, self._look)
 
     def _build_panels(self) -> None:
@@ -116,7 +117,11 @@ class StageDesk:
 
     def _build_run(self) -> None:
         with ui.element("div").classes("line"):
-            self._all = ui.button("Run all", on_click=lambda: self._start(EVERYTHING)).props("dense unelevated").classes("q-px-md")
+            self._all = (
+                ui.button("Run all", on_click=lambda: self._start(EVERYTHING))
+                .props("dense unelevated")
+                .classes("q-px-md")
+            )
             self._all.tooltip("Every stage that the study asks for; what stands is kept.")
             self._cancel = (
                 ui.button("Cancel", on_click=self._end).props("dense outline color=negative").classes("q-px-md")
@@ -235,6 +240,7 @@ class StageDesk:
             said = {"failed": found.message, "cancelled": "Cancelled. What was finished is kept; the next run goes on."}
             trouble = "\n".join(t for t in (trouble, said.get(found.outcome, "")) if t)
         self._trouble.text = trouble
+        self._page.tell_run(found)
 
     def _show_stages(self, found: tuple[StageStanding, ...]) -> None:
         at_work = RUNS.of(self._folder)
@@ -267,7 +273,7 @@ class StageDesk:
                 verdict = standing.stage.verdict(standing.data) if state == "done" else ""
                 why = standing.why if state in ("failed", "stale", "interrupted") else verdict
                 said = f"{state}: {why}" if why else state
-                ui.label(said).classes("text-caption ellipsis w-full").tooltip(said)
+                ui.label(said).classes("text-caption w-full")
             button = ui.button("Again" if state == "done" else "Run", on_click=start).props("flat dense no-caps")
             button.props(f'aria-label="Run {name}"').set_enabled(enabled)
             self._starts.append(button)
