@@ -20,7 +20,7 @@ from hvdc_ident.data import FLOOR_SHARE, MAD_TO_STD, Array, Experiment
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, scatter_of, source_of
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.residual import Curve, ResidualBlock, stretches
-from hvdc_ident.fit.whitening import independent_samples
+from hvdc_ident.fit.whitening import autoregression, independent_samples, innovation_share
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.next_step import NextStep
 from hvdc_ident.text import times_text
@@ -130,6 +130,22 @@ def adequacy(
     systematic = any(s.verdict == "does-not-fit" and not from_misfit(sources[o]) for o, s in sizes.items())
     text, advice = _sentence(sizes, verdict, sources, systematic=systematic)
     return Adequacy(verdict, chi2, FrozenMap(sizes), text, advice, systematic, FrozenMap(signals))
+
+
+def structure_left(judged: Adequacy, blocks: Sequence[ResidualBlock]) -> FrozenMap[float]:
+    """Return by output how many times the residual is what can be white noise in it, where more than half of its power is not.
+
+    blocks: the residuals that were judged. White noise is what was stated or, where nothing was, the scatter from row to row, and where
+    no rows show that, the part of the residual that earlier rows of it do not foretell. Of noise that is not known this may be the
+    noise's own colour.
+    """
+    found = {o: s.times for o, s in judged.outputs.items() if s.verdict in TOO_LARGE and s.times is not None}
+    for output in (o for o, s in judged.outputs.items() if s.verdict == "not-judged"):
+        parts = [b.residual[part] for b in blocks if b.output == output for part in b.stretches]
+        share = innovation_share(autoregression([r - r.mean() for r in parts]))
+        if share * MATTERS < 1.0:
+            found[output] = 1.0 / math.sqrt(share)
+    return FrozenMap(found)
 
 
 def sizes_of_runs(
@@ -374,7 +390,9 @@ ResidualTests = Mapping[str, Mapping[str, ResidualTest]]
 """Tests by output and experiment."""
 
 
-def residual_tests(blocks: Sequence[ResidualBlock], experiments: Sequence[Experiment]) -> dict[str, dict[str, ResidualTest]]:
+def residual_tests(
+    blocks: Sequence[ResidualBlock], experiments: Sequence[Experiment]
+) -> dict[str, dict[str, ResidualTest]]:
     """Return the tests by output and experiment."""
     by_name = {e.name: e for e in experiments}
     table: dict[str, dict[str, ResidualTest]] = {}

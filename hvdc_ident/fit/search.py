@@ -15,10 +15,10 @@ import numpy as np
 from hvdc_ident.data import MAD_TO_STD, Array
 from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
-from hvdc_ident.fit.adequacy import MATTERS
+from hvdc_ident.fit.adequacy import adequacy, structure_left
 from hvdc_ident.fit.fit_parameter import starting_points
 from hvdc_ident.fit.jump_instants import within_own_stretches
-from hvdc_ident.fit.noise import MISFIT, floor_of, models_before_event
+from hvdc_ident.fit.noise import MISFIT, floor_of, models_before_event, source_text
 from hvdc_ident.fit.nonsmooth import LUCK, roughness
 from hvdc_ident.fit.optimiser import LocalMinimum, Optimiser, OptimiserResult
 from hvdc_ident.fit.optimisers import optimiser as named
@@ -26,7 +26,7 @@ from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.result import StartOutcome
 from hvdc_ident.fit.simulator import approximate
-from hvdc_ident.fit.uncertainty import TWO_SIDED
+from hvdc_ident.fit.uncertainty import TWO_SIDED, samples_by_output
 from hvdc_ident.fit.whitening import autoregression
 from hvdc_ident.immutable import FrozenMap
 
@@ -35,7 +35,10 @@ WHITEN = ("no", "pre-event", "residual")
 STARTS = 8
 """Runs of a multistart, where nothing else is said."""
 MOST_STARTS = 64
-"""Runs of a multistart that leaves a doubt: an optimum that one start in twenty reaches is found by 96 of 100 such searches."""
+"""Runs of a multistart whose lowest cost is reached once: an optimum that one start in twenty reaches is found by 96 of 100."""
+UNVISITED = 0.02
+"""Expected share of the starts that would lead to an optimum not seen yet, below which a search for a lower cost ends. Of sines whose
+frequency one start in fifteen finds it lets 1 in 50 go unfound (0.05: 1 in 8; 0.01: none of 100, for twice as many starts)."""
 SIMULATIONS = 10_000
 """Simulations of all experiments, those for differences counted too, after which no further starts are begun."""
 SAME = 0.1
@@ -99,8 +102,7 @@ def search(
 ) -> Search:
     """Return the runs from the given start and from others that are spread over the bounds.
 
-    starts: how many; None: 8, and as many again, up to 64, as long as they leave a doubt: the lowest cost was reached once, or
-    it is more than the known noise, and others ended higher. Further runs are made while all together have taken fewer
+    starts: how many; None: 8, and as many again as long as they leave a doubt (`_worth_more`) and all together have taken fewer
     simulations than `SIMULATIONS`. begun: the outcomes of a search for these unknowns, or more of them, that is to be taken up:
     each of its ends is gone on from, in place of new starts. misfit_expected: whether the model is known to lack something: its
     misfit is no doubt then. The lowest run is continued where it used up its evaluations: along a narrow valley it takes more. An
@@ -113,13 +115,13 @@ def search(
         found = _taken_up(problem, method, begun, executor, progress)
     else:
         found = Search((), ())
-        count, most, number = starts or STARTS, starts or MOST_STARTS, 0
+        count, number = starts or STARTS, 0
         while True:
             points = _round(problem, count - len(found.points), seed, number)
             runs = _runs(problem, method, points, count, len(found.runs), executor, progress)
             found = Search((*found.points, *points), (*found.runs, *runs))
-            count, number = min(2 * count, most), number + 1
-            if len(found.points) >= count or not _worth_more(problem, found, misfit_expected=misfit_expected):
+            count, number = 2 * count, number + 1
+            if starts or not _worth_more(problem, found, misfit_expected=misfit_expected):
                 break
     return _continued(problem, method, found)
 
@@ -156,22 +158,61 @@ def _runs(
 
 
 def _worth_more(problem: Problem, found: Search, *, misfit_expected: bool) -> bool:
-    """Return whether further starts are called for, and the simulations allow them."""
+    """Return whether further starts are called for, and the simulations allow them.
+
+    None where all ended at the lowest cost. Where that leaves more than noise a lower one is missing, or the model lacks something:
+    starts go on until hardly one would lead to an optimum not seen yet (`unvisited`), or most lead to one of their own, so that more
+    would not find them again. Else up to `MOST_STARTS` where the lowest cost was reached once.
+    """
     ends = within_own_stretches(problem, found.ends)
     differences = len(problem.unknowns) if approximate(problem.simulator) else 0
     if sum(r.evaluations for r in found.runs) * (1 + differences) >= SIMULATIONS or not ends:
         return False
-    unit = 2.0 * ends[0].cost / max(problem.rows - len(problem.unknowns), 1)
-    known = MISFIT not in problem.noise_source.values()
-    slack = slack_of(ends[0].cost, max(1.0, unit) if known else unit)
-    if differences:
-        try:
-            slack += LUCK * roughness(problem, ends[0].theta)
-        except SimulationError:
-            # What could be simulated cannot be again: the fit's result says so, and no start would do better.
+    try:
+        slack = _slack_at(problem, ends[0], differences > 0)
+        higher = higher_ends(problem, ends, slack)
+        if not higher:
             return False
-    higher = higher_ends(problem, ends, slack)
-    return bool(higher) and (len(higher) == len(ends) - 1 or (known and unit > MATTERS and not misfit_expected))
+        if len(higher) == len(ends) - 1 and len(found.points) < MOST_STARTS:
+            return True
+        levels = 1 + sum(e.cost > before.cost + slack for before, e in zip([ends[0], *higher], higher, strict=False))
+        most_alone = len(found.points) >= MOST_STARTS and 2 * levels > len(ends)
+        known_well = misfit_expected or most_alone or unvisited(levels, len(ends)) <= UNVISITED
+        return not known_well and leaves_more_than_noise(problem, ends[0].theta)
+    except SimulationError:
+        # What could be simulated cannot be again: the fit's result says so, and no start would do better.
+        return False
+
+
+def _slack_at(problem: Problem, best: LocalMinimum, approximate_derivatives: bool) -> float:
+    """Return by how much a cost may be above the lowest and be as low. Raises SimulationError."""
+    unit = 2.0 * best.cost / max(problem.rows - len(problem.unknowns), 1)
+    known = MISFIT not in problem.noise_source.values()
+    slack = slack_of(best.cost, max(1.0, unit) if known else unit)
+    return slack + (LUCK * roughness(problem, best.theta) if approximate_derivatives else 0.0)
+
+
+def unvisited(optima: int, searches: int) -> float:
+    """Return the expected share of starts that lead to an optimum not seen yet, after so many searches that ended at so many optima.
+
+    The posterior mean where every number of optima, and every size of their basins, was as likely before (Boender and Rinnooy Kan
+    1987, doi 10.1007/BF02591684).
+    """
+    return optima * (optima + 1.0) / (searches * (searches - 1.0)) if searches > optima else 1.0
+
+
+def leaves_more_than_noise(problem: Problem, theta: Array) -> bool:
+    """Return whether the residuals at theta, (p,), are more than the noise stated or, where it is not, than the rows' scatter.
+
+    Raises SimulationError.
+    """
+    unknown = [o for o, source in problem.noise_source.items() if source == MISFIT]
+    if unknown:
+        problem = problem.with_(weights={**problem.weights, **misfit_weights(problem, theta, unknown)})
+    blocks = problem.blocks(theta, derivatives=False)
+    rho, effective = samples_by_output(blocks, theta.size)
+    sources = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
+    return bool(structure_left(adequacy(problem, blocks, sources, effective, rho), blocks))
 
 
 def slack_of(cost: float, unit: float = 1.0, effective_share: float = 1.0) -> float:

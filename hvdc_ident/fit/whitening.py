@@ -127,6 +127,11 @@ def _stationary(model: AR) -> tuple[Array, float]:
     return np.linalg.inv(factor), 1.0 / float(np.sqrt(variance))
 
 
+def innovation_share(model: AR) -> float:
+    """Return the share of the power of AR noise that earlier rows do not foretell; 1 of white noise."""
+    return _stationary(tuple(model))[1] ** -2 if any(model) else 1.0
+
+
 def sum_of_squares(model: AR) -> float:
     """Return the sum of the squared autocorrelations of AR noise over all lags: so many rows tell of a variance as one white row.
 

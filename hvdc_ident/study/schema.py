@@ -593,7 +593,7 @@ class FitTable(TomlTable):
         'loss = "huber"', default="linear", of="loss")
     starts: Annotated[int, Field(ge=1, le=10_000)] | None = optional(
         "Runs of the optimiser from different starts. If left out, 8; more follow, up to 64, where one start alone reached the "
-        "lowest cost, or where the lowest is more than the known noise and others ended higher.",
+        "lowest cost, and as long as the lowest leaves more than noise and others may still end elsewhere.",
         "starts = 4")
     whiten: Whitening = optional(
         "Model of correlated noise: none, from the rows before the event, or from the residuals of a first fit. true is "
