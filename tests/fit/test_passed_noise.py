@@ -14,7 +14,9 @@ from hvdc_ident.data import InputNoise, before_event, input_noise, input_signal,
 from hvdc_ident.discrepancy.nominal import draws
 from hvdc_ident.fit import FitParameter, Problem, fit
 from hvdc_ident.fit.noise import noise_of
+from hvdc_ident.fit.passed_noise import off_the_line
 from hvdc_ident.fit.residual import passed_draws
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import ModelSimulator
 
@@ -59,7 +61,9 @@ def of_rows(rows: np.ndarray, interpolation: str = "linear", time: np.ndarray = 
     signal = input_signal(time, rows, interpolation)
     level = rows[before_event(time, rows, EVENT)].mean()
     known = {n: InputNoise(s, s) for n, s in NOISE.items()}
-    return hi.Experiment(time, inputs={"v": signal.begun_at(level)}, event=EVENT, **{"input_noise": known, "levels": ("y",), **more})
+    return hi.Experiment(
+        time, inputs={"v": signal.begun_at(level)}, event=EVENT, **{"input_noise": known, "levels": ("y",), **more}
+    )
 
 
 def recorded(rows: np.ndarray, outputs: dict[str, np.ndarray], noise: dict[str, float], **more) -> hi.Experiment:
@@ -101,7 +105,10 @@ def test_rounded_rows_before_an_event_have_their_error_in_common():
     passed = Problem(simulator(), (e,), (FitParameter("K", K, 5.0, 80.0),)).passed["experiment"]
     common = passed.answers("y", TIME)[:, -1]
     lower = of_rows(rows - found.common * (TIME >= EVENT))
-    moved = hi.simulate(simulator().model, lower, rtol=1e-10)["y"] - hi.simulate(simulator().model, of_rows(rows), rtol=1e-10)["y"]
+    moved = (
+        hi.simulate(simulator().model, lower, rtol=1e-10)["y"]
+        - hi.simulate(simulator().model, of_rows(rows), rtol=1e-10)["y"]
+    )
     assert common == pytest.approx(moved, abs=2e-3 * np.abs(moved).max())
 
 
@@ -153,3 +160,58 @@ def test_draws_of_noise_are_white_once_whitened():
     (drawn,) = draws(problem, blocks, own, [np.zeros(TIME.size)], 4000, 0)
     covariance = drawn @ drawn.T / 4000.0
     assert np.abs(covariance - np.eye(TIME.size)).max() < 6.0 / np.sqrt(4000.0)
+
+
+def jumping(rng: np.random.Generator, own: float) -> hi.Experiment:
+    """A record of the plant whose voltage falls and comes back at once, at instants of which the rows do not know."""
+    fine = 50
+    t = np.linspace(0.0, TIME[-1], (TIME.size - 1) * fine + 1)
+    fall, back = EVENT + TIME[1] * rng.uniform(0.0, 1.0), 3.0 + TIME[1] * rng.uniform(0.0, 1.0)
+    v = 1.0 - 0.1 * ((t >= fall) & (t < back))
+    error = K * (v[0] + (3.0 + D * v[0]) / K - v)
+    x = lsim(([[-1.0 / T]], [[1.0 / T]], [[1.0]], [[0.0]]), error, t, X0=error[:1], interp=False)[1]
+    y = (x - D * v)[::fine] + own * rng.standard_normal(TIME.size)
+    rows = v[::fine] + NOISE["v"] * rng.standard_normal(TIME.size)
+    return recorded(rows, {"y": y}, {"y": own}, values=level(y))
+
+
+def test_what_lies_between_the_rows_of_a_jump_is_noise_of_the_input():
+    """Of 60 records whose voltage jumps between rows: with what the rows leave open the residual is that of noise, or less, and the
+    intervals hold the truth; taken for certain, the lines leave more than noise at the truth itself."""
+    count, own = 60, 2e-3
+    free = (FitParameter("K", 25.0, 5.0, 80.0), FitParameter("T", 1.2, 0.2, 9.0))
+    hits, total, certain, rows = {"K": 0, "T": 0}, 0.0, 0.0, count * TIME.size
+    for seed in range(count):
+        e = jumping(np.random.default_rng(seed), own)
+        found = fit(Problem(simulator(), (e,), free), starts=1, assess=False)
+        for name, value in (("K", K), ("T", T)):
+            low, high = found.estimates[name].ci95
+            hits[name] += low <= value <= high
+        total += 2.0 * found.cost
+        problem = Problem(simulator(), (e,), free)
+        passed = problem.passed["experiment"]
+        certain_rows = replace(passed, between=np.zeros_like(passed.between))
+        lines = replace(problem, passed=FrozenMap({"experiment": certain_rows}))
+        certain += 2.0 * lines.cost(np.array([K, T]))
+    low = binom.ppf(0.001, count, 0.95)
+    assert all(n >= low for n in hits.values()), hits
+    assert total < chi2.ppf(0.999, rows)
+    assert certain > chi2.ppf(1.0 - 1e-9, rows)
+
+
+def test_only_bends_beyond_the_noise_leave_something_open_between_rows():
+    rng, time = np.random.default_rng(7), np.arange(0.0, 20.0, 0.02)
+    still = off_the_line(time, 1.0 + 1e-3 * rng.standard_normal(time.size), 1e-3)
+    assert np.count_nonzero(still) == 0
+    ramp = off_the_line(time, 0.3 * time, 0.0)
+    assert ramp == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_mean_between_two_rows_is_off_the_line_by_the_rule_of_a_jump_at_any_instant():
+    """By sampling the instant of a jump by 1: the standard deviation of its mean less that of the line is 1/sqrt(12)."""
+    time = np.arange(0.0, 1.0, 0.1)
+    found = off_the_line(time, (time > 0.45).astype(float), 0.0)
+    place = (np.arange(10_000) + 0.5) / 10_000
+    assert found[4] == pytest.approx(np.std((1.0 - place) - 0.5) * 1.0, rel=1e-6)
+    assert found[[3, 5]] == pytest.approx(found[4] / np.sqrt(2.0))
+    assert found[[0, 1, 2, 6, 7, 8]] == pytest.approx(0.0)
