@@ -151,7 +151,7 @@ class PsseUnit:
         option(
             "--base",
             "MVA",
-            "With --dyr, without --raw: the machine's base.",
+            "With --dyr: the machine's base, in place of the power flow's.",
             parser=_number("--base", "MVA", "250", 0, 1e9),
         ),
     ] = None
@@ -160,7 +160,7 @@ class PsseUnit:
         option(
             "--frequency",
             "HZ",
-            "With --dyr, without --raw; default 50.",
+            "With --dyr: the nominal frequency, in place of what --raw or the recordings show.",
             parser=_number("--frequency", "Hz", "60", 0, 1e4),
         ),
     ] = None
@@ -329,7 +329,10 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         except MemoryError:
             end(1, "not enough memory for this study")
         except ImportError as e:
-            end(1, f"the installation is incomplete: {one_line(e, 300)}. Try: `pip install --force-reinstall hvdc_ident`")
+            end(
+                1,
+                f"the installation is incomplete: {one_line(e, 300)}. Try: `pip install --force-reinstall hvdc_ident`",
+            )
         except Exception as e:
             if os.environ.get("HVDC_IDENT_DEBUG") == "1":
                 traceback.print_exc()

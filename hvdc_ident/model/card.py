@@ -85,6 +85,8 @@ def _model(card: dict[str, Any], inside: tuple[Path, ...]) -> Model:
     require_schema(card, SCHEMA, "the card", "", ModelError)
     file = validated(CardFile, card, "", ModelError)
     require_known("parameter", [n for n in file.record if n != "-"], file.parameters, "record")
+    require_known("parameter", file.power_flow, file.parameters, "power_flow")
+    require_known("parameter of the record", file.asked, file.record, "asked")
     sections = file.model_dump(include=set(SECTIONS), exclude_unset=True)
     if not file.components and not file.connections:
         return Model(name=file.name, description=file.description, **sections)

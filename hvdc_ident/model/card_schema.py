@@ -185,6 +185,12 @@ class CardFile(TomlTable):
         'record = ["K", "T"]', default=[])
     also: list[str] = optional("Other models of .dyr files that this card stands for: their records and equations are the same.",
         'also = ["EXDC2"]', default=[])
+    power_flow: dict[str, Literal["ZR", "ZX", "QG"]] = optional(
+        "Parameters that PSS/E's power flow (.raw) states, by the name of the field there. Where the record has the parameter too, the "
+        "record counts and the two are compared.", 'power_flow = {Xpd = "ZX", Ra = "ZR"}', default={})
+    asked: list[str] = optional(
+        "Parameters of the record that a study of a unit asks about, the first that is above 0 and that no flag switches off: inertia, "
+        "gain, droop.", 'asked = ["KPR", "KIR"]', default=[])
     parameters: dict[str, ParameterEntry] = optional("Constants that may be estimated, by name.", "[parameters]", default={})
     inputs: dict[str, InputEntry] = optional("Signals that enter the model from outside, by name.", "[inputs]", default={})
     states: dict[str, StateEntry] = optional("Differential equations, by state.", "[states]", default={})

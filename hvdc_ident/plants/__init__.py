@@ -2,14 +2,31 @@
 
 from hvdc_ident.plants.places import block_signals
 from hvdc_ident.plants.records import RecordedUnit, machine_records, recorded_unit, with_unit_values
-from hvdc_ident.plants.unit import LEVELS, MACHINE, UnitPart, parts_of, shelf_model, unit_card
+from hvdc_ident.plants.unit import (
+    AHEAD,
+    LEVELS,
+    MACHINE,
+    SET_POINTS,
+    STEP_UP,
+    UNCONNECTED,
+    UnitPart,
+    idle_parts,
+    parts_of,
+    shelf_model,
+    unit_card,
+)
 
 __all__ = [
+    "AHEAD",
     "LEVELS",
     "MACHINE",
+    "SET_POINTS",
+    "STEP_UP",
+    "UNCONNECTED",
     "RecordedUnit",
     "UnitPart",
     "block_signals",
+    "idle_parts",
     "machine_records",
     "parts_of",
     "recorded_unit",

@@ -33,6 +33,8 @@ REFERENCES = (
 )
 """Of a unit that is played back: the input with the recorded level before the event, its output and unit, and the reference that is
 found from it, the first that the unit has and that its flags let act."""
+SET_POINTS = ("Plant_pref", "Pref", "nref", "Vref", "Qref", "Qext", "PFaref")
+"""References that a person or another plant's control gives, where no part does."""
 LEVELS = FrozenMap({level: output for level, output, _, _ in REFERENCES})
 """By input with a level the output that has it."""
 LOADED = 0.8
@@ -46,6 +48,8 @@ METER = "freq.dwn"
 """Signal that controls take as the frequency of the network where the unit is played back: of a recorded angle, its rate counts. A
 machine, which has a speed of its own in the frame, takes that of the frame."""
 MACHINE = "gen"
+STEP_UP = "step_up"
+"""Name of the transformer between the machine and the bus, where a unit has one of its own."""
 NAMES = FrozenMap(
     {"Ir": MACHINE, "wg": "drive", "dPm": "aero", "theta": "pitch", "wref": "torque"}
     | {"Efd": "avr", "Pm": "gov", "Vs": "pss", "Ipcmd": "elec", "Qext": "plant"}
@@ -74,7 +78,8 @@ def unit_card(
     """Return the text of the card of a unit.
 
     parts: by name, among them one with a current into the network. An input of a part follows the output of its name that another part
-    has; one that none has is an input of the unit with that name (a reference), or what `UNCONNECTED` says.
+    has; one that none has is an input of the unit with that name (a reference), or what `UNCONNECTED` says. A transformer named
+    `STEP_UP` lies between machine and bus; P and Q are those at the bus.
     network: an infinite bus behind the impedance R + jX (pu of the system base), or the recorded voltage at the terminals and its angle
     or frequency.
     f0: nominal frequency, Hz. levels: of inputs before the event, from which the search for a start sets out. Raises ModelError where
@@ -83,7 +88,8 @@ def unit_card(
     models = {n: shelf_model(p.source) for n, p in parts.items()}
     machine = _one_that_gives(models, "Ir")
     played = network == "playback"
-    connections, references = _wired(models, _network(machine, network), played)
+    powers = _powers(machine, "bus" if played else "line", STEP_UP in parts)
+    connections, references = _wired(models, _network(machine, played, STEP_UP in parts), played)
     inputs: dict[str, Input] = {**(shelf_model("playback").inputs if played else {"E": VOLTAGE}), **references}
     known = {"f": f0} | dict(levels)
     grid = (
@@ -108,10 +114,10 @@ def unit_card(
             "",
             "[connections]",
             *(f"{toml_key(n)} = {e if e.startswith('{') else toml_string(e)}" for n, e in connections.items()),
-            *(line for n, about in references.items() for line in _reference_lines(n, machine, *about)),
+            *(line for n, about in references.items() for line in _reference_lines(n, machine, powers, *about)),
             "",
             "[outputs]",
-            *_output_lines(models),
+            *_output_lines(models, powers),
         ]
         return "\n".join(lines) + "\n"
 
@@ -157,19 +163,29 @@ def _component_lines(name: str, part: UnitPart) -> Iterator[str]:
         yield f"parameters = {{{', '.join(f'{toml_key(n)} = {float(v)!r}' for n, v in part.values.items())}}}"
 
 
-def _reference_lines(name: str, machine: str, level: str, output: str, quantity: Input) -> Iterator[str]:
+def _reference_lines(
+    name: str, machine: str, powers: Mapping[str, str], level: str, output: str, quantity: Input
+) -> Iterator[str]:
     """Yield the state of a reference: it never moves, and where it stands follows from the level of the output."""
-    rest = f"{name} + ({level} - {machine}.{output})/{machine}.Sn"
+    rest = f"{name} + ({level} - {powers[output]})/{machine}.Sn"
     yield from ("", f"[states.{toml_key(name)}]", 'derivative = "0"', f"rest = {toml_string(rest)}")
     yield from (f"guess = {quantity.value!r}", f"unit = {toml_string(quantity.unit)}")
     yield f"description = {toml_string(quantity.description)}"
 
 
-def _output_lines(models: Mapping[str, Model]) -> Iterator[str]:
+def _output_lines(models: Mapping[str, Model], powers: Mapping[str, str]) -> Iterator[str]:
     for n, unit in SHOWN.items():
         source = next((part for part, model in models.items() if n in model.outputs), None)
         if source is not None:
-            yield f'{n} = {{value = "{source}.{n}", unit = "{unit}"}}'
+            yield f'{n} = {{value = "{powers.get(n, f"{source}.{n}")}", unit = "{unit}"}}'
+
+
+def _powers(machine: str, end: str, step_up: bool) -> dict[str, str]:
+    """Return the expressions of P (MW) and Q (Mvar) into the network. end: the component that has the voltage of the bus."""
+    if not step_up:
+        return {"P": f"{machine}.P", "Q": f"{machine}.Q"}
+    base, Ir, Ii = f"{machine}.Sb", f"{STEP_UP}.Ir_far", f"{STEP_UP}.Ii_far"
+    return {"P": f"{base}*({end}.Vr*{Ir} + {end}.Vi*{Ii})", "Q": f"{base}*({end}.Vi*{Ir} - {end}.Vr*{Ii})"}
 
 
 def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, UnitPart]:
@@ -190,6 +206,13 @@ def parts_of(records: Mapping[str, Sequence[float]]) -> dict[str, UnitPart]:
             source, {n: float(v) for n, v in zip(names, values, strict=True) if n != "-"}
         )
     return parts
+
+
+def idle_parts(parts: Mapping[str, UnitPart]) -> list[str]:
+    """Return the parts beside the machine that no other part follows: a stabiliser without its exciter."""
+    models = {n: shelf_model(p.source) for n, p in parts.items() if n != STEP_UP}
+    taken = {n: {AHEAD.get(u, u) for other, m in models.items() if other != n for u in m.inputs} for n in models}
+    return [n for n, m in models.items() if n != MACHINE and taken[n].isdisjoint(m.outputs)]
 
 
 def part_name(source: str) -> str:
@@ -235,26 +258,25 @@ def _followed(uses: Mapping[str, set[str]], name: str) -> set[str]:
     return found
 
 
-def _network(machine: str, network: str) -> dict[str, str]:
-    """Return the connections of the machine with the network."""
-    if network == "playback":
-        return {
-            "bus.V": "V",
-            "bus.theta": "theta",
-            "bus.f": "f",
-            f"{machine}.Vr": "bus.Vr",
-            f"{machine}.Vi": "bus.Vi",
-        }
-    return {
-        "grid.V": "E",
-        "grid.theta": "0",
-        "line.Vr_far": "grid.Vr",
-        "line.Vi_far": "grid.Vi",
-        "line.Ir": f"{machine}.Ir",
-        "line.Ii": f"{machine}.Ii",
-        f"{machine}.Vr": '{value = "line.Vr", start = 1.0}',
-        f"{machine}.Vi": '{value = "line.Vi", start = 0.2}',
+def _network(machine: str, played: bool, step_up: bool) -> dict[str, str]:
+    """Return the connections of the machine with the network, over its step-up transformer where it has one."""
+    end = "bus" if played else "line"
+    terminal = STEP_UP if step_up else end
+    # Without a network between them the recorded voltage is that of the machine; else voltage and current are a circle of unknowns.
+    circle = step_up or not played
+    machine_ends = {
+        f"{machine}.{v}": f'{{value = "{terminal}.{v}", start = {start}}}' if circle else f"{terminal}.{v}"
+        for v, start in (("Vr", 1.0), ("Vi", 0.2))
     }
+    over = {f"{STEP_UP}.{v}_far": f"{end}.{v}" for v in ("Vr", "Vi")} | {
+        f"{STEP_UP}.{i}": f"{machine}.{i}" for i in ("Ir", "Ii")
+    }
+    through = over if step_up else {}
+    if played:
+        return {"bus.V": "V", "bus.theta": "theta", "bus.f": "f"} | through | machine_ends
+    into = {f"line.{i}": f"{STEP_UP}.{i}_far" if step_up else f"{machine}.{i}" for i in ("Ir", "Ii")}
+    far = {"grid.V": "E", "grid.theta": "0", "line.Vr_far": "grid.Vr", "line.Vi_far": "grid.Vi"}
+    return far | into | through | machine_ends
 
 
 @cache

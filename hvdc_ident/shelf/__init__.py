@@ -5,8 +5,10 @@ from __future__ import annotations
 import tomllib
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from hvdc_ident.errors import unknown_name
+from hvdc_ident.immutable import FrozenMap
 
 
 @cache
@@ -32,8 +34,7 @@ def _sources() -> dict[str, str]:
     """Return the component of each model of .dyr files, by the model's name."""
     found = {name.upper(): name for name in components()}
     for name in components():
-        card = tomllib.loads(card_of(name).read_text(encoding="utf-8"))
-        found |= dict.fromkeys(card.get("also", ()), name)
+        found |= dict.fromkeys(_about(name).get("also", ()), name)
     return found
 
 
@@ -45,4 +46,20 @@ def source_of(model: str) -> str | None:
 @cache
 def record_of(name: str) -> tuple[str, ...]:
     """Return a component's parameters in the order of the values of its .dyr record; "-" for a value that it does not use."""
-    return tuple(tomllib.loads(card_of(name).read_text(encoding="utf-8")).get("record", ()))
+    return tuple(_about(name).get("record", ()))
+
+
+@cache
+def power_flow_of(name: str) -> FrozenMap[str]:
+    """Return the parameters of a component that a power flow states, with the names of their fields there."""
+    return FrozenMap(_about(name).get("power_flow", {}))
+
+
+@cache
+def asked_of(name: str) -> tuple[str, ...]:
+    """Return the parameters of a component that a study asks about, the first that counts."""
+    return tuple(_about(name).get("asked", ()))
+
+
+def _about(name: str) -> dict[str, Any]:
+    return tomllib.loads(card_of(name).read_text(encoding="utf-8"))

@@ -51,7 +51,9 @@ COLUMNS_SHOWN = 8
 class DyrOfStudy:
     """Where a study's unit comes from: a .dyr file, the bus and the machine; unknown: models of its that the unit lacks.
 
-    candidates: parameters that are asked about first, with their bounds. places: patterns of insertion points that are tried.
+    candidates: parameters that are asked about first, with their bounds; offered: gains and time constants beside them. places:
+    patterns of insertion points that are tried. bus_kv, mva, frequency (Hz): bases of the recorded voltage and of the machine, None
+    where no file states them. notes: what the files state, used and not used, in sentences.
     """
 
     file: Path
@@ -59,7 +61,12 @@ class DyrOfStudy:
     machine: str
     unknown: tuple[str, ...] = ()
     candidates: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    offered: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     places: tuple[str, ...] = ()
+    bus_kv: float | None = None
+    mva: float | None = None
+    frequency: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -109,13 +116,16 @@ class NewStudy(Shown):
                 "noise": {o: n.std for o, n in r.noise.items()},
             }
         found = {"schema": 1, "study": self.path.as_posix(), "model": self.model.name, "experiments": experiments}
-        return found if self.dyr is None else found | {"unknown_models": list(self.dyr.unknown)}
+        if self.dyr is None:
+            return found
+        bases = {"bus_kv": self.dyr.bus_kv, "mva": self.dyr.mva, "frequency": self.dyr.frequency}
+        return found | {"unknown_models": list(self.dyr.unknown), "bases": bases, "notes": list(self.dyr.notes)}
 
     def _screen(self) -> Iterator[str]:
         number = len(self.recordings)
         yield f"{self.path} is written: model {self.model.name}, {number} experiment{'s' if number > 1 else ''}"
-        if self.dyr is not None and self.dyr.unknown:
-            yield _left_out(self.dyr)
+        if self.dyr is not None and self.dyr.notes:
+            yield "\n".join(self.dyr.notes)
         for r in self.recordings:
             yield _found(r)
             used = [
@@ -174,9 +184,7 @@ def new_study(
     return NewStudy(path, plant, mapped, dyr)
 
 
-def matched(
-    record: Trajectory, model: AnyModel, phases: Sequence[schema.PhasesTable] = ()
-) -> tuple[Matching, str]:
+def matched(record: Trajectory, model: AnyModel, phases: Sequence[schema.PhasesTable] = ()) -> tuple[Matching, str]:
     """Return the columns of a recording by signal of a model, and why the model's levels are not known ("" where they are).
 
     Levels are those before the event that inputs of the signals' names show. phases: what columns are made of.
@@ -191,9 +199,7 @@ def matched(
     return matching(columns_of(record, event, ways), targets_of(model, levels), model.parameters), why
 
 
-def proposal(
-    record: Trajectory, model: AnyModel, name: str
-) -> tuple[Matching, str, tuple[schema.PhasesTable, ...]]:
+def proposal(record: Trajectory, model: AnyModel, name: str) -> tuple[Matching, str, tuple[schema.PhasesTable, ...]]:
     """Return what a recording may be of a model: the columns by signal, those among them that are made of three phases, and of which.
 
     The text says why the model's levels are not known; empty where they are. name: of the experiment.
@@ -326,11 +332,6 @@ def _base_words(match: Match) -> str:
     return "" if match.base is None else f": base = {match.base:g} {match.column.unit}?"
 
 
-def _left_out(dyr: DyrOfStudy) -> str:
-    models = listed(list(dyr.unknown))
-    return f"{models} of bus {dyr.bus} in {dyr.file.name}: not on the shelf, left out of the unit"
-
-
 def _study_text(
     path: Path, source: str, model: AnyModel, recordings: Sequence[Mapped], dyr: DyrOfStudy | None
 ) -> Iterator[str]:
@@ -342,17 +343,20 @@ def _study_text(
     if dyr is not None:
         file = toml_string(_relative(dyr.file, path.parent))
         yield f"dyr = {{file = {file}, bus = {dyr.bus}, machine = {toml_string(dyr.machine)}}}   # where `export --to FILE.dyr` writes to"
-        yield from [f"# {_left_out(dyr)}"] if dyr.unknown else []
+        yield from (f"# {_comment(note)}" for note in dyr.notes)
     yield ""
     yield "# What may be estimated: take out the # of some parameters, and narrow their bounds."
     yield "[parameters]"
-    asked = {} if dyr is None else dyr.candidates
+    asked, offered = ({}, {}) if dyr is None else (dyr.candidates, dyr.offered)
     yield from (f"{toml_key(n)} = {{min = {low:g}, max = {high:g}}}" for n, (low, high) in asked.items())
-    for name, p in [(n, p) for n, p in model.parameters.items() if n not in asked][:MOST_LISTED]:
+    for name, (low, high) in offered.items():
+        yield f"# {toml_key(name)} = {{min = {low:g}, max = {high:g}}}   # {_comment(model.parameters[name].description)}"
+    listed_above = {*asked, *offered}
+    for name, p in [(n, p) for n, p in model.parameters.items() if n not in listed_above][:MOST_LISTED]:
         bounds = "" if math.isinf(p.min) and math.isinf(p.max) else f"within [{p.min:g}, {p.max:g}]"
         about = ", ".join(t for t in (p.unit, bounds, p.description) if t)
         yield f"# {toml_key(name)} = {{start = {p.value!r}}}" + (f"   # {_comment(about)}" if about else "")
-    more = len(model.parameters) - len(asked) - MOST_LISTED
+    more = len(model.parameters) - len(listed_above) - MOST_LISTED
     yield from [f"# and {more} more parameters of the model"] if more > 0 else []
     if settable := [n for n, i in model.inputs.items() if i.settable]:
         names = ", ".join(map(toml_string, settable))

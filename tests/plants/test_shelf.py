@@ -9,7 +9,7 @@ import pytest
 
 import hvdc_ident as hi
 from hvdc_ident.model import read_card
-from hvdc_ident.shelf import card_of, components, record_of
+from hvdc_ident.shelf import asked_of, card_of, components, power_flow_of, record_of
 from tests.plants.test_against_andes import CASES, unit
 
 NETWORK = ("bus-frequency", "infinite-bus", "line", "load", "playback", "transformer", "dc-line", "grid-impedance")
@@ -46,6 +46,15 @@ def test_a_record_names_parameters(name: str) -> None:
     for n in named:
         low, high = model.parameters[n].min, model.parameters[n].max
         assert low <= model.parameters[n].value <= high
+
+
+@pytest.mark.parametrize("name", [n for n in components() if n not in NO_RECORD])
+def test_what_a_power_flow_states_and_a_study_asks_about_are_parameters(name: str) -> None:
+    model, record = read_card(card_of(name)), record_of(name)
+    assert set(power_flow_of(name)) <= set(model.parameters)
+    assert set(asked_of(name)) <= set(record)
+    source_impedance = {n for n in model.parameters if n in ("Ra", "Qgen0") or (n == "Xpd" and n not in record)}
+    assert source_impedance <= set(power_flow_of(name)), "a shelf default would stand in for what the .raw states"
 
 
 @pytest.mark.parametrize("name", CASES)

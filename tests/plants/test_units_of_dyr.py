@@ -129,7 +129,7 @@ def test_what_is_missing_is_told(folder, tmp_path) -> None:
     code, _, err = called("new", tmp_path / "c", "--dyr", dyr, "--bus", 7, "--base", 1, "--from", event)
     assert code == 2 and "no record of bus 7" in err
     assert not any(tmp_path.iterdir())
-    again = ["new", tmp_path / "d", "--dyr", dyr, "--bus", 101, "--base", 250, "--from"]
+    again = ["new", tmp_path / "d", "--dyr", dyr, "--bus", 101, "--base", 250, "--frequency", 50, "--from"]
     code, _, err = called(*again, tmp_path / "none.csv")
     assert code == 2 and "none.csv" in err
     assert called(*again, event, "--quiet")[0] == 0  # what failed has left nothing in the way
