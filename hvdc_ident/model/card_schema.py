@@ -189,7 +189,7 @@ class CardFile(TomlTable):
         "Parameters that PSS/E's power flow (.raw) states, by the name of the field there. Where the record has the parameter too, the "
         "record counts and the two are compared.", 'power_flow = {Xpd = "ZX", Ra = "ZR"}', default={})
     asked: list[str] = optional(
-        "Parameters of the record that a study of a unit asks about, the first that is above 0 and that no flag switches off: inertia, "
+        "Parameters of the record that a study of a unit asks about, the first that is not 0 and that no flag switches off: inertia, "
         "gain, droop.", 'asked = ["KPR", "KIR"]', default=[])
     parameters: dict[str, ParameterEntry] = optional("Constants that may be estimated, by name.", "[parameters]", default={})
     inputs: dict[str, InputEntry] = optional("Signals that enter the model from outside, by name.", "[inputs]", default={})

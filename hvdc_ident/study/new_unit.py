@@ -38,8 +38,8 @@ FLAGS = FrozenMap({"Kvp": ("QFLAG",), "Kqp": ("QFLAG", "VFLAG")})
 """Flags of its part that must be 1 for a parameter to count."""
 GAIN = re.compile(r"^share|\b(gain|droop|inertia|damping|feedback|loading|demagnetisation|lead-lag|constant of)\b")
 """Words in the description of a gain or of another factor in a loop; a time constant has the unit of time."""
-TIMER = re.compile(r"^time (below|above|after)\b")
-"""Words in that of a setting of protection, which acts at an instant."""
+LIMIT = re.compile(r"^(highest|lowest|time (below|above|after))\b")
+"""Words in that of a limit, or of a setting of protection, which acts at an instant."""
 COMMANDS = ("Pm", "Efd", "Ipcmd", "Iqcmd")
 """Inputs of a machine or converter that its controls give."""
 SEEN = ("P", "Q")
@@ -182,12 +182,12 @@ def _places(unit: RecordedUnit, card: Path) -> tuple[str, ...]:
 
 
 def asked_about(unit: RecordedUnit) -> dict[str, tuple[float, float]]:
-    """Return of each part that acts the first parameter that its card asks about, is above 0 and counts at its flags, with its bounds."""
+    """Return of each part that acts the first parameter that its card asks about, is not 0 and counts at its flags, with its bounds."""
     found = {}
     idle = idle_parts(unit.parts)
     for name, part in ((n, p) for n, p in unit.parts.items() if n not in idle):
         off = {n for n, flags in FLAGS.items() if any(part.values.get(f) == 0.0 for f in flags)}
-        usual = next((n for n in asked_of(part.source) if n not in off and part.values.get(n, 0.0) > 0.0), None)
+        usual = next((n for n in asked_of(part.source) if n not in off and part.values.get(n)), None)
         if usual is not None:
             found[f"{name}.{usual}"] = _bounds(part, usual)
     return found
@@ -206,7 +206,8 @@ def offered(unit: RecordedUnit) -> dict[str, tuple[float, float]]:
 def is_gain_or_time(parameter: Parameter) -> bool:
     """Return True for a gain, a droop, an inertia, a damping or a time constant: what a study of a unit may ask about."""
     about = parameter.description
-    return (parameter.unit == "s" and not TIMER.search(about)) or GAIN.search(about.split(";")[0]) is not None
+    named = parameter.unit == "s" or GAIN.search(about.split(";")[0]) is not None
+    return named and not LIMIT.search(about)
 
 
 def _bounds(part: UnitPart, name: str) -> tuple[float, float]:

@@ -128,9 +128,10 @@ def _unused_values(records: Sequence[DyrRecord]) -> Iterator[str]:
 
 def _left_out(unit: RecordedUnit, asked: Collection[str]) -> Iterator[str]:
     """Yield what becomes of the models that are not on the shelf."""
-    missing = _missing(unit)
+    open_ = _open(unit)
+    missing = _needed(open_)
     for record in unit.unknown:
-        near = _near(record, missing.values())
+        near = _near(record, missing.values(), open_.values())
         yield f"{record.model} (line {record.line} of the .dyr) is not on the shelf and is left out{near}"
     if not unit.unknown:
         return
@@ -143,11 +144,8 @@ def _left_out(unit: RecordedUnit, asked: Collection[str]) -> Iterator[str]:
     yield "; ".join(filter(None, lines))
 
 
-def _missing(unit: RecordedUnit) -> dict[tuple[str, str], str]:
-    """Return by part and input the signal that no other part gives, though components of .dyr files do.
-
-    References, which have no giver in many a unit, only where nothing else is missing.
-    """
+def _open(unit: RecordedUnit) -> dict[tuple[str, str], str]:
+    """Return by part and input the signal that no other part gives, though components of .dyr files do."""
     models = {n: shelf_model(p.source) for n, p in unit.parts.items()}
     found = {}
     for name, model in models.items():
@@ -156,7 +154,13 @@ def _missing(unit: RecordedUnit) -> dict[tuple[str, str], str]:
             signal = AHEAD.get(u, u)
             if signal not in others and _giving([signal]):
                 found[name, u] = signal
-    return {place: s for place, s in found.items() if s not in SET_POINTS} or found
+    return found
+
+
+def _needed(open_: Mapping[tuple[str, str], str]) -> dict[tuple[str, str], str]:
+    """Return the signals that a unit does not go without; where there are none, the others, and last the references."""
+    no_references = {place: s for place, s in open_.items() if s not in SET_POINTS}
+    return {place: s for place, s in no_references.items() if s not in UNCONNECTED} or no_references or dict(open_)
 
 
 def _without(unit: RecordedUnit, missing: Mapping[tuple[str, str], str]) -> Iterator[str]:
@@ -174,15 +178,17 @@ def _giving(signals: Collection[str]) -> list[str]:
     return [c for c in components() if record_of(c) and not set(signals).isdisjoint(shelf_model(c).outputs)]
 
 
-def _near(record: DyrRecord, signals: Collection[str]) -> str:
-    """Return the components that a model may be: by its name and its number of values, of those that give what is missing."""
-    cards = [c.upper() for c in _giving(signals)]
+def _near(record: DyrRecord, missing: Collection[str], open_: Collection[str]) -> str:
+    """Return in words the components that a model may be: by its name, else by its number of values.
+
+    open_: signals that no part gives; missing: those of them that are needed, for which the number of values alone may speak.
+    """
+    lacking = [c.upper() for c in _giving(missing)]
     number = len(record.values)
-    alike = nearest(record.model, cards)
-    as_long = [c for c in cards if len(record_of(c.lower())) == number]
-    both = [c for c in alike if c in as_long]
-    found = both or as_long or alike
+    alike = nearest(record.model, [c.upper() for c in _giving(open_)])
+    as_long = [c for c in lacking if len(record_of(c.lower())) == number]
+    found = [c for c in alike if c in as_long] or alike or as_long
     if not found:
-        return f"; {listed(cards)} give what is missing" if cards else ""
-    why = f", with {number} values as well" if found is not alike else ", by its name"
+        return f"; {listed(lacking)} give what is missing" if lacking else ""
+    why = ", by its name" if found[0] in alike else f", with {number} values as well"
     return f"; nearest on the shelf: {listed(found)}{why}: where it is that model, name it so in a copy of the .dyr"
