@@ -190,5 +190,5 @@ def _near(record: DyrRecord, missing: Collection[str], open_: Collection[str]) -
     found = [c for c in alike if c in as_long] or alike or as_long
     if not found:
         return f"; {listed(lacking)} give what is missing" if lacking else ""
-    why = ", by its name" if found[0] in alike else f", with {number} values as well"
+    why = ", by name" if found[0] in alike else f", with {number} values as well"
     return f"; nearest on the shelf: {listed(found)}{why}: where it is that model, name it so in a copy of the .dyr"

@@ -231,7 +231,7 @@ def test_a_record_of_another_frequency_than_stated_is_said(folder: Path) -> None
     ("records", "expected", "asked"),
     [
         (
-            "101 'ESAC7Z' 1 0.02 150.0 0.05 6.0 -6.0 1.0 0.60 0.05 1.20 0 3.50 0.10 4.60 0.35 /\n" + TGOV1,
+            "101 'OURS9' 1 0.02 150.0 0.05 6.0 -6.0 1.0 0.60 0.05 1.20 0 3.50 0.10 4.60 0.35 /\n" + TGOV1,
             [
                 "nearest on the shelf: IEEET1, with 14 values as well",
                 "no part gives Efd (field voltage), which stays as before",
@@ -242,7 +242,7 @@ def test_a_record_of_another_frequency_than_stated_is_said(folder: Path) -> None
             SEXS + "101 'TGOV9' 1 0.05 0.5 1.0 0.0 2.0 6.0 0.0 0.0 /\n",
             [
                 "TGOV9 (line 3 of the .dyr)",
-                "nearest on the shelf: TGOV1, by its name",
+                "nearest on the shelf: TGOV1, by name",
                 "no part gives Pm (mechanical power)",
             ],
             {"gen.H", "avr.K"},
