@@ -9,28 +9,46 @@ import scipy.linalg
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.stability import Characteristic
+from hvdc_ident.linearize.stability import EPS, Characteristic
 from hvdc_ident.linearize.system import Array
 
 TOLERANCE = 1e-10
+"""Share of the largest coupling of its equation below which one counts as left over where terms cancelled: 6 digits above rounding."""
 
 
-def staircase(a: Array, b: Array, tolerance: float = TOLERANCE) -> tuple[Array, int]:
-    """Return (orthogonal basis, k): its first k columns span what the inputs reach."""
+def staircase(a: Array, b: Array, uncertain: Array) -> tuple[Array, int]:
+    """Return (orthogonal basis, k): its first k columns span what the inputs reach.
+
+    uncertain: (states, states) what the entries of A may be off by. A coupling is one where it is larger than what these leave in
+    its place, not where it is large beside all of A: a slow state behind a fast one is reached through an entry as small as its unit
+    makes it. The units of the inputs count for nothing.
+    """
     n = a.shape[0]
+    sizes = np.linalg.norm(b, axis=0)
     basis, at, reached = np.eye(n), a.copy(), 0
-    block, size = b.copy(), max(float(np.linalg.norm(b)), 1e-300)
+    block, off = b / np.where(sizes > 0.0, sizes, 1.0), TOLERANCE
     while reached < n and block.size:
         u, values, _ = np.linalg.svd(block)
-        r = int((values > tolerance * size).sum())
+        r = int((values > off).sum())
         if r == 0:
             break
         turn = scipy.linalg.block_diag(np.eye(reached), u)
         basis, at = basis @ turn, turn.T @ at @ turn
-        block = at[reached + r :, reached : reached + r]
-        size = max(float(np.linalg.norm(a)), 1e-300)
+        next_, done = slice(reached + r, n), slice(reached, reached + r)
+        block = at[next_, done]
+        off = float(np.linalg.norm(np.abs(basis[:, next_]).T @ uncertain @ np.abs(basis[:, done])))
         reached += r
     return basis, reached
+
+
+def _uncertain(a: Array, tolerance: float) -> Array:
+    """Return what the entries of A may be off by: a share of the largest coupling of their equation, and rounding of their own.
+
+    A state's own rate is no coupling: it is no difference of terms that lead to others. An entry of 0 is one.
+    """
+    couplings = np.abs(a - np.diag(np.diag(a)))
+    left_over = np.where(couplings > 0.0, tolerance * couplings.max(axis=1, initial=0.0, keepdims=True), 0.0)
+    return np.asarray(left_over + 10.0 * len(a) * EPS * np.abs(a))
 
 
 def kalman(
@@ -39,7 +57,8 @@ def kalman(
     """Return A, B, C of the controllable and observable part, and the uncontrollable and unobservable eigenvalues."""
     hidden = []
     for transposed in (False, True):
-        basis, k = staircase(a.T if transposed else a, c.T if transposed else b, tolerance)
+        uncertain = _uncertain(a, tolerance)
+        basis, k = staircase(a.T, c.T, uncertain.T) if transposed else staircase(a, b, uncertain)
         if k == a.shape[0]:  # nothing is hidden: the model's own states keep the digits that a basis would mix
             hidden.append(np.zeros(0))
             continue

@@ -14,6 +14,7 @@ import scipy.linalg
 
 from hvdc_ident.codec import INLINE, Coded, stored_as
 from hvdc_ident.errors import LinearizationError
+from hvdc_ident.linearize.gramians import reached_gramian, seen_gramian
 from hvdc_ident.linearize.linear_model import LinearModel
 from hvdc_ident.linearize.norms import Peak, linf_norm
 from hvdc_ident.linearize.realisation import TOLERANCE, difference, kalman, scaled_states
@@ -83,9 +84,7 @@ def _renamed(model: LinearModel, a: Array, b: Array, c: Array, d: Array, how: st
 
 def hankel(a: Array, b: Array, c: Array) -> tuple[Array, Array, Array]:
     """Return (singular values, left and right square-root balancing matrices) of a stable system."""
-    p = scipy.linalg.solve_continuous_lyapunov(a, -b @ b.T)
-    q = scipy.linalg.solve_continuous_lyapunov(a.T, -c.T @ c)
-    root_p, root_q = _root(p), _root(q)
+    root_p, root_q = _root(reached_gramian(a, b)), _root(seen_gramian(a, c))
     u, values, v = np.linalg.svd(root_q.T @ root_p)
     return values, root_q @ u, root_p @ v.T
 
