@@ -22,7 +22,17 @@ from hvdc_ident.linearize.system import Array
 if TYPE_CHECKING:
     import control
 
-    from hvdc_ident.linearize import export, frequency, loops, modal, norms, plot, reduction, transfer_function, zeros
+    from hvdc_ident.linearize import (
+        delayed_zeros,
+        export,
+        frequency,
+        loops,
+        modal,
+        norms,
+        plot,
+        reduction,
+        transfer_function,
+    )
 
 
 Exact = TypeVar("Exact", Change, Characteristic)
@@ -263,7 +273,7 @@ class LinearModel(Shown):
     if TYPE_CHECKING:
         poles = modal.poles
         stability = modal.stability_of
-        zeros = zeros.zeros_of
+        zeros = delayed_zeros.zeros_of
         modes = modal.modes
         transfer_function = transfer_function.transfer_function
         response = frequency.response
@@ -277,7 +287,7 @@ class LinearModel(Shown):
     else:
         poles = method("hvdc_ident.linearize.modal.poles")
         stability = method("hvdc_ident.linearize.modal.stability_of")
-        zeros = method("hvdc_ident.linearize.zeros.zeros_of")
+        zeros = method("hvdc_ident.linearize.delayed_zeros.zeros_of")
         modes = method("hvdc_ident.linearize.modal.modes")
         transfer_function = method("hvdc_ident.linearize.transfer_function.transfer_function")
         response = method("hvdc_ident.linearize.frequency.response")

@@ -21,7 +21,8 @@ class TransferFunction(Coded):
     """gain * prod(s - zeros) / prod(s - poles), s in rad/s; cancelled: (pole, zero) pairs that were left out.
 
     dc_gain: the value at s = 0, infinite with a pole there; modes that the input does not reach or the output does not
-    see are no poles of it, though an integrator among them stays in `poles` and `zeros`.
+    see are no poles of it, though an integrator among them stays in `poles` and `zeros`. approximated: the delays that stand in it as
+    Pade approximants, whose zeros and poles are none of the model's; `LinearModel.zeros` and `poles` have those.
     """
 
     input: str
@@ -31,6 +32,7 @@ class TransferFunction(Coded):
     gain: float
     dc_gain: float
     cancelled: tuple[tuple[complex, complex], ...] = ()
+    approximated: tuple[str, ...] = ()
 
     def __call__(self, s: complex | Array) -> Array:
         """Return the value at complex frequencies s."""
@@ -58,8 +60,9 @@ def transfer_function(model: LinearModel, input: str | None = None, output: str 
     hidden = np.concatenate(kalman(*scaled_states(a, b, c))[1])
     kept_poles, kept_zeros, cancelled = _cancel(all_poles, all_zeros, hidden)
     gain = _gain(a, b, c, d, kept_zeros, kept_poles)
+    late = () if part.exact is None else tuple(c.name for c in part.exact.channels if c.total > 0.0)
     return TransferFunction(
-        input, output, _paired(kept_zeros), _paired(kept_poles), gain, _dc_gain(part), tuple(cancelled)
+        input, output, _paired(kept_zeros), _paired(kept_poles), gain, _dc_gain(part), tuple(cancelled), late
     )
 
 

@@ -6,15 +6,10 @@ They come from the system matrix, scaled, never from polynomials; those of pytho
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import scipy.linalg
 
 from hvdc_ident.linearize.system import Array
-
-if TYPE_CHECKING:
-    from hvdc_ident.linearize.linear_model import LinearModel
 
 RANK = 1e-11
 """Singular values below this share of the largest count as 0 when ranks are decided."""
@@ -102,8 +97,3 @@ def _deflate(a: Array, b: Array, c: Array, d: Array) -> tuple[Array, Array, Arra
         a = at[:keep, :keep]
         c = np.concatenate([ct[:r, :keep], at[keep:, :keep]])
         b, d = bt[:keep], np.concatenate([d[:r], bt[keep:]])
-
-
-def zeros_of(model: LinearModel) -> Array:
-    """Return the complex invariant zeros of a whole model, rad/s."""
-    return zeros(*model.standard())
