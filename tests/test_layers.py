@@ -24,8 +24,8 @@ options result candidates movable nominal prediction hypothesis screen location 
 stand_ins moves known_errors remainder forms size_search search candidate_table classes findings verdict diagnosis
 """,
     "linearize": """
-limits system delays sampling characteristic stability descriptor equilibrium plot derivatives point branches linear_model zeros frequency
-realisation norms kinds fmu_linear jacobian operating_point linearisation mode delayed_modes modal root_loci gain_limits loops reduction
+limits system delays sampling characteristic stability descriptor equilibrium plot derivatives point branches linear_model zeros
+delayed_zeros frequency realisation gramians norms kinds fmu_linear jacobian operating_point linearisation mode delayed_modes modal root_loci gain_limits loops reduction
 distance transfer_function formula impedance response_file export
 """,
     "fmu": """
