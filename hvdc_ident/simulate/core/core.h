@@ -37,6 +37,7 @@ enum {
 #define LANES 4         /* instants that a generated function over several of them takes at once; elements of a loop over a vector */
 #define ACCURACY 1e-10  /* largest scaled residual that counts as a steady state */
 #define SHORTEST 0x1p-16 /* of a path of values: a step that has to be shorter means that the path ends */
+#define SHARES 5        /* of a step at which the switches are looked at: its ends, its middle and, where one may open and close, its quarters */
 #define TINY 1e-3       /* the least that an unknown counts for, where it tells by what an equation's residual is measured */
 
 /* What tells the compiler that the turns of a loop do not depend on each other; the build of the library defines it. */
@@ -98,6 +99,7 @@ enum {
     VECTOR(floors) VECTOR(totals)                  /* error weights and sums of each parameter */                              \
     VECTOR(z_before) VECTOR(z_from) VECTOR(z_step) VECTOR(side) /* unknowns before a solve, a step of it, the modes there */   \
     VECTOR(sv) VECTOR(top) VECTOR(slack) VECTOR(sws) /* switches: values, largest so far, tolerance, rows */                   \
+    VECTOR(along) VECTOR(beside)                   /* their values at five shares of a step, and where the states are moved */ \
     VECTOR(src) VECTOR(src_rate) VECTOR(src_left)  /* sources of delays and samples; the delays' before the segment */         \
     VECTOR(lag) VECTOR(lag_p) VECTOR(before)       /* delays, their rows, the delayed signals before the start */              \
     VECTOR(nodes) VECTOR(history) VECTOR(echo)     /* history of delayed signals; instants at which jumps come back */         \

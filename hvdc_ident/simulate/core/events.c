@@ -2,25 +2,60 @@
 
 #include "core.h"
 
+static const double FINEST = 1e-10; /* share of a step up to which the instant of a switch is sought: a hundredth of the usual tolerance */
+
+/* How far a switch is beyond its mode. */
+static double over(const run *r, integer k)
+{
+    return (2.0 * r->m[k] - 1.0) * r->sv[k];
+}
+
+/* The value of a switch at y that may be an error: at most a hundredth of the tolerance of the largest value there was, and not more
+   than the states' tolerances make of it; not less than rounding does.
+
+   The first alone would take p^9 for 0 long before p is: the tolerance is one of the states, not of a function of them. */
+static double unsure(run *r, double *y, integer k)
+{
+    double moved = 0.0;
+    evaluate(r, r->do_sw, y, r->beside);
+    double there = r->beside[k];
+    for (integer i = 0; i < r->n; i++) {
+        double kept = y[i];
+        y[i] += r->rtol * fabs(kept) + r->atol;
+        evaluate(r, r->do_sw, y, r->beside);
+        moved += fabs(r->beside[k] - there);
+        y[i] = kept;
+    }
+    double rounding = 8.0 * 0x1p-52 / r->rtol * moved, usual = 0.01 * r->rtol * r->top[k];
+    return fmax(moved < usual ? moved : usual, rounding); /* `usual` too where moved is no number */
+}
+
 /* The switch that is furthest beyond its mode at y, or NONE; leaves the switches' values in r->sv. */
-static integer violation(run *r, const double *y)
+static integer violation(run *r, double *y)
 {
     evaluate(r, r->do_sw, y, r->sv);
     integer beyond = 0;
     for (integer k = 0; k < r->ns; k++) /* without a branch: nearly always there is none */
-        beyond += (2.0 * r->m[k] - 1.0) * r->sv[k] > r->slack[k];
+        beyond += over(r, k) > 0.0;
     if (beyond == 0)
         return NONE;
     double worst = 0.0;
     integer which = NONE;
     for (integer k = 0; k < r->ns; k++) {
-        double over = (2.0 * r->m[k] - 1.0) * r->sv[k] - r->slack[k];
-        if (over > worst) {
-            worst = over;
+        double far = over(r, k);
+        if (far > worst && (far > r->slack[k] || far > unsure(r, y, k))) {
+            worst = far;
             which = k;
         }
     }
     return which;
+}
+
+/* Keep the switches' values for one of the shares of the step. */
+static void see(run *r, integer place)
+{
+    for (integer k = 0; k < r->ns; k++)
+        r->along[place * r->ns + k] = r->sv[k];
 }
 
 /* Keep the largest value of every switch so far, which its tolerance is relative to. */
@@ -32,6 +67,7 @@ static void widen(run *r)
         r->top[i] = largest;
         r->slack[i] = 0.01 * r->rtol * largest + 1e-14;
     }
+    see(r, 0);
 }
 
 /* The switch that is furthest beyond its mode at a share of the present step, or NONE.
@@ -56,36 +92,149 @@ static integer violation_at(run *r, double share, bool exact)
     return violation(r, r->u);
 }
 
-/* Bisection on "some switch is beyond its mode", on the dense output: the share of the step, and the switch in `event`. */
-static double bisect(run *r, double bad, integer *event)
+/* True where the step began on the good side of a switch, so that the first change of its sign is where it is passed. */
+static bool began_within(const run *r, integer k)
 {
-    double good = bad == 0.5 ? 0.0 : 0.5;
-    for (integer k = 0; k < 60; k++) {
-        double middle = 0.5 * (good + bad);
+    return (2.0 * r->m[k] - 1.0) * r->along[k] <= 0.0;
+}
+
+/* The first share found of the step at which a switch is passed, between a good one and a bad one, on the dense output; the switch is
+   in `event`, and its values are known at both.
+
+   The tolerance of a switch says whether it is passed; where that is its sign says, as far as the step can tell: time is what
+   matters, and a value may say little of it. Points a hundredth beside a line's 0 by turns leave a fiftieth of the bracket between them
+   where the switch is nearly a line, every third halves it. */
+static double bisect(run *r, double good, double bad, integer *event)
+{
+    double largest = fmax(fabs(r->t), fabs(r->end)), side = 2.0 * r->m[*event] - 1.0;
+    double before = side * r->along[(good > 0.0 ? 2 : 0) * r->ns + *event], after = over(r, *event);
+    for (integer turn = 0; bad - good > FINEST && (bad - good) * r->hs > 1e-15 * largest; turn++) {
+        double cut = 0.5;
+        if (turn % 3 < 2 && before < 0.0 && after > 0.0)
+            cut = fmin(fmax(before / (before - after) + (turn % 3 ? -0.01 : 0.01), 0.01), 0.99);
+        double middle = good + cut * (bad - good);
         integer which = violation_at(r, middle, true);
-        if (which >= 0) {
-            bad = middle;
-            *event = which;
-            if (fabs(r->sv[which]) <= 2.0 * r->slack[which])
-                break;
-        } else {
+        if (which == NONE && over(r, *event) > 0.0 && began_within(r, *event))
+            which = *event;
+        if (which == NONE) {
             good = middle;
+            before = over(r, *event);
+        } else {
+            bad = middle;
+            after = over(r, which);
+            if (which != *event)
+                before = 0.0; /* not known of this one */
+            *event = which;
         }
-        if ((bad - good) * r->hs <= 1e-15 * fmax(1.0, fabs(r->t)))
-            break;
     }
     return bad;
+}
+
+/* Where a parabola through values at -1, 0 and 1 is largest, as far as it is inside; 0 where it is nowhere larger than at 0. */
+static double vertex(double left, double middle, double right)
+{
+    double bend = left - 2.0 * middle + right, slope = 0.5 * (right - left);
+    if (!(bend < 0.0))
+        return left > right ? -1.0 : right > left ? 1.0 : 0.0;
+    return fmin(fmax(-slope / bend, -1.0), 1.0);
+}
+
+/* True where a switch that keeps its mode at the ends and in the middle of the step may leave it in between.
+
+   A parabola through three values rises above them by an eighth of their range at most; a quartic may by more: half of it. */
+static bool may_open(const run *r, integer k)
+{
+    double side = 2.0 * r->m[k] - 1.0, a = side * r->along[k], b = side * r->along[2 * r->ns + k], c = side * r->along[4 * r->ns + k];
+    double top = fmax(a, fmax(b, c)), range = top - fmin(a, fmin(b, c));
+    return top + 0.5 * range > 0.0 && range > r->slack[k];
+}
+
+/* Write the switches' values at a share of the step into r->sv, as the dense output has them. */
+static void look(run *r, double share)
+{
+    interpolate(r, share, r->n, r->u);
+    outside(r, r->t + share * r->hs, r->t);
+    evaluate(r, r->do_sw, r->u, r->sv);
+}
+
+/* A share of the step at which switch k, which keeps its mode at five of them, is beyond it; 2 where there is none.
+
+   Parabolas through ever nearer values lead to the largest one; what a parabola leaves of five values bounds what it may be off by. */
+static double crest(run *r, integer k)
+{
+    double side = 2.0 * r->m[k] - 1.0, v[SHARES];
+    integer best = 1;
+    for (integer place = 0; place < SHARES; place++) {
+        v[place] = side * r->along[place * r->ns + k];
+        if (0 < place && place < SHARES - 1 && v[place] > v[best])
+            best = place;
+    }
+    double first = v[3] - 3.0 * v[2] + 3.0 * v[1] - v[0], second = v[4] - 3.0 * v[3] + 3.0 * v[2] - v[1];
+    double off = fabs(first) + fabs(second), width = 0.25, at = width * (double)best;
+    double left = v[best - 1], middle = v[best], right = v[best + 1];
+    for (;;) {
+        double moved = vertex(left, middle, right);
+        double highest = middle + 0.5 * moved * (right - left) + 0.5 * moved * moved * (left - 2.0 * middle + right);
+        if (highest + off < 0.0)
+            return 2.0;
+        at += moved * width;
+        if (!(at > 0.0 && at < 1.0)) /* it falls from the step's start, or rises to its end, which were looked at */
+            return 2.0;
+        if (violation_at(r, at, true) != NONE)
+            return at;
+        width = fmin(0.1 * width, fmin(at, 1.0 - at));
+        off *= 0.001;
+        if (!(width > FINEST))
+            return 2.0;
+        look(r, at);
+        middle = over(r, k);
+        look(r, at - width);
+        left = over(r, k);
+        look(r, at + width);
+        right = over(r, k);
+    }
+}
+
+/* The first share of the step that is found at which a switch is beyond its mode that is not so at the ends and in the middle; 2 where
+   there is none. Leaves what comes from outside, and the switches' values, as they are at the step's end. */
+static double opened(run *r)
+{
+    bool any = false;
+    for (integer k = 0; k < r->ns; k++)
+        any = any || may_open(r, k);
+    if (!any)
+        return 2.0;
+    for (integer place = 1; place < SHARES; place += 2) {
+        look(r, 0.25 * (double)place);
+        see(r, place);
+    }
+    double first = 2.0;
+    for (integer k = 0; k < r->ns; k++)
+        if (may_open(r, k))
+            first = fmin(first, crest(r, k));
+    outside(r, r->step_end, r->t);
+    for (integer k = 0; k < r->ns; k++)
+        r->sv[k] = r->along[4 * r->ns + k];
+    return first;
 }
 
 /* The switch that ends the present step, whose end it may move; NONE, or AGAIN where the step is to be redone with r->h. */
 static integer find_switch(run *r)
 {
-    double bad = 0.5;
+    double good = 0.0, bad = 0.5;
     integer event = violation_at(r, 0.5, false);
     if (event == NONE) {
-        bad = 1.0;
+        see(r, 2);
         outside(r, r->step_end, r->t);
         event = violation(r, r->yn);
+        see(r, 4);
+        bad = opened(r);
+        if (bad < 1.0) {
+            event = violation_at(r, bad, true);
+        } else {
+            good = 0.5;
+            bad = 1.0;
+        }
     }
     integer aim = r->aim;
     r->aim = NONE;
@@ -93,7 +242,7 @@ static integer find_switch(run *r)
         bool met = aim >= 0 && fabs(r->sv[aim]) <= NEAR_SURFACE * r->slack[aim];
         return met ? aim : NONE; /* the step aimed at this switch and met it */
     }
-    bad = bisect(r, bad, &event);
+    bad = bisect(r, good, bad, &event);
     if (bad < 0.98 && bad * r->hs > 1e-12 * r->span) {
         /* Step again up to the switch itself: the dense output is less exact than the step. */
         r->h = bad * r->hs;
@@ -211,6 +360,8 @@ static enum status pass_switch(run *r, integer event)
         add_echo(r, i, 1.0);
     for (integer c = 0; c < r->width; c++)
         r->jump_p[c] = 0.0;
+    evaluate(r, r->do_sw, r->y, r->sv);
+    see(r, 0);
     evaluate(r, r->do_rhs, r->y, r->k);
     r->fresh = 1;
     r->h = fmin(r->h, r->hs);

@@ -323,6 +323,7 @@ static void prepare_segment(run *r)
                 r->top[i] = fmax(r->top[i], fabs(r->sv[i]));
             r->slack[i] = 0.01 * r->rtol * r->top[i] + 1e-14;
         }
+        see(r, 0);
     }
     evaluate(r, r->do_rhs, r->y, r->k);
     r->evaluations++;
