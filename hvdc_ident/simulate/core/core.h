@@ -37,7 +37,7 @@ enum {
 #define LANES 4         /* instants that a generated function over several of them takes at once; elements of a loop over a vector */
 #define ACCURACY 1e-10  /* largest scaled residual that counts as a steady state */
 #define SHORTEST 0x1p-16 /* of a path of values: a step that has to be shorter means that the path ends */
-#define SHARES 5        /* of a step at which the switches are looked at: its ends, its middle and, where one may open and close, its quarters */
+#define SHARES 5        /* of a step at which the switches are looked at: its ends, its middle, and its quarters where one may act in between */
 #define TINY 1e-3       /* the least that an unknown counts for, where it tells by what an equation's residual is measured */
 
 /* What tells the compiler that the turns of a loop do not depend on each other; the build of the library defines it. */

@@ -296,6 +296,15 @@ static void jump_rows(run *r, integer event, double speed, bool jumped)
     }
 }
 
+/* A switch beyond its mode that is as far from 0 as another one is, or NONE: the two sides of a sign pass together. */
+static integer beside(const run *r, integer event)
+{
+    for (integer k = 0; k < r->ns; k++)
+        if (k != event && over(r, k) > 0.0 && fabs(r->sv[k]) == fabs(r->sv[event]))
+            return k;
+    return NONE;
+}
+
 /* Change a switch and those that follow from it; where the new side leads back, slide on it. */
 static enum status cross(run *r, integer event)
 {
@@ -316,6 +325,8 @@ static enum status cross(run *r, integer event)
         if (r->sliding != NONE && !slides_on(r) && !end_slide(r))
             return INCONSISTENT;
         integer also = violation(r, r->y);
+        if (also < 0)
+            also = beside(r, event);
         if (also < 0 || also == event)
             break;
         r->m[also] = 1.0 - r->m[also];
