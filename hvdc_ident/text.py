@@ -102,6 +102,11 @@ def change_text(after: float | None, before: float | None) -> str:
     return "0.0 %" if abs(change) < 0.05 else f"{change:+.1f} %"
 
 
+def gap_text(share: float) -> str:
+    """Return a share of the gap in per cent: one digit wherever it is told, so that what is explained and what is left add up to 100 %."""
+    return percentage(share, 1)
+
+
 def probability_text(share: float) -> str:
     """Return a share of 1 in whole per cent; one that is nearly nothing, or nearly all, is said so."""
     return "< 1 %" if 0 < share < 0.005 else "> 99 %" if 0.995 <= share < 1.0 - 1e-9 else percentage(share)

@@ -19,7 +19,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.noise import SURE
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import figures, listed, percentage, quantity
+from hvdc_ident.text import figures, gap_text, listed, quantity
 
 
 def found_of(refit: Refit, placed: Placed, chosen_from: int) -> FoundEffect:
@@ -162,7 +162,7 @@ def off_given(last: Refit, given: Refit, adequate: bool, matters: bool) -> Findi
     noise = max(last.chi2, last.rows) if adequate else last.rows
     share = 1.0 - max(last.chi2 - noise, 0.0) / (before - noise)
     explains, louder = (
-        f"That explains {percentage(share, 1)} of the gap",
+        f"That explains {gap_text(share)} of the gap",
         f"{figures(np.sqrt(last.chi2 / last.rows), 3)} times",
     )
     if matters and not adequate:

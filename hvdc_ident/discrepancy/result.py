@@ -15,7 +15,7 @@ from hvdc_ident.errors import InputError, SteadyStateError
 from hvdc_ident.fit.adequacy import ResidualTests
 from hvdc_ident.fit.result import Estimate
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import interval_text, interval_words, percentage, value_by_place
+from hvdc_ident.text import gap_text, interval_text, interval_words, value_by_place
 
 if TYPE_CHECKING:
     from hvdc_ident.model import AnyModel
@@ -334,7 +334,7 @@ class Diagnosis(Coded, Shown):
         ]
         yield TextTable(("residual in noise units", "fitted data", "held out"), tuple(gaps))
         if self.gap.shrink_holdout is not None and self.effects:
-            yield f"The held-out gap shrinks by {percentage(self.gap.shrink_holdout, 1)}."
+            yield f"The held-out gap shrinks by {gap_text(self.gap.shrink_holdout)}."
         found = [
             (f.effect, f.probability, "; ".join(", ".join(p.at) for p in f.places[:4]), len(f.places))
             for f in self.findings

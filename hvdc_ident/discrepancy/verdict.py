@@ -28,7 +28,7 @@ from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.adequacy import MATTERS
-from hvdc_ident.text import figures, listed, percentage, value_by_place
+from hvdc_ident.text import figures, gap_text, listed, probability_text, value_by_place
 
 LEAST_EXPLAINED = 0.5
 """Share of the gap that what is named has to explain."""
@@ -70,7 +70,7 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
     remainder = remainder_of(search, first, last, noise_floor(last, left, tests, options.significance))
     labels = ", ".join(p.candidate.label for p in last.placed)
     if remainder.share > 1.0 - LEAST_EXPLAINED:
-        text = f"Something is missing; the best of the catalogue ({labels}) explains only {percentage(1 - remainder.share)} of the gap."
+        text = f"Something is missing; the best of the catalogue ({labels}) explains only {gap_text(1.0 - remainder.share)} of the gap."
         return Conclusion("unnameable", text, tests, remainder=remainder)
     sets = tuple(rivals(r, options, search.tries) for r in outcome.kept)
     sets, better = _with_formulas(search, outcome, sets)
@@ -188,23 +188,21 @@ def headline(
     rest = f"what remains is {figures(left.noise_units, 3)} times the noise"
     rest += ", within the stated tolerance" if tolerated else ""
     caveat = f" {judgement.caveat[:1].upper()}{judgement.caveat[1:]}." if judgement.caveat else ""
-    return (
-        f"{' '.join(f.text for f in findings)} {explains} {percentage(1.0 - left.share, 1)} of the gap; {rest}.{caveat}"
-    )
+    return f"{' '.join(f.text for f in findings)} {explains} {gap_text(1.0 - left.share)} of the gap; {rest}.{caveat}"
 
 
 def _remainder_text(remainder: Remainder, significance: float) -> str:
     """Return the remainder in words; empty where it may be noise, at this level."""
     parts = []
     if remainder.p <= significance and remainder.share > TOLERANCE:
-        left = percentage(remainder.share, 1)
+        left = gap_text(remainder.share)
         parts.append(
             f"{left} of the gap is left, which is no noise and which an unknown input at {remainder.at} would explain"
         )
     held = remainder.held_out or 0.0
     if held > TOLERANCE and remainder.held_out_p <= significance:
         record = f", most of it in '{remainder.record}' ({figures(remainder.record_units, 3)} times the noise)"
-        parts.append(f"{percentage(held, 1)} of the held-out gap is left{record if remainder.record else ''}")
+        parts.append(f"{gap_text(held)} of the held-out gap is left{record if remainder.record else ''}")
     return "; ".join(parts)
 
 
@@ -219,7 +217,7 @@ def _class_text(each: Sequence[EffectClass]) -> str:
         at = list(dict.fromkeys([c.best.at, *(r.at for r, _ in c.members)]))
         where = ", or at ".join(listed(places) for places in at[:LISTED])
         more = f", or at one of {len(at) - LISTED} more places" if len(at) > LISTED else ""
-        texts.append(f"{' or '.join(c.kinds)} ({percentage(c.probability)}) at {where}{more}")
+        texts.append(f"{' or '.join(c.kinds)} ({probability_text(c.probability)}) at {where}{more}")
     return "; or ".join(texts)
 
 

@@ -18,7 +18,7 @@ from hvdc_ident.study.stages import Stage, stages
 from hvdc_ident.summary import Results, RunSummary
 from hvdc_ident.summary.phrases import by_place, note_text, verdict_sentence
 from hvdc_ident.summary.run_summary import FindingSummary, Interval, ParameterSummary
-from hvdc_ident.text import change_text, estimate_texts, figures, interval_text, listed, percentage
+from hvdc_ident.text import change_text, estimate_texts, figures, interval_text, listed, probability_text
 
 T = TypeVar("T")
 SIDES = ("first", "second")
@@ -218,7 +218,7 @@ class RunComparison(Coded, Shown):
         lines = []
         for side, found in zip(SIDES, self.findings, strict=True):
             if found is not None:
-                said = [f"{f.effect} ({percentage(f.probability)}): {f.text}" for f in found]
+                said = [f"{f.effect} ({probability_text(f.probability)}): {f.text}" for f in found]
                 lines.append(f"missing, {side}: {' '.join(said) or 'nothing was found'}")
         kinds = [sorted(f.effect for f in found) for found in self.findings if found is not None]
         if len(kinds) == 2 and any(kinds):

@@ -23,7 +23,7 @@ from hvdc_ident.study.study import Study
 from hvdc_ident.summary.decisions import counting_of
 from hvdc_ident.summary.run_summary import Counting
 from hvdc_ident.summary.stage_results import NO_ESTIMATES, diagnosis_of, fit_of
-from hvdc_ident.text import figures, listed, percentage
+from hvdc_ident.text import figures, listed, probability_text
 
 SetName = Literal["given", "start", "fitted", "effect", "fit"]
 SETS: tuple[SetName, ...] = get_args(SetName)
@@ -190,7 +190,7 @@ class _Results:
         if self.counts.name != "effect":
             return f"the best that was found, and not certain: {self.counts.doubt}"
         places = [
-            listed(f"{', '.join(p.at)} ({percentage(p.probability)})" for p in f.places)
+            listed(f"{', '.join(p.at)} ({probability_text(p.probability)})" for p in f.places)
             for f in (self.diagnosis.findings if self.diagnosis is not None else ())
             if len(f.places) > 1
         ]

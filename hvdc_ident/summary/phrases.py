@@ -20,11 +20,11 @@ from hvdc_ident.summary.run_summary import (
 from hvdc_ident.text import (
     capital,
     figures,
+    gap_text,
     interval_text,
     interval_words,
     listed,
     one_of,
-    percentage,
     quantity,
     times_text,
     value_by_place,
@@ -256,11 +256,11 @@ def remainder_sentence(s: RunSummary) -> str:
     parts = []
     if r.share is not None:
         at = f"; an unknown input at {r.at} would explain it" if r.at else ""
-        parts.append(f"{percentage(r.share)} of the gap is left and is not noise{at}")
+        parts.append(f"{gap_text(r.share)} of the gap is left and is not noise{at}")
     if r.held_out is not None:
         times = f" ({times_text(r.record_times)} the noise)" if r.record_times else ""
         where = f", most of it in {r.record}{times}" if r.record else ""
-        parts.append(f"on held-out recordings {percentage(r.held_out)} is left{where}")
+        parts.append(f"on held-out recordings {gap_text(r.held_out)} is left{where}")
     told = ". ".join([*parts[:1], *map(capital, parts[1:])])
     return told or ("" if r.adequate else "what is left is still not noise")
 
@@ -274,7 +274,7 @@ def gained_sentence(s: RunSummary) -> str:
     rest = "" if times is None else f"; what is left there is {'' if times == '1 times' else f'{times} '}the noise"
     where = "experiments that no fit has seen" if r.against == "experiments" else r.against
     return (
-        f"Adding it shrinks the error on {where} by {percentage(r.shrink)}, measured against the same model with its "
+        f"Adding it shrinks the error on {where} by {gap_text(r.shrink)}, measured against the same model with its "
         f"parameters fitted and nothing added{rest}."
     )
 

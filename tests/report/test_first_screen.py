@@ -141,7 +141,7 @@ def test_the_answers_of_the_demo(like_the_demo: Path) -> None:
     assert "Without it a fit would put KIVDC at 846.1 pu/s (+15.2 %)" in tile(screen, "values")
     assert tile(screen, "missing").startswith("What does the model lack? Lag , 97 % likely. Each of P1 and Q1")
     assert "P1, Q1 (60 %); P1_m (40 %)" in tile(screen, "missing")
-    assert "Not all of it: 19 % of the gap is left and is not noise" in tile(screen, "missing")
+    assert "Not all of it: 19.0 % of the gap is left and is not noise" in tile(screen, "missing")
     assert "Record P1_m as well" in tile(screen, "next")
 
 

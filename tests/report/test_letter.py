@@ -104,7 +104,7 @@ def test_every_sentence_of_an_ambiguous_case(tmp_path: Path) -> None:
         "Your value of KIP lies within its 95 % interval. A fit without the effect moves KIP "
         "by +5.0 % to make up for it; with the effect the same fit moves it by +0.3 %."
     )
-    assert "75 %" in gained and "1.1 times the noise" in gained
+    assert "75.0 %" in gained and "1.1 times the noise" in gained
     assert letter.following == "To tell them apart: record P2 at 1 kHz."
     assert letter.attached == ("augmented-model.toml",)
 

@@ -17,7 +17,7 @@ from hvdc_ident.summary import Results, RunSummary
 from hvdc_ident.summary.phrases import by_place, gained_sentence
 from hvdc_ident.summary.stage_results import SizeCurves
 from hvdc_ident.summary.tables import findings_table
-from hvdc_ident.text import capital, estimate_text, listed, percentage, quantity, span, with_unit
+from hvdc_ident.text import capital, estimate_text, gap_text, listed, percentage, quantity, span, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -163,7 +163,7 @@ def _where(s: RunSummary, found: Diagnosis) -> str:
             f"It is densest where {text(region['signal'])} lies between {span(region['from'], region['to'], '', 3)}."
         )
     if s.remainder.explained is not None:
-        parts.append(f"{percentage(s.remainder.explained, 1)} of the gap is explained.")
+        parts.append(f"{gap_text(s.remainder.explained)} of the gap is explained.")
     return f"<p>{' '.join(parts)}</p>" if parts else ""
 
 
