@@ -82,8 +82,8 @@ const label = (u, k, ctx) => {
     const y = u.data[k][n];
     if (y == null || y < 0) return;  // the other of a pair says the same
     const words = named(x, y), wide = ctx.measureText(words).width, a = u.valToPos(x, "x", true), b = u.valToPos(y, "y", true);
-    const lefts = [a + apart, a - apart - wide, a - wide / 2], feet = [b, b - apart, b + apart + tall, b - apart - tall, b + apart + 2 * tall];
-    const box = feet.flatMap((foot) => lefts.map((left) => [left, foot - tall, left + wide, foot])).find(free);
+    const sides = [[a + apart, b], [a - apart - wide, b], [a - wide / 2, b - apart], [a - wide / 2, b + apart + tall]];
+    const box = sides.map(([left, foot]) => [left, foot - tall, left + wide, foot]).find(free);
     if (!box) return;
     taken.push(box);
     ctx.fillText(words, box[0], box[3] - 3 * px);
