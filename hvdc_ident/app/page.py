@@ -15,7 +15,6 @@ from hvdc_ident.app.results import FoundResults
 from hvdc_ident.app.runs import StudyRun
 from hvdc_ident.report.first_screen import tiles
 from hvdc_ident.report.html import text
-from hvdc_ident.summary.phrases import values_line
 
 HEIGHT_OF_HEAD = """<script>
 new MutationObserver((_, seen) => {
@@ -122,9 +121,9 @@ class Page:
             self._answers.content = ""
             return
         every = tiles(s, "page")
-        short = {t.name: t.answer for t in every} | {"values": text(values_line(s)) or every[1].answer}
         brief = "".join(
-            f"<div class='brief' data-tile='{t.name}'><h2>{t.title}</h2><p>{short[t.name]}</p></div>" for t in every
+            f"<div class='brief' data-tile='{t.name}'><h2>{t.title}</h2><p>{t.brief or t.answer}</p></div>"
+            for t in every
         )
         verdict, values, missing, step = (t.html for t in every)
         whole = f"<div class='first'>{verdict}{values}{missing}{step}</div>"

@@ -135,7 +135,7 @@ export default {
           scales: { x: { time: false, distr: this.log ? 3 : 1, ...this.ends() }, y: { range: this.plane ? around : spread } },
           axes: [{ ...axis(g === last ? this.xtitle : "", 2), size: g === last ? 34 : 8, values: g < last ? () => [] : this.log ? decades : digits }, { ...axis(grid.title, 3), values: digits }],
           cursor: { sync: { key: this.sync.key }, drag: { x: true, y: this.plane } },
-          legend: { show: true, live: !this.plane, markers: { dash: (u, k) => (k && grid.curves[k - 1].mark ? "dotted" : u.series[k].dash ? "dashed" : "solid") } }, focus: { alpha: 1 },
+          legend: { show: true, live: !this.plane, markers: { dash: (u, k) => (k && !this.plane && grid.curves[k - 1].mark ? "dotted" : u.series[k].dash ? "dashed" : "solid") } }, focus: { alpha: 1 },
           hooks: this.plane ? { drawAxes: [upright] } : this.markers?.length ? this.marking(g) : {},
         };
         const empty = [[], ...grid.curves.map(() => [])];

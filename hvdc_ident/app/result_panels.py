@@ -133,7 +133,8 @@ def _overlay(results: Results, experiment: str, place: Any, *, errors: bool) -> 
     place.clear()
     with place:
         sets = tuple(n for n in SETS if any(n in o.runs for o in overlays))
-        curves = [Trace("recorded", RECORDED), *(Trace(WORDS[n], SETS[n][0], dashed=SETS[n][1]) for n in sets)]
+        recorded = [] if errors else [Trace("recorded", RECORDED)]
+        curves = [*recorded, *(Trace(WORDS[n], SETS[n][0], dashed=SETS[n][1]) for n in sets)]
         grids = [Grid(o.title, tuple(curves)) for o in overlays]
         plot = Plot(grids, "time, s", TALL * len(grids) + 30, f"Waveforms of {experiment}").classes("w-full")
         for k, overlay in enumerate(overlays):
@@ -143,11 +144,11 @@ def _overlay(results: Results, experiment: str, place: Any, *, errors: bool) -> 
 def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = False) -> list[Array]:
     """Return the columns of an output's picture, (n,) each: time, recorded, and the runs by set of values; nan where one is not.
 
-    errors: recorded less simulated in place of the runs, and none in place of the recorded signal.
+    errors: recorded less simulated in place of the runs, and nothing of the recorded signal.
     """
     record = overlay.record
     missing = np.full(record.time.size, np.nan)
-    columns = [record.time, missing if errors else record[f"{overlay.output}.measured"]]
+    columns = [record.time, *([] if errors else [record[f"{overlay.output}.measured"]])]
     for name in sets:
         run = overlay.runs.get(name)
         if run is None or run.time.size != record.time.size:

@@ -23,10 +23,11 @@ from hvdc_ident.summary.phrases import (
     place_texts,
     remainder_sentence,
     size_text,
+    values_line,
     verdict_sentence,
     which_values,
 )
-from hvdc_ident.summary.run_summary import ParameterSummary, Quantity
+from hvdc_ident.summary.run_summary import FindingSummary, ParameterSummary, Quantity
 from hvdc_ident.summary.tables import PLACES, sets_table
 from hvdc_ident.text import capital, change_text, percentage, probability_text
 
@@ -36,12 +37,13 @@ ROWS = 9
 
 @dataclass(frozen=True)
 class Tile:
-    """One answer. answer: its sentence; more: what stands below it, both HTML."""
+    """One answer. answer: its sentence; more: what stands below it; brief: the answer where there is room for a line or two; all HTML."""
 
     name: str
     title: str
     answer: str
     more: str = ""
+    brief: str = ""
 
     @property
     def html(self) -> str:
@@ -53,8 +55,8 @@ def tiles(s: RunSummary, door: Door = "shell") -> tuple[Tile, Tile, Tile, Tile]:
     """Return verdict, values, what is missing and what to do next. door: where they are read."""
     return (
         Tile("verdict", "Does the model follow the recordings?", *_verdict(s)),
-        Tile("values", "The values", *_values(s, door)),
-        Tile("missing", "What does the model lack?", *_missing(s, door)),
+        Tile("values", "The values", *_values(s, door), brief=text(values_line(s))),
+        Tile("missing", "What does the model lack?", *_missing(s, door), brief="; ".join(map(_found, s.findings))),
         Tile("next", "What to record next", _next(s, door)),
     )
 
@@ -193,9 +195,7 @@ def _missing(s: RunSummary, door: Door) -> tuple[str, str]:
         return f"<strong>{text(_verdict_word(s.diagnosis))}.</strong> {prose(s.said.rstrip('.'))}.", ""
     parts: list[str] = []
     for f in s.findings:
-        name = finding_name(f)
-        sure = f", <strong>{text(probability_text(f.probability))}</strong> likely" if f.effect != "parameter" else ""
-        told = f"<strong>{text(name[:1].upper() + name[1:])}</strong>{sure}. {text(f.text)}."
+        told = f"{_found(f)}. {text(f.text)}."
         parts.append(f"<p class='answer'>{told}</p>" if parts else told)
         places = place_texts(f)
         if len(places) > 1:
@@ -207,6 +207,13 @@ def _missing(s: RunSummary, door: Door) -> tuple[str, str]:
     elif s.remainder.doubt:
         parts.append(f"<p><strong>In doubt:</strong> {text(s.remainder.doubt)}.</p>")
     return parts[0], "".join(parts[1:])
+
+
+def _found(f: FindingSummary) -> str:
+    """Return what was found, with its probability."""
+    name = finding_name(f)
+    sure = f", <strong>{text(probability_text(f.probability))}</strong> likely" if f.effect != "parameter" else ""
+    return f"<strong>{text(name[:1].upper() + name[1:])}</strong>{sure}"
 
 
 def _verdict_word(verdict: str) -> str:

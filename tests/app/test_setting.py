@@ -100,6 +100,34 @@ def test_poles_far_from_the_slowest_are_left_out_of_the_picture() -> None:
     assert near(np.empty(0, complex)).size == 0
 
 
+def test_a_swing_is_shown_beside_slow_poles_and_an_integrators_rounding() -> None:
+    swing = [-1.0 + 14.0j, -1.0 - 14.0j]
+    poles = np.array([3e-15, -0.1, *swing, -12.0, -9.0 + 6.0j, -9.0 - 6.0j, -40.0, -2.0 + 90.0j, -2.0 - 90.0j])
+    assert near(poles).tolist() == [3e-15, -0.1, *swing, -12.0, -9.0 + 6.0j, -9.0 - 6.0j]
+
+
+def test_the_response_is_of_what_the_experiment_moves_and_records() -> None:
+    t = np.linspace(0.0, 1.0, 11)
+    moved = {"Vdcref1": 1.0, "Pref2": hi.step(0.5, 0.6, at=0.3)}
+    record = hi.Experiment(t, "test", inputs=moved, outputs={"P2": np.zeros(11)}, values={"Qref1": 0.1})
+    setting = Setting.of(LINK, record)
+    assert setting.channel == ("Pref2", "P2") and setting.outputs == ("P2",) and setting.end == 1.0
+    levels = {"Vdcref1": 1.0, "Pref2": 0.5, "Qref1": 0.1}
+    expected = hi.find_operating_point(LINK, levels)
+    assert setting.point().outputs["Q1"] == pytest.approx(expected.outputs["Q1"], abs=1e-9)
+    point = hi.find_operating_point(LINK, levels, values={"KIP": 60.0})
+    changed = hi.bode(hi.linearize(LINK, point, values={"KIP": 60.0}, inputs="Pref2", outputs="P2"), np.array([30.0])).values
+    faster = setting.with_value("KIP", 60.0)
+    np.testing.assert_allclose(faster.response(faster.point(), np.array([30.0])).values, changed, rtol=1e-9)
+    assert abs(changed - setting.response(setting.point(), np.array([30.0])).values).max() > 0.01
+    assert setting.response_text == "From Pref2 to P2, at the start of test; 0 dB is 1 pu/pu."
+
+
+def test_sizes_of_effects_are_called_by_what_they_are_of() -> None:
+    setting = with_effects(Setting.of(LINK), [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.002}}])
+    assert dict(setting.titles) == {n: "T of the lag at Ir1 and Ir2" for n in set(setting.model.parameters) - set(LINK.parameters)}
+
+
 def test_a_card_a_study_and_a_shipped_model_are_opened(tmp_path: Path) -> None:
     card = tmp_path / "motor.toml"
     card.write_text(

@@ -230,6 +230,7 @@ class Explorer:
 
     def _choose_kind(self, kind: str) -> None:
         self._kind = kind or SIGNALS
+        self._build_waves()
         self._draw_waves()
 
     def _choose_end(self, event: Any) -> None:
@@ -438,10 +439,15 @@ class Explorer:
             ui.notify(NOTHING_CHANGED, type="info", multi_line=True)
         return True
 
+    @property
+    def _draws_recorded(self) -> bool:
+        """True where the recorded signal is drawn, below the others."""
+        return self._setting.record is not None and self._kind == SIGNALS
+
     def _build_waves(self) -> None:
         self._waves.clear()
         units = {n: self._setting.model.outputs[n].unit for n in self._setting.outputs}
-        recorded = [Trace("recorded", RECORDED)] if self._setting.record else []
+        recorded = [Trace("recorded", RECORDED)] if self._draws_recorded else []
         curves = (
             *recorded,
             Trace("given", GIVEN, dashed=True),
@@ -501,7 +507,7 @@ class Explorer:
             ran = answer.run is not None and setting.outputs == self._setting.outputs
             for k, name in enumerate(setting.outputs if ran else ()):
                 self._wave.put(
-                    k, 3 if setting.record else 2, thinned(setting.time, self._drawn(setting, answer, name))[1]
+                    k, 3 if self._draws_recorded else 2, thinned(setting.time, self._drawn(setting, answer, name))[1]
                 )
             for k, column in enumerate(() if answer.bode is None else _gain_and_phase(answer.bode)):
                 self._bode.put(k, 2, column)
@@ -530,9 +536,8 @@ class Explorer:
             return  # the answer to what is looked at now is on its way
         for k, name in enumerate(setting.outputs):
             columns = [self._drawn(setting, given, name), self._drawn(setting, now, name)]
-            if setting.record:
-                recorded = setting.recorded(name)
-                columns.insert(0, np.full(recorded.size, np.nan) if self._kind == ERRORS else recorded)
+            if self._draws_recorded:
+                columns.insert(0, setting.recorded(name))
             self._wave.whole(k, thinned(setting.time, *columns))
 
     def _draw_bode(self) -> None:

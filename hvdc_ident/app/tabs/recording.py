@@ -146,7 +146,7 @@ class Mapper:
         self._experiment = ui.select(
             [], label="experiment", on_change=lambda e: self._choose(e.value, self._open_experiment)
         )
-        self._files = ui.select([], label="recordings in the study's folder", with_input=True)
+        self._files = ui.select([], label="in the study's folder", with_input=True)
         self._files.on_value_change(lambda e: self._choose(e.value, self._open_file))
         self._upload = ui.upload(
             multiple=True,
