@@ -125,7 +125,7 @@ def test_the_response_is_of_what_the_experiment_moves_and_records() -> None:
 
 def test_sizes_of_effects_are_called_by_what_they_are_of() -> None:
     setting = with_effects(Setting.of(LINK), [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.002}}])
-    assert dict(setting.titles) == {n: "T of the lag at Ir1 and Ir2" for n in set(setting.model.parameters) - set(LINK.parameters)}
+    assert dict(setting.titles) == dict.fromkeys(set(setting.model.parameters) - set(LINK.parameters), "T of the lag at Ir1 and Ir2")
 
 
 def test_a_card_a_study_and_a_shipped_model_are_opened(tmp_path: Path) -> None:

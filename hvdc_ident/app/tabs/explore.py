@@ -260,11 +260,13 @@ class Explorer:
         names = {"": "given values", **{n: n for n in self._starts}}
         self._start.set_options(names, value=self._setting.start if self._setting.start in names else "")
         self._start.visible = len(names) > 1
-        asked, self._awaits_fit = self._awaits_fit, False
-        untouched = self._setting is self._began and found.is_of_the_study("fit")
-        if found.fitted is not None and (asked or untouched):
+        waited = self._awaits_fit or self._setting is self._began  # what somebody has set by hand since is left alone
+        if found.fitted is None or not found.is_of_the_study("fit") or not waited:
+            return
+        again = found.fitted.name == self._setting.start and found.fitted.model.values == self._setting.base.values
+        if self._awaits_fit or not again:
             self._begin_with(found.fitted)
-            self._began = self._setting
+        self._began, self._awaits_fit = self._setting, False
 
     def _open(self, name: str) -> None:
         """Open the tab with a model that the results come to."""
