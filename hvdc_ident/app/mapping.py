@@ -29,15 +29,15 @@ from hvdc_ident.summary.levels import NoiseNote
 
 WRITTEN = ("name", "data", "role", "inputs", "outputs", "columns", "event", "window")
 """Keys of an experiment that a mapping states; all others are kept."""
-CONVERSION = ("unit", "base", "scale", "offset")
+CONVERSION = ("unit", "base", "scale", "offset", "turn")
 
 
 @dataclass(frozen=True)
 class SignalLine:
     """A signal of the model and the column that holds it.
 
-    model = scale x recorded + offset, or recorded / base + offset; what is None is left to the file's unit. why: the column
-    was proposed for it, in words.
+    model = scale x recorded + offset, or recorded / base + offset; what is None is left to the file's unit. turn: Hz, taken out of an
+    angle. why: the column was proposed for it, in words.
     """
 
     signal: str
@@ -47,11 +47,12 @@ class SignalLine:
     base: float | None = None
     scale: float | None = None
     offset: float | None = None
+    turn: float | None = None
     why: str = ""
 
     @property
     def conversion(self) -> dict[str, Any]:
-        """Unit, base, scale and offset that are stated, by key."""
+        """Unit, base, scale, offset and turn that are stated, by key."""
         return {k: v for k in CONVERSION if (v := getattr(self, k)) is not None}
 
 
@@ -169,10 +170,16 @@ class Draft:
 
 def proposed(record: Trajectory, model: AnyModel, name: str, data: str) -> tuple[RecordingMap, Matching]:
     """Return the mapping that `new` proposes too, with what three phases give, and the matching behind it, with candidates for the rest."""
-    found, _, phases = proposal(record, model, name)
-    lines = [SignalLine(m.target.name, m.target.kind, m.column.name, why=m.reason) for m in found.mapped]
-    stated = [line.model_dump(exclude_none=True, exclude_defaults=True) for line in phases]
-    return RecordingMap(name, data, _ordered(lines), kept=FrozenMap({"phases": stated} if stated else {})), found
+    found = proposal(record, model, name)
+    lines = [
+        SignalLine(m.target.name, m.target.kind, m.column.name, why=m.reason, **m.line.keys)
+        for m in found.columns.mapped
+    ]
+    stated = [line.model_dump(exclude_none=True, exclude_defaults=True) for line in found.phases]
+    kept = {"phases": stated, "values": dict(found.values)}
+    return RecordingMap(
+        name, data, _ordered(lines), kept=FrozenMap({k: v for k, v in kept.items() if v})
+    ), found.columns
 
 
 def columns_with_derived(mapping: RecordingMap, record: Trajectory, where: str) -> Trajectory:

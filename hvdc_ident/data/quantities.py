@@ -73,9 +73,9 @@ _PHASES = {
 }
 _QUALIFIERS = _words_of(
     "ref reference order setpoint set sp soll sollwert consigne cmd command limit lim max min maximum minimum err error fehler std sigma "
-    "vdc udc idc thd status stat flag flags quality valid dc field fd mech mechanical rotor neutral delta angl angle_diff spread factor pf cosphi "
-    "cos harmonic h3 h5 h7 target forecast demand rating rated nominal nom base bias integral sqrt count rate_limit real imag im re "
-    "internal efd ifd oel uel avg_err"
+    "vdc udc idc dc thd status stat flag flags quality valid field fd mech mechanical rotor neutral delta angl spread factor pf cosphi cos "
+    "harmonic h3 h5 h7 target forecast demand rating rated nominal nom base bias integral sqrt count real imag im re internal efd ifd oel "
+    "uel"
 )
 """Words from which a column is not the measured quantity itself, or a part of it that is not its magnitude or angle."""
 _DEVIATIONS = _words_of("dev deviation abweichung ecart desviacion")

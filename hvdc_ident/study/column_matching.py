@@ -1,8 +1,10 @@
 """Which column of a recording is which signal of a model: by name, else by unit and level before the event.
 
-A name matches exactly, or but for case and punctuation. What is left is compared by unit and level, and only where a signal
-and a column are each other's only candidates is one mapped for that reason, which is told: many signals of a per-unit model
-rest at 1 or at 0, so a level alone is no evidence, and a wrong column gives a wrong fit without a word. All else is proposed.
+A name matches exactly, or but for case and punctuation, or where both names say one quantity (`data.quantities`), each the only one:
+`EASTFIELD12 V1 Mag` is V. A column is never taken for a signal of another quantity. What is left is compared by unit and level, and
+only where a signal and a column are each other's only candidates is one mapped for that reason, which is told: many signals of a
+per-unit model rest at 1 or at 0, so a level alone is no evidence, and a wrong column gives a wrong fit without a word. All else is
+proposed.
 A column whose unit can be converted only with a rated base is proposed with the base that the levels suggest, and not mapped.
 """
 
@@ -11,19 +13,23 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from hvdc_ident.data import FEWEST_QUIET, Array, Trajectory, before_event, conversion, noise_estimate
+from hvdc_ident.data.quantities import Quantity, Reading, compatible, read_columns
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.parameters import Parameter
+from hvdc_ident.plants import LEVELS
 from hvdc_ident.study.conversions import Evidence, scale_between, suggest_conversion
 from hvdc_ident.text import quantity
 
 Kind = Literal["input", "output"]
+AT_TERMINALS: tuple[Quantity, ...] = ("voltage", "angle", "frequency", "active power", "reactive power")
+"""Quantities that a name alone tells."""
 SHOWN = 3
 """Signals that are proposed for one column, those of the nearest level."""
 NEAR = math.sqrt(2.0)
@@ -41,13 +47,18 @@ class Target:
     unit: str
     level: float | None
 
+    @property
+    def reading(self) -> Reading:
+        """The signal as its name and unit say it."""
+        return read_columns((self.name,), (self.unit,))[0]
+
 
 @dataclass(frozen=True)
 class Column:
     """A column of a recording: its unit, its level before the event and the noise about it, in that unit.
 
     gaps: rows in which it is not recorded. quiet: whether the level is a mean of rows before an event, not the first row. counted: in
-    which of several ways it is counted, as a peak or rms, in words; "" where there is only one.
+    which of several ways it is counted, as a peak or rms, in words; "" where there is only one. reading: as its name and unit say it.
     """
 
     name: str
@@ -57,6 +68,7 @@ class Column:
     gaps: int
     quiet: bool = True
     counted: str = ""
+    reading: Reading = field(default_factory=Reading)
 
     @property
     def stem(self) -> str:
@@ -74,13 +86,43 @@ class Column:
 
 
 @dataclass(frozen=True)
+class ColumnLine:
+    """How the values of a column become the model's: keys of a line of the study's `columns`, None for what is not stated."""
+
+    unit: str | None = None
+    base: float | None = None
+    scale: float | None = None
+    offset: float | None = None
+    turn: float | None = None
+
+    @property
+    def keys(self) -> dict[str, Any]:
+        """What is stated, by key."""
+        return {k: v for k, v in vars(self).items() if v is not None}
+
+
+@dataclass(frozen=True)
 class Match:
-    """A column that is taken for a signal, or may be: the reason in words. base: rated base to be stated, in the column's unit."""
+    """A column that is taken for a signal, or may be: the reason in words. base: rated base to be stated, in the column's unit.
+
+    line: what gives the model's unit, beside what the file states.
+    """
 
     target: Target
     column: Column
     reason: str
     base: float | None = None
+    line: ColumnLine = field(default_factory=ColumnLine)
+
+    @property
+    def by(self) -> tuple[float, float] | None:
+        """Scale and offset to the model's unit; None where a base is needed and none is stated."""
+        line, offset = self.line, self.line.offset or 0.0
+        if line.scale is not None or line.base is not None:
+            return line.scale if line.scale is not None else 1.0 / (line.base or 1.0), offset
+        column = replace(self.column, unit=line.unit or self.column.unit)
+        by = column.converted(self.target.unit)
+        return None if by is None else (by[0], by[1] + offset)
 
 
 @dataclass(frozen=True)
@@ -96,16 +138,15 @@ class Matching:
     missing: tuple[Target, ...]
 
 
-def columns_of(
-    record: Trajectory, event: float | None, counted: Mapping[str, str] = FrozenMap()
-) -> tuple[Column, ...]:
+def columns_of(record: Trajectory, event: float | None, counted: Mapping[str, str] = FrozenMap()) -> tuple[Column, ...]:
     """Return the columns of a recording that hold numbers. event: s; without one the first row tells the level. counted: by name."""
     found = []
-    for name, unit in zip(record.names, record.units, strict=True):
+    readings = read_columns(record.names, record.units)
+    for name, unit, reading in zip(record.names, record.units, readings, strict=True):
         values = record[name]
         if not np.isnan(values).all():
             level, noise, quiet = _rest(record.time, values, event)
-            found.append(Column(name, unit, level, noise, record.gaps(name), quiet, counted.get(name, "")))
+            found.append(Column(name, unit, level, noise, record.gaps(name), quiet, counted.get(name, ""), reading))
     return tuple(found)
 
 
@@ -115,8 +156,9 @@ def targets_of(model: AnyModel, levels: Mapping[str, float]) -> tuple[Target, ..
     return (*inputs, *(Target(n, "output", o.unit, levels.get(n)) for n, o in model.outputs.items()))
 
 
-def match_names(columns: Sequence[Column], targets: Sequence[Target]) -> dict[str, Match]:
-    """Return by signal the column of its name, exactly, else but for case and punctuation where only one has it.
+def match_names(columns: Sequence[Column], targets: Sequence[Target], place: str = "") -> dict[str, Match]:
+    """Return by signal the column of its name, exactly, else but for case and punctuation where only one has it, else the only one whose
+    name says the same quantity. place: where the signals are, which tells columns of several places apart.
 
     Where the units need a base, or an input has gaps, there is a match too: `usable` tells.
     """
@@ -131,17 +173,29 @@ def match_names(columns: Sequence[Column], targets: Sequence[Target]) -> dict[st
         others = [t for t in targets if t.name not in found and _bare(t.name) == _bare(target.name)]
         if len(alike) == 1 and len(others) == 1:
             found[target.name] = Match(target, alike[0], "the same name but for case and punctuation")
+    for target in (t for t in targets if t.name not in found and t.name not in LEVELS):
+        said = target.reading.measured if not target.reading.place else ""
+        taken = {m.column.name for m in found.values()}
+        alike = [c for c in columns if c.reading.measured == said and not c.counted]
+        here = [c for c in alike if _bare(place) and _bare(place) in _bare(c.name)]
+        alike = here if len(here) == 1 else alike
+        if said in AT_TERMINALS and len(alike) == 1 and alike[0].name not in taken:
+            found[target.name] = Match(target, alike[0], f"its name says {_article(said)}")
     return found
 
 
 def matching(
-    columns: Sequence[Column], targets: Sequence[Target], parameters: Mapping[str, Parameter] = FrozenMap()
+    columns: Sequence[Column],
+    targets: Sequence[Target],
+    parameters: Mapping[str, Parameter] = FrozenMap(),
+    named: Mapping[str, Match] | None = None,
 ) -> Matching:
     """Return the columns by signal. The targets' levels are those of the model at the inputs that names map.
 
-    parameters: of the model, among which rated bases are.
+    parameters: of the model, among which rated bases are. named: by names, as far as that is decided already.
     """
-    named = {n: m for n, m in match_names(columns, targets).items() if not is_ambiguous(m)}
+    by_names = match_names(columns, targets) if named is None else named
+    named = {n: m for n, m in by_names.items() if not is_ambiguous(m)}
     mapped = [_questioned(m) for m in named.values() if usable(m)]
     proposed = [_with_base(m, parameters) for m in named.values() if not usable(m)]
     taken = {m.column.name for m in named.values()}
@@ -150,7 +204,8 @@ def matching(
     wanted = [m.target.name for matches in pairs.values() for m in matches]
     for matches in pairs.values():
         only = len(matches) == 1 and not matches[0].column.counted and wanted.count(matches[0].target.name) == 1
-        if only and matches[0].column.unit and matches[0].target.unit and _is_near(matches[0]):
+        sure = only and not (matches[0].target.reading.measured and not matches[0].column.reading.measured)
+        if sure and matches[0].column.unit and matches[0].target.unit and _is_near(matches[0]):
             mapped.append(matches[0])
         else:
             proposed += [_questioned(m) for m in sorted(matches, key=_far)[:SHOWN]]
@@ -166,13 +221,16 @@ def matching(
 
 def usable(match: Match) -> bool:
     """Return whether a column can be used as it is: its unit converts to the signal's, and an input has no gaps."""
-    converts = match.column.converted(match.target.unit) is not None
-    return converts and not (match.target.kind == "input" and match.column.gaps)
+    return match.by is not None and not (match.target.kind == "input" and match.column.gaps)
 
 
 def is_ambiguous(match: Match) -> bool:
     """Return whether a name says nothing: of a column that is counted in one of several ways, in a unit that converts."""
     return bool(match.column.counted) and match.column.converted(match.target.unit) is not None
+
+
+def _article(said: str) -> str:
+    return f"an {said}" if said[0] in "aeiou" else f"a {said}"
 
 
 def _bare(name: str) -> str:
@@ -191,7 +249,9 @@ def _rest(time: Array, values: Array, event: float | None) -> tuple[float | None
 def _candidate(target: Target, column: Column) -> Match | None:
     """A column that may be a signal: of a unit that converts to the signal's, or of no stated unit and at the signal's level."""
     by = column.converted(target.unit)
-    if by is None or (target.kind == "input" and column.gaps):
+    if by is None or (target.kind == "input" and column.gaps) or target.name in LEVELS:
+        return None
+    if not compatible(target.reading.quantity, column.reading.quantity):
         return None
     stated = bool(column.unit and target.unit)
     reason = f"its unit {column.unit}" if stated else "its level, for no unit is stated"
@@ -206,7 +266,7 @@ def _candidate(target: Target, column: Column) -> Match | None:
 
 def _evidence(match: Match) -> Evidence | None:
     """Return the recorded level against the model's, in the model's unit; None where one is not known."""
-    by = match.column.converted(match.target.unit)
+    by = match.by
     if by is None or match.column.level is None or match.target.level is None:
         return None
     return Evidence(by[0] * match.column.level + by[1], (match.target.level,), abs(by[0]) * match.column.noise)

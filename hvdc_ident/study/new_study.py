@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import Array, Experiment, Trajectory, event_time, input_signal, scaled
+from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory, event_time, input_signal, scaled
 from hvdc_ident.data.three_phase import PHASE_QUANTITIES
 from hvdc_ident.display import Shown
 from hvdc_ident.errors import ComputationError, InputError, in_python, located
@@ -37,7 +37,8 @@ from hvdc_ident.study.column_matching import (
 )
 from hvdc_ident.study.json_schema import SCHEMA_LINE, write_schemas
 from hvdc_ident.study.phase_columns import of_use, phases_text, proposed_phases, ways_to_count, without_phases
-from hvdc_ident.study.recordings import Recordings, read_experiments, smoothed, with_derived
+from hvdc_ident.study.recordings import Recordings, level_before, read_experiments, smoothed, with_derived
+from hvdc_ident.study.terminal_columns import Settled, Terminals, settled, terminals_of
 from hvdc_ident.summary.levels import NoiseNote
 from hvdc_ident.text import listed, quantity
 
@@ -74,7 +75,8 @@ class Mapped:
     """One recording of a new study: its experiment's name, its file, its columns, and what was found in it as `check` finds it.
 
     levels: why the model's levels are not known; empty where they are. experiment: None where no output is mapped. phases: what
-    columns made of three phases are made of.
+    columns made of three phases are made of. values: inputs constant at other than the model's value. notes: what was decided between
+    columns.
     """
 
     name: str
@@ -85,6 +87,19 @@ class Mapped:
     experiment: Experiment | None
     noise: Mapping[str, NoiseNote]
     phases: tuple[schema.PhasesTable, ...] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """What a recording may be of a model. levels: why the model's are not known, "" where they are. Others as those of `Mapped`."""
+
+    columns: Matching
+    levels: str = ""
+    phases: tuple[schema.PhasesTable, ...] = ()
+    values: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -146,14 +161,16 @@ def new_study(
     trust: bool = False,
     limits: Mapping[str, float] | None = None,
     dyr: DyrOfStudy | None = None,
+    terminals: Terminals | None = None,
 ) -> NewStudy:
     """Write a study of recordings and a model into a folder, and return what was mapped and what was not.
 
     recordings: files of any known waveform format, one experiment each. model: a shipped name, or the path of a card, an
     FMU or a Python file (trust: it may run). limits: of an FMU. dyr: where a unit of a .dyr
-    file is from. The study refers to the files where they are.
+    file is from; terminals: what its files state of them. The study refers to the files where they are.
 
-    Columns are mapped to inputs and outputs by name, exactly or but for case and punctuation; units are converted. Where a
+    Columns are mapped to inputs and outputs by name, exactly or but for case and punctuation, or as recorders name the quantity; units
+    are converted. Where a
     signal and a column are each other's only candidates by unit, and the levels before the event agree, they are mapped too.
     Everything else is a comment in the study with its candidates. Raises InputError where the folder holds a study, or a file or
     the model cannot be used.
@@ -177,58 +194,83 @@ def new_study(
     with located("model"):
         plant = load_model(model, trust=trust, limits=dict(limits) if limits else None)
     names = _names(files)
-    mapped = tuple(_mapped(path.parent, file, name, plant) for file, name in zip(files, names, strict=True))
+    about = terminals or terminals_of(plant)
+    mapped = tuple(_mapped(path.parent, file, name, plant, about) for file, name in zip(files, names, strict=True))
     source = str(model) if is_shipped(str(model)) else _relative(Path(model), path.parent)
     write_schemas(path.parent)
     write_text(path, "\n".join(_study_text(path, source, plant, mapped, dyr)) + "\n")
     return NewStudy(path, plant, mapped, dyr)
 
 
-def matched(record: Trajectory, model: AnyModel, phases: Sequence[schema.PhasesTable] = ()) -> tuple[Matching, str]:
-    """Return the columns of a recording by signal of a model, and why the model's levels are not known ("" where they are).
+def proposal(record: Trajectory, model: AnyModel, name: str, about: Terminals | None = None) -> Proposal:
+    """Return what a recording may be of a model: the columns by signal, those among them that are made of three phases, and of which.
 
-    Levels are those before the event that inputs of the signals' names show. phases: what columns are made of.
+    name: of the experiment. about: what files state of the plant's terminals, where the model is played back; left out, its card.
     """
+    phases = proposed_phases(record)
+    made = without_phases(with_derived(phases, (), record, name), phases)
+    found = _matched(made, model, phases, about or terminals_of(model))
+    phases = of_use(phases, [m.column.name for m in (*found.columns.mapped, *found.columns.proposed)])
+    unused = tuple(c for c in found.columns.unused if c in record)
+    return replace(found, columns=replace(found.columns, unused=unused), phases=phases)
+
+
+def _matched(
+    record: Trajectory, model: AnyModel, phases: Sequence[schema.PhasesTable], about: Terminals | None
+) -> Proposal:
+    """Return the columns of a recording by signal of a model. Levels are those before the event that mapped inputs show."""
     ways = ways_to_count(phases)
-    named = match_names(columns_of(record, None, ways), targets_of(model, {}))
+    targets = targets_of(model, {})
+    named = match_names(columns_of(record, None, ways), targets, about.bus if about else "")
     moved = [m for m in named.values() if m.target.kind == "input" and not m.column.gaps]  # in whatever unit
     signals = {m.column.name: input_signal(*_values(record, m)) for m in moved}
     event = event_time(signals, smoothed(phases))
-    inputs = [m for m in moved if usable(m) and not is_ambiguous(m)]
-    levels, why = _levels(model, {m.target.name: float(_values(record, m)[1][0]) for m in inputs})
-    return matching(columns_of(record, event, ways), targets_of(model, levels), model.parameters), why
+    columns = columns_of(record, event, ways)
+    if about is not None:
+        at_rest = {c.name: c for c in columns}
+        named = {n: replace(m, column=at_rest[m.column.name]) for n, m in named.items()}
+        own = settled(record, named, event, about)
+    else:
+        own = Settled(named)
+    inputs = [m for m in own.matches.values() if m.target.kind == "input" and usable(m) and not is_ambiguous(m)]
+    at = {m.target.name: float(_values(record, m)[1][0]) for m in inputs} | dict(own.values)
+    for level, output in LEVELS.items():
+        if about is not None and output in own.matches:
+            at[level] = level_before(*_values(record, own.matches[output]), event)
+    levels, why = _levels(model, at)
+    by_names = {**own.matches, **{m.target.name: m for m in own.open}} if about is not None else None
+    columns = tuple(c for c in columns if c.name not in own.compared)
+    found = matching(columns, targets_of(model, levels), model.parameters, by_names)
+    return Proposal(found, why, tuple(phases), own.values, own.notes)
 
 
-def proposal(record: Trajectory, model: AnyModel, name: str) -> tuple[Matching, str, tuple[schema.PhasesTable, ...]]:
-    """Return what a recording may be of a model: the columns by signal, those among them that are made of three phases, and of which.
-
-    The text says why the model's levels are not known; empty where they are. name: of the experiment.
-    """
-    phases = proposed_phases(record)
-    made = with_derived(phases, (), record, name)
-    found, why = matched(without_phases(made, phases), model, phases)
-    phases = of_use(phases, [m.column.name for m in (*found.mapped, *found.proposed)])
-    return replace(found, unused=tuple(c for c in found.unused if c in record)), why, phases
-
-
-def _mapped(folder: Path, file: Path, name: str, model: AnyModel) -> Mapped:
-    found, why, phases = proposal(read_waveforms(file), model, name)
+def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Terminals | None) -> Mapped:
+    found = proposal(read_waveforms(file), model, name, about)
     data = _relative(file, folder)
     by_kind = {
-        kind: {m.target.name: m.column.name for m in found.mapped if m.target.kind == kind}
+        kind: {m.target.name: m.column.name for m in found.columns.mapped if m.target.kind == kind}
         for kind in ("input", "output")
     }
+    rest = (found.phases, found.values, found.notes)
     if not by_kind["output"]:
-        return Mapped(name, file, data, found, why, None, {}, phases)
-    inputs, outputs = by_kind["input"], by_kind["output"]
-    table = schema.ExperimentTable(name=name, data=file.name, inputs=inputs, outputs=outputs, phases=list(phases))
+        return Mapped(name, file, data, found.columns, found.levels, None, {}, *rest)
+    lines = {m.target.name: schema.ColumnTable(**m.line.keys) for m in found.columns.mapped if m.line.keys}
+    table = schema.ExperimentTable(
+        name=name,
+        data=file.name,
+        inputs=by_kind["input"],
+        outputs=by_kind["output"],
+        columns=lines,
+        values=dict(found.values),
+        phases=list(found.phases),
+    )
     (experiment,), notes = read_experiments([table], model, Recordings(file.parent), str(file))
-    return Mapped(name, file, data, found, why, experiment, notes[name], phases)
+    return Mapped(name, file, data, found.columns, found.levels, experiment, notes[name], *rest)
 
 
 def _values(record: Trajectory, match: Match) -> tuple[Array, Array]:
     """The instants of a column in s, and its values in the signal's unit."""
-    scale, offset = match.column.converted(match.target.unit) or (1.0, 0.0)
+    scale, offset = match.by or (1.0, 0.0)
     rows = np.isfinite(record[match.column.name])
     return record.time[rows], scaled(record[match.column.name][rows], scale) + offset
 
@@ -291,6 +333,7 @@ def _open_lines(r: Mapped) -> Iterator[str]:
     """Lines on the columns and signals that are not mapped."""
     if r.levels:
         yield r.levels
+    yield from r.notes
     for line in r.phases:
         made = ", ".join(f"{name} ({PHASE_QUANTITIES[of]})" for name, of in line.gives.items())
         yield f"of the phases {', '.join((*line.voltage, *(line.current or ())))} at {line.frequency:g} Hz are made: {made}"
@@ -303,7 +346,7 @@ def _open_lines(r: Mapped) -> Iterator[str]:
     trim = _trim(r)
     if trim:
         yield f"levels before the event: {', '.join(f'{level} = that of {o}' for level, o in trim.items())}"
-    inputs = [t for t in r.columns.missing if t.kind == "input" and t.name not in trim]
+    inputs = [t for t in r.columns.missing if t.kind == "input" and t.name not in trim and t.name not in r.values]
     if inputs:
         yield f"inputs without a column keep their values: {', '.join(_value(t) for t in inputs)}"
     outputs = [t.name for t in r.columns.missing if t.kind == "output"]
@@ -362,7 +405,7 @@ def _study_text(
         names = ", ".join(map(toml_string, settable))
         yield from ("", "# [inputs]", f"# settable = [{names}]   # those that a person can move for a recording")
     for r in recordings:
-        yield from ("", *_experiment_text(r, played=dyr is not None))
+        yield from ("", *_experiment_text(r, _measured_inputs(r, model)))
     yield ""
     yield "# The stages. A stage runs if its table is in this file; `simulate` always runs."
     mark = "" if asked and any(r.experiment is not None for r in recordings) else "# "
@@ -372,18 +415,36 @@ def _study_text(
         yield f"{mark}places = [{', '.join(map(toml_string, dyr.places))}]   # the controls, and what they act on"
 
 
-def _experiment_text(r: Mapped, played: bool) -> Iterator[str]:
+def _measured_inputs(r: Mapped, model: AnyModel) -> list[str]:
+    """Return the inputs that are recorded as they were measured: nobody sets them, and they move from row to row."""
+    if r.experiment is None:
+        return []
+    mapped = {m.target.name: m for m in r.columns.mapped if m.target.kind == "input"}
+    moving = {n: r.experiment.inputs[n] for n in mapped if not model.inputs[n].settable}
+    return [n for n, s in moving.items() if not (s.is_constant or _is_staircase(s))]
+
+
+def _is_staircase(signal: InputSignal) -> bool:
+    """Return whether a signal holds its values between jumps."""
+    changes = np.diff(signal.values) != 0.0
+    return bool((np.diff(signal.times)[changes] == 0.0).all())
+
+
+def _experiment_text(r: Mapped, measured: Sequence[str]) -> Iterator[str]:
     """The lines of one experiment; all of them comments where no output is mapped, as none may be without.
 
-    played: its inputs are measured ones, which have no jumps.
+    measured: its inputs that are, which have no jumps.
     """
     mark = "" if r.experiment is not None else "# "
     yield f"# {_comment(_found(r))}"
     yield f"{mark}[[experiment]]"
     yield f"{mark}name = {toml_string(r.name)}"
     yield f"{mark}data = {toml_string(r.data)}"
-    if played:
-        yield f'{mark}interpolation = "linear"   # a measured voltage moves from row to row, and does not jump at the later one'
+    inputs = [m.target.name for m in r.columns.mapped if m.target.kind == "input"]
+    if measured:
+        by_input = ", ".join(f'{toml_key(n)} = "linear"' for n in measured)
+        how = '"linear"' if set(measured) == set(inputs) else f"{{{by_input}}}"
+        yield f"{mark}interpolation = {how}   # what is measured moves from row to row, and does not jump at the later one"
     yield '# role = "holdout"   # not fitted: validates the estimates'
     if r.experiment is not None and r.experiment.event is not None:
         yield f"# event = {r.experiment.event!r}   # s, as found from the inputs"
@@ -392,6 +453,9 @@ def _experiment_text(r: Mapped, played: bool) -> Iterator[str]:
     trim = _trim(r)
     if trim:
         yield f"{mark}trim = {{{', '.join(f'{level} = {toml_string(o)}' for level, o in trim.items())}}}   # the level before the event"
+    if r.values:
+        yield f"{mark}values = {{{', '.join(f'{toml_key(n)} = {v!r}' for n, v in r.values.items())}}}   # as recorded before the event"
+    yield from (f"# {_comment(note)}" for note in r.notes)
     if r.phases:
         made = any(m.column.name in line.gives for m in r.columns.mapped for line in r.phases)
         lines = ", ".join(map(phases_text, r.phases))
@@ -413,14 +477,26 @@ def _experiment_text(r: Mapped, played: bool) -> Iterator[str]:
             shown = ", ".join(_value(t) if kind == "input" else t.name for t in missing[:MOST_LISTED])
             at = ", at the model's values" if kind == "input" else ""
             yield f"# without a column{at}: {_comment(shown)}{_more(missing)}"
-        bases += [m for m in proposed if m.column.converted(m.target.unit) is None]
-    if bases:
-        yield from ("", "# [experiment.columns]   # with the lines above: recorded / base = value in the model")
+        bases += [m for m in proposed if m.by is None]
+    stated = [m for m in r.columns.mapped if m.line.keys]
+    if stated or bases:
+        opened = mark if stated else "# "
+        yield from (
+            "",
+            f"{opened}[experiment.columns]   # with the lines above: scale x recorded, or recorded / base = value in the model",
+        )
+        for m in stated:
+            yield f"{mark}{toml_key(m.target.name)} = {{{_line_text(m.line.keys)}}}"
         for m in bases:
             base = "..." if m.base is None else repr(m.base)
-            yield f"# {toml_key(m.target.name)} = {{unit = {toml_string(m.column.unit)}, base = {base}}}"
+            unit = m.column.unit or m.column.reading.unit
+            yield f"# {toml_key(m.target.name)} = {{unit = {toml_string(unit)}, base = {base}}}"
     if r.columns.unused:
         yield f"# columns not used: {_comment(', '.join(r.columns.unused[:MOST_LISTED]))}{_more(r.columns.unused)}"
+
+
+def _line_text(line: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} = {toml_string(v) if isinstance(v, str) else repr(v)}" for key, v in line.items())
 
 
 def _trim(r: Mapped) -> dict[str, str]:
@@ -433,6 +509,8 @@ def _trim(r: Mapped) -> dict[str, str]:
 def _unit_words(match: Match) -> str:
     """The reason of a mapping, and what becomes of the unit."""
     unit, wanted = match.column.unit, match.target.unit
+    if match.line.keys or "taken as" in match.reason:
+        return match.reason
     if not unit:
         return f"{match.reason}; the file states no unit: taken as {wanted}" if wanted else match.reason
     return (

@@ -31,6 +31,7 @@ from hvdc_ident.shelf import asked_of, record_of
 from hvdc_ident.study.new_study import DyrOfStudy, NewStudy, new_study
 from hvdc_ident.study.nominal_frequency import recorded_frequencies
 from hvdc_ident.study.recordings import level_before
+from hvdc_ident.study.terminal_columns import Terminals
 from hvdc_ident.study.unit_notes import InPowerFlow, unit_notes
 from hvdc_ident.text import listed
 
@@ -105,7 +106,7 @@ def new_unit_study(folder: str | Path, recordings: str | Path | Sequence[str | P
         notes=unit_notes(unit, records, grid, base, (frequency, source), list(candidates)),
     )
     try:
-        found = new_study(folder, recordings, card, dyr=about)
+        found = new_study(folder, recordings, card, dyr=about, terminals=_terminals(grid, base, frequency))
     except InputError:
         card.unlink()  # the next try finds the folder as it was
         raise
@@ -159,6 +160,12 @@ def _frequency(asked: UnitAsked, grid: InPowerFlow | None, recordings: Sequence[
             NextStep("option", "raw = FILE", "reads it from the power flow (BASFRQ)"),
         ),
     )
+def _terminals(grid: InPowerFlow | None, base: float, frequency: float) -> Terminals:
+    """Return what the files state of the unit's terminals."""
+    if grid is None:
+        return Terminals(frequency, base)
+    bus, machine = grid.bus, grid.generator
+    return Terminals(frequency, base, bus.base_kv or None, grid.raw.sbase, machine.pg, machine.qg, bus.name.strip())
 
 
 def _levels(found: NewStudy) -> dict[str, float]:

@@ -35,7 +35,9 @@ from hvdc_ident.data.three_phase import (
     frequency_noise,
     phase_quantities,
     phasor_quantities,
+    unwrapped,
 )
+from hvdc_ident.data.turning import whole_turns
 from hvdc_ident.errors import InputError, StudyError, located, require_known
 from hvdc_ident.files import digest
 from hvdc_ident.formats import files_of, read_waveforms
@@ -206,6 +208,7 @@ def _experiment(
     mappings = {s: _mapping(table, model, s, c, data, place) for s, c in columns.items()}
     mapped = {s: scaled(data[c], mappings[s][0]) for s, c in columns.items()}
     mapped |= {s: mapped[s] + offset for s, (_, offset) in mappings.items() if offset != 0.0}
+    mapped |= {s: _in_frame(table, s, time, mapped[s], place) for s in columns if same_unit(_unit(model, s), "rad")}
     inputs = {}
     for s in (*table.inputs, *table.drive):
         rows = data.own_rows(columns[s])
@@ -228,6 +231,8 @@ def _experiment(
     means = {s: lengths[c] for s, c in columns.items() if c in lengths}
     units = tuple(model.outputs[o].unit for o in outputs)
     converted = tuple(_conversion_words(table, model, s, c, data, mappings[s]) for s, c in columns.items())
+    jumps = {s: whole_turns(mappings[s][0] * data[c]) for s, c in columns.items() if same_unit(_unit(model, s), "rad")}
+    converted += tuple(f"{s}: unwrapped, for it jumps by a whole turn in {n} places" for s, n in jumps.items() if n)
     origin = replace(
         data.origin,
         time_unit=_time_unit(table, data.origin),
@@ -368,6 +373,13 @@ def _mapping(
     return by[0], by[1] + offset
 
 
+def _in_frame(table: schema.ExperimentTable, signal: str, time: Array, angle: Array, place: str) -> Array:
+    """Return an angle in rad without its jumps by whole turns, and without the course with which the frame of the model turns."""
+    line = table.columns.get(signal)
+    turn = line.turn if line is not None else None
+    return unwrapped(angle) if turn is None else unwrapped(angle) - 2.0 * np.pi * turn * (time - time[0])
+
+
 def _conversion_words(
     table: schema.ExperimentTable,
     model: AnyModel,
@@ -416,7 +428,11 @@ def _time_unit(table: schema.ExperimentTable, origin: Origin) -> str:
 
 
 def _event(
-    table: schema.ExperimentTable, time: Array, inputs: Mapping[str, InputSignal], means: Mapping[str, float], place: str
+    table: schema.ExperimentTable,
+    time: Array,
+    inputs: Mapping[str, InputSignal],
+    means: Mapping[str, float],
+    place: str,
 ) -> float | None:
     """The event as stated, or of inputs that are made of phases or phasors; None where the inputs themselves show it."""
     if table.event is not None and not time[0] <= table.event <= time[-1]:
@@ -519,7 +535,12 @@ def with_derived(
     for number, line in enumerate(phases, 1):
         found = _added(found, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"), line.voltage[0])
     for number, phasor in enumerate(phasors, 1):
-        found = _added(found, phasor.gives, _of_phasors(phasor, data, f"{place}.phasors, line {number}"), phasor.voltage.magnitude[0])
+        found = _added(
+            found,
+            phasor.gives,
+            _of_phasors(phasor, data, f"{place}.phasors, line {number}"),
+            phasor.voltage.magnitude[0],
+        )
     return found
 
 

@@ -234,7 +234,7 @@ class ParameterTable(TomlTable):
 class ColumnTable(TomlTable):
     """One line of an experiment's `columns`: the recorded column of a signal and how it gets the model's unit.
 
-    model = scale x recorded + offset, or (recorded / base) + offset; the offset is in the model's unit.
+    model = scale x recorded + offset, or (recorded / base) + offset; the offset is in the model's unit. An angle is unwrapped.
     """
 
     name: Name | None = optional("The column in the file. If left out, the signal's own name.", 'columns = {P2 = {name = "P_MW"}}')
@@ -244,6 +244,9 @@ class ColumnTable(TomlTable):
     base: Positive | None = optional("The value of 1 pu, instead of scale: model = recorded / base + offset.",
         'columns = {P2 = {unit = "MW", base = 1000}}', "that of the column")
     offset: FiniteFloat | None = optional("What is added after scaling.", "columns = {T = {scale = 0.1, offset = -20}}", "the model's")
+    turn: FiniteFloat | None = optional(
+        "Of an angle: the frequency with which it turns before the event. That course is taken out, for the frame of the model turns with "
+        "it, which its frequency says.", "columns = {theta = {turn = 0.012}}", "Hz")
 
     @model_validator(mode="after")
     def _one_factor(self) -> ColumnTable:
