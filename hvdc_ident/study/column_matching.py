@@ -105,7 +105,7 @@ class ColumnLine:
 class Match:
     """A column that is taken for a signal, or may be: the reason in words. base: rated base to be stated, in the column's unit.
 
-    line: what gives the model's unit, beside what the file states.
+    line: what gives the model's unit, beside what the file states. is_open: no unit or base is known that the values allow.
     """
 
     target: Target
@@ -113,6 +113,7 @@ class Match:
     reason: str
     base: float | None = None
     line: ColumnLine = field(default_factory=ColumnLine)
+    is_open: bool = False
 
     @property
     def by(self) -> tuple[float, float] | None:
@@ -221,7 +222,7 @@ def matching(
 
 def usable(match: Match) -> bool:
     """Return whether a column can be used as it is: its unit converts to the signal's, and an input has no gaps."""
-    return match.by is not None and not (match.target.kind == "input" and match.column.gaps)
+    return match.by is not None and not match.is_open and not (match.target.kind == "input" and match.column.gaps)
 
 
 def is_ambiguous(match: Match) -> bool:
@@ -325,6 +326,8 @@ def _base_meant(match: Match, parameters: Mapping[str, Parameter]) -> tuple[floa
 def _with_base(match: Match, parameters: Mapping[str, Parameter]) -> Match:
     """Return a match of names that cannot be used, with the reason, and the base that its levels suggest."""
     column, target = match.column, match.target
+    if match.is_open:
+        return match
     if column.converted(target.unit) is not None:
         rows = f"{column.gaps} row{'s' if column.gaps > 1 else ''}"
         return replace(match, reason=f"{match.reason}, but not recorded in {rows}, and an input is needed all along")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from hvdc_ident.data import Contradiction
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.checks import need_start
@@ -15,14 +17,15 @@ if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
 
-def hindrances(study: Study, values: InitialValues) -> list[str]:
+def hindrances(study: Study, values: InitialValues, contradictions: Sequence[Contradiction] = ()) -> list[str]:
     """Return what hinders a run, in sentences; empty where nothing was found.
 
     values: of this study; they come from a run of every recorded experiment at the given values, whose failures they hold, with
     the recordings that seem to have another sign or unit. Besides these, experiments without a recording are run at the given
-    values, and all at the start values where these differ and a search begins there.
+    values, and all at the start values where these differ and a search begins there. contradictions: in the recordings; those that are
+    mended already hinder nothing, and of an experiment with one that is not, nothing else is told.
     """
-    found = [*values.failures, *values.mistakes, *_bounds(study)]
+    found = [*(c.text for c in contradictions if not c.done), *values.failures, *values.mistakes, *_bounds(study)]
     found += _runs(study, at_start=False)
     searches = any(s.searches and s.wanted(study) for s in stages())
     if searches and study.start != study.given:

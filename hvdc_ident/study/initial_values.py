@@ -74,6 +74,12 @@ class InitialValues:
         """Those of the lines that suspect a mistake of the recording: its sign, unit or time, a set-point, or columns exchanged."""
         return [line for first, line in self._grouped() if first.is_mistake]
 
+    def without(self, experiments: Iterable[str]) -> InitialValues:
+        """Return the comparison without some experiments: those in which a mistake is known, from which the rest follows."""
+        known = set(experiments)
+        remarks, failures = (tuple(t for t in texts if t.split(":")[0] not in known) for texts in (self.remarks, self.failures))
+        return InitialValues(tuple(v for v in self.values if v.experiment not in known), remarks, failures)
+
     def _grouped(self) -> Iterator[tuple[InitialValue, str]]:
         """Yield a value of each group that is said alike, and the line."""
         groups: dict[tuple[str, str | None, str], list[InitialValue]] = {}

@@ -477,7 +477,7 @@ def _experiment_text(r: Mapped, measured: Sequence[str]) -> Iterator[str]:
             shown = ", ".join(_value(t) if kind == "input" else t.name for t in missing[:MOST_LISTED])
             at = ", at the model's values" if kind == "input" else ""
             yield f"# without a column{at}: {_comment(shown)}{_more(missing)}"
-        bases += [m for m in proposed if m.by is None]
+        bases += [m for m in proposed if m.by is None or m.is_open]
     stated = [m for m in r.columns.mapped if m.line.keys]
     if stated or bases:
         opened = mark if stated else "# "

@@ -12,6 +12,7 @@ from typing import Any
 from hvdc_ident.codec import INLINE, NOT_STORED, Coded
 from hvdc_ident.data import Experiment, recording_lines
 from hvdc_ident.study.checks import steady_notes
+from hvdc_ident.study.column_contradictions import column_contradictions
 from hvdc_ident.study.hindrances import hindrances
 from hvdc_ident.study.initial_values import initial_values
 from hvdc_ident.study.measured_responses import described
@@ -115,18 +116,21 @@ class Summary(Coded):
     @classmethod
     def of(cls, study: Study, seed: int = 0, *, in_python: bool = False) -> Summary:
         """Return the summary of a study. The model is run once an experiment, and once more where the start values differ."""
-        model, initial = study.model, initial_values(study)
+        model, initial, contradictions = study.model, initial_values(study), column_contradictions(study)
+        wrong = {c.where for c in contradictions if not c.done}
+        others = initial.without(where.removeprefix("experiment ") for where in wrong)
+        steady = steady_notes(study, searches=any(s.searches and s.wanted(study) for s in stages()))
         return cls(
             **heading_of(study, seed),
             sizes={n: len(getattr(model, n)) for n in ("states", "parameters", "inputs", "outputs")},
             candidates={n: StatedCandidate.of(c, n, study) for n, c in candidate_lines(study).items()},
             experiments={e.name: RecordedExperiment.of(e, study) for e in study.experiments},
-            steady_state=tuple(steady_notes(study, searches=any(s.searches and s.wanted(study) for s in stages()))),
+            steady_state=tuple(n for n in steady if n.replace(",", ":").split(":")[0] not in wrong),
             responses={r.name: described(r) for r in study.responses},
             stages=tuple(s.name for s in stages() if s.wanted(study)),
             rest_levels=initial.all,
-            rest_lines=(*initial.lines, *initial.remarks),
-            hindrances=tuple(hindrances(study, initial)),
+            rest_lines=(*others.lines, *others.remarks, *(c.text for c in contradictions if c.done)),
+            hindrances=tuple(hindrances(study, others, contradictions)),
             in_python=in_python,
         )
 
@@ -177,6 +181,8 @@ def _noise(output: str, note: NoiseNote, unit: str) -> str:
     if note.source == "residual":
         return f"{output} from the residual of the fit (not given, and no quiet rows before an event)"
     if note.source == "floor":
-        return f"{output} none above {quantity(note.std, unit, 3)} (before the event; the residual of the fit stands in)"
+        return (
+            f"{output} none above {quantity(note.std, unit, 3)} (before the event; the residual of the fit stands in)"
+        )
     how = f"{note.source}, row by row" if note.by_row else note.source
     return f"{output} {quantity(note.std, unit, 3)} ({how})"

@@ -32,6 +32,8 @@ NEAR = math.sqrt(2.0)
 """Largest factor between a recorded power and that of the power flow, which is another hour's, that tells which base is meant."""
 FASTEST = 0.05
 """Share of the nominal frequency by which that of a network differs for a tenth of a second without the plant's being tripped."""
+AT_REST = 0.01
+"""Share of the nominal frequency within which a network's is before an event."""
 SURE = 5.0
 """Standard errors from which a slope before the event is one."""
 LASTS = 0.1
@@ -149,7 +151,7 @@ def frequency_way(unit: str, stated: bool, level: float, largest: float, about: 
     """
     f0 = about.frequency
     near = [w for w in frequency_ways(unit, stated, about) if 0.9 * f0 <= w.scale * level + w.offset <= 1.1 * f0]
-    possible = [w for w in near if not w.offset or w.scale * largest <= 0.1 * f0]
+    possible = [w for w in near if not w.offset or (w.size(abs(level)) <= AT_REST * f0 and w.size(largest) <= 0.1 * f0)]
     return _only(possible)
 
 
@@ -322,7 +324,7 @@ def _left_open(match: Match, about: Terminals) -> Match:
         base = _round(about.base_kv / by[0])
         why = f"that is not where a bus of {about.base_kv:g} kV rests"
     line = _unit_line(unit, stated or not unit)
-    return replace(match, reason=f"{match.reason}; {level}, and {why}", base=base, line=line)
+    return replace(match, reason=f"{match.reason}; {level}, and {why}", base=base, line=line, is_open=True)
 
 
 def _turn_before(time: Array, angle: Array, event: float | None) -> float:
