@@ -38,7 +38,7 @@ from hvdc_ident.study.column_matching import (
 from hvdc_ident.study.json_schema import SCHEMA_LINE, write_schemas
 from hvdc_ident.study.phase_columns import of_use, phases_text, proposed_phases, ways_to_count, without_phases
 from hvdc_ident.study.recordings import Recordings, level_before, read_experiments, smoothed, with_derived
-from hvdc_ident.study.terminal_columns import Settled, Terminals, settled, terminals_of
+from hvdc_ident.study.terminal_columns import Settled, Terminals, settled, steadied, terminals_of, unit_of_match
 from hvdc_ident.summary.levels import NoiseNote
 from hvdc_ident.text import listed, quantity
 
@@ -223,8 +223,7 @@ def _matched(
     targets = targets_of(model, {})
     named = match_names(columns_of(record, None, ways), targets, about.bus if about else "")
     moved = [m for m in named.values() if m.target.kind == "input" and not m.column.gaps]  # in whatever unit
-    signals = {m.column.name: input_signal(*_values(record, m)) for m in moved}
-    event = event_time(signals, smoothed(phases))
+    event = _event(record, moved, smoothed(phases), played=about is not None)
     columns = columns_of(record, event, ways)
     if about is not None:
         at_rest = {c.name: c for c in columns}
@@ -242,6 +241,18 @@ def _matched(
     columns = tuple(c for c in columns if c.name not in own.compared)
     found = matching(columns, targets_of(model, levels), model.parameters, by_names)
     return Proposal(found, why, tuple(phases), own.values, own.notes)
+
+
+def _event(record: Trajectory, moved: Sequence[Match], means: Mapping[str, float], *, played: bool) -> float | None:
+    """Return the event that columns of inputs show, in s. played: an angle among them may turn before it, which is no event."""
+    signals = {
+        m.column.name: input_signal(*_values(record, m)) for m in moved if not (played and m.target.name == "theta")
+    }
+    for m in (m for m in moved if played and m.target.name == "theta"):
+        values = steadied(record, m.column.name, unit_of_match(m)[0], event_time(signals, means))
+        rows = np.isfinite(values)
+        signals[m.column.name] = input_signal(record.time[rows], values[rows])
+    return event_time(signals, means)
 
 
 def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Terminals | None) -> Mapped:

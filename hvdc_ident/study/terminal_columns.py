@@ -327,6 +327,19 @@ def _left_open(match: Match, about: Terminals) -> Match:
     return replace(match, reason=f"{match.reason}; {level}, and {why}", base=base, line=line, is_open=True)
 
 
+def steadied(record: Trajectory, column: str, unit: str, others: float | None) -> Array:
+    """Return an angle in its unit, unwrapped, without the course with which it turns at first: what is left moves with the event.
+
+    unit: as the file states it, rad where it does not. others: event in s that the other columns show; without one the first tenth of
+    the record tells the course.
+    """
+    by = (conversion(unit, "rad") if unit else None) or (1.0, 0.0)
+    angle = unwrapped(by[0] * record[column])
+    begin = others if others is not None else float(record.time[0] + 0.1 * (record.time[-1] - record.time[0]))
+    turn = _turn_before(record.time, angle, begin)
+    return np.asarray((angle - 2.0 * math.pi * turn * (record.time - record.time[0])) / by[0])
+
+
 def _turn_before(time: Array, angle: Array, event: float | None) -> float:
     """Return the frequency in Hz with which an angle in rad turns before the event; 0 where that is no more than its noise."""
     rows = before_event(time, angle, event)

@@ -1,4 +1,4 @@
-"""Records at a unit's terminals in the habits of recorders, and with wrong units, bases and signs: taken right, or said with what to write."""
+"""Records at a unit's terminals in the habits of recorders, and with wrong units, bases and signs: taken right, or said."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ def habits(p: Columns) -> dict[str, Columns]:
             "ELM Q [Mvar]": -p["Q"],
         },
         "references beside": {
-            "time": p["time"], "V_ref [kV]": 0.0 * p["V"] + KV, "V [kV]": KV * p["V"], "theta [rad]": p["theta"], "P_set [MW]": 0.0 * p["P"] + 200.0,
-            "P [MW]": p["P"], "Q [Mvar]": p["Q"],
+            "time": p["time"], "V_ref [kV]": 0.0 * p["V"] + KV, "V [kV]": KV * p["V"], "theta [rad]": p["theta"],
+            "P_set [MW]": 0.0 * p["P"] + 200.0, "P [MW]": p["P"], "Q [Mvar]": p["Q"],
         },
     }  # fmt: skip
 
@@ -137,7 +137,9 @@ def test_a_record_is_complete_in_any_habit(habit: str, plant: Columns, tmp_path:
     np.testing.assert_allclose(played - played[-1], (plant[turn] - plant[turn][-1])[after], atol=1e-3)
     assert column_contradictions(hi.load_study(found.path)) == ()
     stated = tomllib.loads(found.path.read_text())
-    assert {"fit", "diagnose", "identifiability"} <= set(stated) and stated["experiment"][0]["interpolation"] == "linear"
+    assert {"fit", "diagnose", "identifiability"} <= set(stated) and stated["experiment"][0][
+        "interpolation"
+    ] == "linear"
 
 
 Mistake = Callable[[Columns], tuple[Columns, dict[str, Any]]]
@@ -172,7 +174,12 @@ def test_a_mistake_is_said_and_what_to_write_mends_it(mistake: str, plant: Colum
     kind, made = MISTAKES[mistake]
     new(tmp_path, plant)
     columns, keys = made(plant)
-    written(tmp_path, columns if "beside" in keys or "f" in keys.get("inputs", []) else {n: v for n, v in columns.items() if n != "f"})
+    written(
+        tmp_path,
+        columns
+        if "beside" in keys or "f" in keys.get("inputs", [])
+        else {n: v for n, v in columns.items() if n != "f"},
+    )
     path = stated(tmp_path, keys)
     (found,) = column_contradictions(hi.load_study(path))
     assert found.kind == kind and found.where == "experiment event"
@@ -195,7 +202,8 @@ def test_sound_records_are_not_nagged(plant: Columns, tmp_path: Path) -> None:
 
 def test_an_angle_that_turns_before_the_event_turns_the_frame(plant: Columns, tmp_path: Path) -> None:
     turn = 0.03
-    found = new(tmp_path, {n: plant[n] for n in ("time", "V", "P", "Q")} | {"theta": plant["theta"] + 2.0 * np.pi * turn * plant["time"]})
+    angle = plant["theta"] + 2.0 * np.pi * turn * plant["time"]
+    found = new(tmp_path, {n: plant[n] for n in ("time", "V", "P", "Q")} | {"theta": angle})
     (e,) = hi.load_study(found.path).experiments
     assert e.values["f"] == pytest.approx(F0 + turn, abs=1e-4)
     played = e.inputs["theta"](plant["time"])[-1] - e.inputs["theta"](0.0)
@@ -211,17 +219,17 @@ def test_the_finer_of_angle_and_frequency_is_used(plant: Columns, tmp_path: Path
 
 
 def test_what_no_unit_explains_is_left_open(plant: Columns, tmp_path: Path) -> None:
-    """A voltage of 7 kV at a bus of 18 kV, and powers of a thousandth of the machine: asked, and not mapped."""
-    found = new(tmp_path, plant | {"V [kV]": 7.0 * plant["V"]} | {"V": plant["V"]} if False else {
-        "time": plant["time"], "V [kV]": 7.0 * plant["V"], "theta": plant["theta"], "P": plant["P"], "Q": plant["Q"],
-    })  # fmt: skip
+    """A voltage of 7 kV at a bus of 18 kV is asked about, and not mapped."""
+    columns = {"time": plant["time"], "V [kV]": 7.0 * plant["V"], **{n: plant[n] for n in ("theta", "P", "Q")}}
+    found = new(tmp_path, columns)
     (r,) = found.recordings
     (open_,) = (m for m in r.columns.proposed if m.target.name == "V")
     assert open_.is_open and "not where a bus of 18 kV rests" in open_.reason and open_.base == KV
 
 
 def test_a_column_of_another_quantity_is_never_offered(plant: Columns, tmp_path: Path) -> None:
-    found = new(tmp_path, {"time": plant["time"], "V1 Ang [deg]": np.degrees(plant["theta"]), "I1 Ang [deg]": plant["theta"], "IPM": plant["P"]})
+    angle = np.degrees(plant["theta"])
+    found = new(tmp_path, {"time": plant["time"], "V1 Ang [deg]": angle, "I1 Ang [deg]": angle, "IPM": plant["P"]})
     (r,) = found.recordings
     offered = {(m.target.name, m.column.name) for m in (*r.columns.mapped, *r.columns.proposed)}
     assert offered == {("theta", "V1 Ang")} and set(r.columns.unused) == {"I1 Ang", "IPM"}
