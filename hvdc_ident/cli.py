@@ -23,6 +23,7 @@ from hvdc_ident.command import (
     PsseUnit,
     Seed,
     StudyFile,
+    WithinBudget,
     Work,
     command,
     echo,
@@ -188,14 +189,21 @@ def _check_fmu(
 
 
 def letter(
-    *, study: StudyFile, out: Out = None, open_: Open = False, work: Work, console: Console, access: Access
+    *,
+    study: StudyFile,
+    out: Out = None,
+    open_: Open = False,
+    work: Work,
+    budget: WithinBudget = None,
+    console: Console,
+    access: Access,
 ) -> None:
     """Write one page for the model's owner. It states what the model misses, why, and what is attached."""
     from hvdc_ident.study.export import letter as write
 
     loaded = access.study(study)
     with console.progress() as progress:
-        page, done = write(loaded, out or loaded.folder, work.options(console, progress))
+        page, done = write(loaded, out or loaded.folder, work.options(console, progress, budget))
     console.print_json({"schema": 1, "file": page.as_posix(), "verdict": done.data.get("verdict")})
     console.say(f"letter: {page}")
     if loaded.settings.letter is None:

@@ -10,17 +10,17 @@ import inspect
 import math
 import os
 import shutil
-import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
 import typer
 
+from hvdc_ident.budget import Budget
 from hvdc_ident.errors import HvdcIdentError, InputError, one_line
 from hvdc_ident.executor import Progress, progress_bar
 from hvdc_ident.study.stages import StageOptions
@@ -84,13 +84,21 @@ def open_address(address: str) -> None:
 StudyFile = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML).", show_default=False)]
 Out = Annotated[Path | None, option("--out", "DIR", "Folder for results; default STUDY-results.")]
 Open = Annotated[bool, typer.Option("--open", help="Open the page in the browser.")]
-Budget = Annotated[
-    float | None,
+
+
+def _budget(text: Any) -> Budget:
+    """Return a budget that begins now."""
+    return Budget.of(_number("--budget", "seconds, at least 0.001", "600", 0.001)(text))
+
+
+WithinBudget = Annotated[
+    Budget | None,
     option(
         "--budget",
         "SECONDS",
-        "Stop after so long. What was finished is kept, and the same command goes on; diagnose answers with what it has by then.",
-        parser=_number("--budget", "seconds, at least 0.001", "600", 0.001),
+        "End after so long with what is known by then, and with what was not tried. What was finished is kept, and the same command "
+        "goes on.",
+        parser=_budget,
     ),
 ]
 Seed = Annotated[
@@ -182,12 +190,13 @@ class Work:
     executor: Annotated[str, option("--executor", "WHERE", "local, or dask://HOST:PORT: where the work is done.")] = ""
     seed: Seed = 0
 
-    def options(self, console: Console, progress: Progress) -> StageOptions:
+    def options(self, console: Console, progress: Progress, budget: Budget | None = None) -> StageOptions:
         """Return the stages' options. Raises InputError for an executor of an unknown name."""
         from hvdc_ident.study.executors import check_executor
 
         check_executor(self.executor)
-        return StageOptions(self.workers, self.seed, progress, executor=self.executor, announce=console.announce)
+        told = console.announce
+        return StageOptions(self.workers, self.seed, progress, executor=self.executor, budget=budget, announce=told)
 
 
 @dataclass(frozen=True)
@@ -199,9 +208,9 @@ class FitWork(Work):
         typer.Option("--force", metavar="NAME", help="Fit this candidate whatever the verdict on it; may be repeated."),
     ] = None
 
-    def options(self, console: Console, progress: Progress) -> StageOptions:
+    def options(self, console: Console, progress: Progress, budget: Budget | None = None) -> StageOptions:
         """Return the stages' options."""
-        return replace(super().options(console, progress), force=tuple(dict.fromkeys(self.force or ())))
+        return replace(super().options(console, progress, budget), force=tuple(dict.fromkeys(self.force or ())))
 
 
 @dataclass(frozen=True)
@@ -258,31 +267,6 @@ class CommandFailed(Exception):
     """The work ran and failed; what it found is written."""
 
 
-class _BudgetSpent(KeyboardInterrupt):
-    """The time that the work may take is over; it ends as by an interrupt."""
-
-
-@contextmanager
-def within(budget: float | None) -> Iterator[None]:
-    """Interrupt the work inside after so many seconds. Raises InputError where the system has no such timer."""
-    if budget is None:
-        yield
-        return
-    if not hasattr(signal, "setitimer"):
-        raise InputError("this system has no timer for --budget", hint="leave it out, and interrupt the command")
-
-    def stop(*_: object) -> NoReturn:
-        raise _BudgetSpent(f"the {budget:g} s of --budget are over")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.setitimer(signal.ITIMER_REAL, budget)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-
-
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """Return the function with its groups as options, and every exception as one message and an exit code."""
     parameters: list[inspect.Parameter] = []
@@ -319,8 +303,6 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             end(2 if isinstance(e, InputError) else 1, str(e.read_in("shell")))
         except CommandFailed as e:
             end(1, str(e))
-        except _BudgetSpent as e:
-            end(1, f"{e}; what was finished is kept, and the same command goes on from there")
         except KeyboardInterrupt:
             end(130, "what was finished is kept, and the same command goes on from there")
         except BrokenPipeError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,17 +10,16 @@ import typer
 
 from hvdc_ident.command import (
     Access,
-    Budget,
     CommandFailed,
     Console,
     FitWork,
     Open,
     Out,
     StudyFile,
+    WithinBudget,
     Work,
     open_page,
     pasteable,
-    within,
 )
 from hvdc_ident.errors import require_known
 from hvdc_ident.study.stages import Stage
@@ -65,6 +63,7 @@ def run(
     out: Out = None,
     open_: Open = False,
     work: Work,
+    budget: WithinBudget = None,
     console: Console,
     access: Access,
 ) -> None:
@@ -77,7 +76,7 @@ def run(
     loaded = access.study(study)
     folder = out or loaded.folder
     with console.progress() as progress:
-        done = run_study(loaded, folder, work.options(console, progress))
+        done = run_study(loaded, folder, work.options(console, progress, budget))
     _tell_run(loaded, folder, done, console, lambda line: pasteable(line, study, out, access), opens=open_)
 
 
@@ -118,7 +117,7 @@ def run_lines(done: Sequence[Done], summary: RunSummary | None, truth: Sequence[
 
     lines = [f"steady state, {line}" for line in dict.fromkeys(n for d in done for n in d.data.get("steady_state", ()))]
     for d in done:
-        state = "failed" if d.failed else "done" if d.fresh else "kept from before"
+        state = state_of(d)
         verdict = d.failed or d.stage.verdict(d.data)
         lines.append(f"{d.stage.name}: {state}; {verdict}" if verdict else f"{d.stage.name}: {state}")
     if summary is None:
@@ -126,29 +125,40 @@ def run_lines(done: Sequence[Done], summary: RunSummary | None, truth: Sequence[
     return [*lines, "", *lines_of(summary, truth)]
 
 
+def state_of(done: Done) -> str:
+    """Return in words how a stage ended."""
+    if done.unfinished:
+        return "unfinished"
+    return "failed" if done.failed else "done" if done.fresh else "kept from before"
+
+
 def stage_command(stage: Stage) -> Callable[..., None]:
     """Return the command that runs one stage of a study, and those it builds on, and tells how it went."""
 
     def one_stage(
-        *, study: StudyFile, out: Out = None, work: Work, budget: Budget = None, console: Console, access: Access
+        *, study: StudyFile, out: Out = None, work: Work, budget: WithinBudget = None, console: Console, access: Access
     ) -> None:
         from hvdc_ident.study.pipeline import run_stage
 
         loaded = access.study(study)
         folder = out or loaded.folder
-        searched = "budget" in stage.takes  # it answers with what it has by then; the others are interrupted
-        with within(None if searched else budget), console.progress() as progress:
-            options = work.options(console, progress)
-            options = replace(options, budget=budget) if searched else options
+        with console.progress() as progress:
+            options = work.options(console, progress, budget)
             hint = "NAME = {min = ..., max = ...} in [parameters], which makes a parameter a candidate"
             require_known("candidate", options.force, loaded.candidates, "--force", hint)
             done = run_stage(loaded, stage.name, folder, options)
         console.print_json(done.data)
         console.say(*(f"steady state, {line}" for line in done.data.get("steady_state", ())))
-        silent = (done.failed and not stage.told_in_part) or console.json or console.quiet
-        lines = () if silent else stage.tell(done.data)
+        silent = (done.failed and not (stage.told_in_part or done.unfinished)) or console.json or console.quiet
+        lines = (
+            ()
+            if silent
+            else done.data.get("done", ())
+            if done.unfinished and not stage.told_in_part
+            else stage.tell(done.data)
+        )
         console.say(*(pasteable(line, study, out, access) for line in lines))
-        console.say(f"{stage.name}: {'failed' if done.failed else 'done'}; {folder / stage.file}")
+        console.say(f"{stage.name}: {state_of(done)}; {folder / stage.file}")
         if done.failed:
             raise CommandFailed(f"{stage.name}: {done.failed}")
 

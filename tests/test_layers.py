@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
-next_step errors lazy aliases text immutable codec toml_tables executor files parallel psse colours display data
+next_step errors lazy aliases text immutable codec toml_tables executor budget files parallel psse colours display data
 parameters axes expression shelf model plants effects
 models formats simulate
 fmu linearize sensitivity linear fit identifiability discrepancy summary report study api app command run_commands cli

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Literal, cast
 
 import numpy as np
 
+from hvdc_ident.budget import Budget
 from hvdc_ident.codec import plain
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.candidate_table import lines
@@ -50,14 +50,14 @@ from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
 from hvdc_ident.simulate import ModelSimulator
-from hvdc_ident.text import quantity
+from hvdc_ident.text import figures, quantity
 
 CLOSED = (
     "The model is closed inside: effects were tried at its inputs and outputs only; its signals, states and loops were "
     "not, and no form outside the catalogue was looked for."
 )
 
-UNFINISHED = "The budget ended before all candidates were tried."
+UNFINISHED = "The diagnosis was ended by its budget, and says nothing yet of what is missing, or where."
 UNTESTED = "The budget ended: neither forms outside the catalogue nor whether anything else is missing was asked."
 UNTRIED = (
     "No single effect came near the noise. {} candidates that promise less were not refitted; a thorough search refits more of "
@@ -103,7 +103,7 @@ def diagnose(
     search = SearchContext(
         names, None if places is None else tuple(places), FrozenMap(tolerance or {}), chosen, seed, executor,
         None if progress is None else Course(progress),
-        math.inf if chosen.budget is None else time.monotonic() + chosen.budget,
+        Budget.of(chosen.budget) if isinstance(chosen.budget, float | int) else chosen.budget,
     )  # fmt: skip
     search.tell(0, 1, "the nominal model, refitted")
     start, notes = nominal(
@@ -113,9 +113,10 @@ def diagnose(
     held_now = tuple(f for f in free if f.name not in first.problem.names)
     search = replace(search, held=held_now, stated=stated(model, free), records=first.problem.experiments)
     outcome = two_start_search(search, first)
-    judgement = judge(search, first, outcome)
-    if search.spent and outcome.kept:
-        notes = (*notes, UNTESTED)
+    if search.spent:
+        judgement, notes = unfinished(search, first, outcome), (*notes, UNTESTED)
+    else:
+        judgement = judge(search, first, outcome)
     inside = isinstance(model, Model)
     other = None
     if judgement.instead is not None:
@@ -131,6 +132,24 @@ def diagnose(
     if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.rounds for t in r.failed):
         notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
+
+
+def unfinished(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclusion:
+    """The conclusion of a search that its budget has ended: no effect and no place, for what was not tried may explain more.
+
+    What comes nearest so far is told as that, without its place.
+    """
+    found = outcome.rounds[-1]
+    refitted, every = len({t.pick.candidate for t in found.trials}), len(found.candidates)
+    tried = f"Of {every} candidates of round {len(outcome.rounds)} {refitted} were refitted to their ends"
+    left = min((math.sqrt(t.refit.chi2 / t.refit.rows) for r in outcome.rounds for t in r.trials), default=math.inf)
+    before = math.sqrt(first.chi2 / first.rows)
+    best = (
+        f"; the best of them leaves {figures(left, 3)} times the noise, the model alone {figures(before, 3)}"
+        if left < before
+        else ""
+    )
+    return Conclusion("unfinished", f"{UNFINISHED} {tried}{best}.", tests_of(search, first))
 
 
 def _outside(search: SearchContext, opened: Round) -> DescribedForm:
@@ -188,6 +207,7 @@ def _assembled(
     tests = judgement.tests
     effects: tuple[FoundEffect, ...] = ()
     last = outcome.refit if judgement.verdict == "no-evidence" else first
+    done = judgement.verdict != "unfinished"
     if in_place:
         last = outcome.refit
         effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, outcome.kept, strict=True))
@@ -201,7 +221,7 @@ def _assembled(
     beyond = leaves_more_than_noise(
         judgement, last, adequate=rest["adequate"], significance=search.options.significance
     )
-    findings, depend = findings_of(search, outcome, judgement, effects, with_intervals=not beyond)
+    findings, depend = findings_of(search, outcome, judgement, effects, with_intervals=not beyond) if done else ((), {})
     text = headline(judgement, findings, depend, tolerated=keeps_tolerance(search, last))
     others: tuple[StandIn, ...] = ()
     if judgement.verdict == "no-evidence":
@@ -210,8 +230,6 @@ def _assembled(
             others = stand_ins(search, last, outcome.rounds[0], tuple(moved.parameters))
             moved = beside_stand_ins(moved, others)
             findings, text = (moved,), moved.text
-    if search.spent and not in_place:
-        text = f"{text} {UNFINISHED}"
     if off := clocks(search, last):
         text = f"{text} {clock_sentence(off)}"
     if louder := contradiction(model, first.noise, LOUDER):
@@ -240,7 +258,7 @@ def _assembled(
         doubt=judgement.doubt,
         findings=findings,
         remainder={} if left is None else plain(left) | {"below_tolerance": left.below_tolerance},
-        hypotheses=compared(first, outcome),
+        hypotheses=compared(first, outcome) if done else (),
         values_by_place=FrozenMap(depend),
         stand_ins=others,
     )  # fmt: skip

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 from typing import Literal
 
+from hvdc_ident.budget import Budget
 from hvdc_ident.data import Experiment
 from hvdc_ident.errors import StudyError
 from hvdc_ident.executor import Executor, Progress
@@ -42,7 +42,7 @@ class DiagnosisOptions:
     starts: runs of the nominal multistart; None: 8, and more where only one of them came to the lowest cost.
     fallback: search for a form outside the catalogue.
     thorough: refit four times as many candidates of each effect.
-    budget: seconds after which nothing further is looked for; None: no limit.
+    budget: after which nothing further is looked for; in seconds one that begins with the diagnosis; None: no limit.
 
     Declared nuisances are estimated with the parameters; a start state is one where the card leaves it free.
     """
@@ -56,7 +56,7 @@ class DiagnosisOptions:
     starts: int | None = None
     fallback: bool = True
     thorough: bool = False
-    budget: float | None = None
+    budget: float | Budget | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.significance < 1 and self.bootstraps * self.significance >= 1):
@@ -109,7 +109,7 @@ class Course:
 class SearchContext:
     """Settings of a search, which stay over its rounds.
 
-    deadline: instant at which its budget ends (`time.monotonic`), s. held: candidates of the fit that the nominal
+    budget: after which it begins nothing further; None: no limit. held: candidates of the fit that the nominal
     model holds; stated: its other parameters, with bounds as near as they are known. records: the experiments, on their
     own clocks; none where it is not asked whether these are off.
     """
@@ -121,15 +121,15 @@ class SearchContext:
     seed: int
     executor: Executor | None = None
     course: Course | None = None
-    deadline: float = math.inf
+    budget: Budget | None = None
     held: tuple[FitParameter, ...] = ()
     stated: tuple[FitParameter, ...] = ()
     records: tuple[Experiment, ...] = ()
 
     @property
     def spent(self) -> bool:
-        """True once the budget is over, by the monotonic clock."""
-        return time.monotonic() > self.deadline
+        """True once the budget is over."""
+        return self.budget is not None and self.budget.spent
 
     def tries(self, effect: str) -> bool:
         """Return True for an effect that is searched for."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hvdc_ident.model import AnyModel
 
 
-Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable"]
+Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable", "unfinished"]
 AUGMENTED = "augmented-model.toml"
 MAX_DRAWN = 10
 """Candidates in the figure, the best by BIC."""

@@ -31,7 +31,7 @@ FIT_WORDS = {
 }
 """The first words of a verdict on the residuals."""
 
-Status = Literal["converged", "at-bound", "two-optima", "not-converged", "failed"]
+Status = Literal["converged", "at-bound", "two-optima", "not-converged", "failed", "unfinished"]
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hvdc_ident.budget import Budget, BudgetSpent
 from hvdc_ident.codec import plain
 from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.executor import Progress, StageProgress
@@ -20,12 +21,13 @@ from hvdc_ident.study.checks import steady_notes
 from hvdc_ident.study.executors import open_executor
 from hvdc_ident.study.initial_values import initial_values
 from hvdc_ident.study.plausibility import violations
-from hvdc_ident.study.stages import Stage, StageOptions, StageResult, stage, stages
+from hvdc_ident.study.stages import UNFINISHED, Stage, StageOptions, StageResult, stage, stages
 from hvdc_ident.study.store import CachingExecutor, Store, exclusive, source_hash
 from hvdc_ident.study.study import Study
 from hvdc_ident.summary import Results, RunSummary, summarise
 from hvdc_ident.summary.decisions import SUMMARISED
 from hvdc_ident.summary.levels import InitialValue
+from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
     from hvdc_ident.parallel import OpenPool, PatientPool
@@ -49,28 +51,36 @@ class Done:
     failed: str
     fresh: bool
 
+    @property
+    def unfinished(self) -> bool:
+        """True where its budget ended it."""
+        return self.data.get("status") == UNFINISHED
+
 
 def run_stage(study: Study, name: str, folder: Path, options: StageOptions) -> Done:
     """The stage's result, written to the folder together with those of the stages it builds on.
 
-    Those are kept where they stand in the folder for the same study, software and seed; the stage itself runs anew.
-    Raises InputError, with nothing written, or ComputationError.
+    Those are taken as they stand in the folder for the same study, software and seed, whatever their other options and their end;
+    the stage itself runs anew. Raises InputError, with nothing written, or ComputationError.
     """
     wanted = stage(name)
     with exclusive(folder):
-        earlier: dict[str, Any] = {}
-        rest = _rest_of(study, options)
-        for before in wanted.after:
-            earlier[before] = _kept_or_run(study, stage(before), folder, options, rest).data
-        done = _run(study, wanted, folder, options, earlier, rest)
+        done = _run_after(study, wanted, folder, options, {}, _rest_of(study, options))
         write_summary(folder, heading_of(study, options.seed))
         return done
 
 
 def have_stage(study: Study, name: str, folder: Path, options: StageOptions) -> Done:
-    """The stage's result, run only where the folder does not hold it for the same study, software and seed."""
+    """The stage's result as it stands in the folder, whatever its seed, its other options and its end; run only where there is none.
+
+    One of another state of the study, its files or the software is none.
+    """
+    wanted = stage(name)
     with exclusive(folder):
-        done = _kept_or_run(study, stage(name), folder, options, _rest_of(study, options))
+        found = _ended(study, wanted, folder)
+        if found is not None:
+            return found
+        done = _run_after(study, wanted, folder, options, {}, _rest_of(study, options))
         write_summary(folder, heading_of(study, options.seed))
         return done
 
@@ -78,8 +88,8 @@ def have_stage(study: Study, name: str, folder: Path, options: StageOptions) -> 
 def run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
     """Every stage the study asks for, in order, written to the folder; those that stand there unchanged are kept.
 
-    A stage that fails ends the run of those that build on it; the others run. One that the study does not fit (an
-    InputError) fails so, too, unless no other stage has a result: then the error is raised.
+    A stage that fails ends the run of those that build on it, but for one that asks why (`Stage.despite`); the others run. One that
+    the study does not fit (an InputError) fails so, too, unless no other stage has a result: then the error is raised.
     """
     done: dict[str, Done] = {}
     refused: dict[str, InputError] = {}
@@ -88,10 +98,14 @@ def run_all(study: Study, folder: Path, options: StageOptions) -> list[Done]:
     with exclusive(folder):
         for number, wanted in enumerate(asked, 1):
             numbered = replace(options, progress=_numbered(options.progress, number, len(asked)))
-            if any(b in refused or (b in done and done[b].failed) for b in wanted.after):
+            if options.budget is not None and options.budget.spent and _kept(study, wanted, folder, options) is None:
+                done[wanted.name] = _written(study, wanted, folder, options, _not_tried(options.budget), ())
+                continue
+            ended = {b for b in wanted.after if b in done and done[b].failed and b not in wanted.despite}
+            if ended or any(b in refused for b in wanted.after):
                 continue
             try:
-                done[wanted.name] = _kept_or_run(study, wanted, folder, numbered, rest)
+                done[wanted.name] = _kept_or_run(study, wanted, folder, numbered, done, rest)
             except InputError as error:
                 refused[wanted.name] = error
         if refused and all(d.failed for d in done.values()):
@@ -154,11 +168,26 @@ def _rest_of(study: Study, options: StageOptions) -> Rest:
     return rest
 
 
-def _kept_or_run(study: Study, wanted: Stage, folder: Path, options: StageOptions, rest: Rest) -> Done:
+def _kept_or_run(
+    study: Study, wanted: Stage, folder: Path, options: StageOptions, done: Mapping[str, Done], rest: Rest
+) -> Done:
+    """The stage's result, kept where it stands as it is asked for. done: the stages of this run so far."""
     kept = _kept(study, wanted, folder, options)
     if kept is not None:
         return Done(wanted, kept, "", fresh=False)
-    earlier = {b: _kept_or_run(study, stage(b), folder, options, rest).data for b in wanted.after}
+    return _run_after(study, wanted, folder, options, done, rest)
+
+
+def _run_after(
+    study: Study, wanted: Stage, folder: Path, options: StageOptions, done: Mapping[str, Done], rest: Rest
+) -> Done:
+    """The stage, run after those that it builds on, each of which runs only where it has not for this study and seed."""
+    earlier: dict[str, Any] = {}
+    for name in wanted.after:
+        before = done.get(name) or _ended(study, stage(name), folder)
+        if before is None or before.data["seed"] != options.seed or (before.unfinished and name not in done):
+            before = _run_after(study, stage(name), folder, options, done, rest)
+        earlier[name] = before.data
     return _run(study, wanted, folder, options, earlier, rest)
 
 
@@ -166,18 +195,71 @@ def _run(
     study: Study, wanted: Stage, folder: Path, options: StageOptions, earlier: Mapping[str, Any], rest: Rest
 ) -> Done:
     levels = rest()
+    so_far = _SoFar(options.progress)
 
     def keep(first: Mapping[str, Any]) -> None:
         """Write a first answer, marked as such, unless the folder holds the whole one from before."""
+        so_far.first = first
         if _kept(study, wanted, folder, options) is None:
             _written(study, wanted, folder, options, StageResult({"status": FIRST, **first}, failed=FIRST), levels)
 
-    progress = StageProgress(options.progress, wanted.name, wanted.phases(study))
+    budget = options.budget
+    progress: Progress = StageProgress(so_far.progress, wanted.name, wanted.phases(study))
+    inside = replace(
+        options, folder=folder, keep=keep, progress=progress if budget is None else budget.watched(progress)
+    )
     try:
-        outcome = wanted.run(study, replace(options, folder=folder, keep=keep, progress=progress), earlier)
+        with nullcontext() if budget is None else budget.timed():
+            outcome = wanted.run(study, inside, earlier)
     except ComputationError as error:
         outcome = _failed(error)
+    except BudgetSpent:
+        assert budget is not None
+        outcome = so_far.ended_by(budget, wanted)
+    if outcome.unfinished and _kept(study, wanted, folder, options) is not None:  # the whole one from before stays
+        return Done(wanted, {**heading_of(study, options.seed), **plain(outcome.data)}, outcome.failed, fresh=True)
     return _written(study, wanted, folder, options, outcome, levels)
+
+
+class _SoFar:
+    """What a stage under way has told so far, from which a result is made where its budget ends it.
+
+    first: its first answer. said: the texts of its progress, the last one at the end.
+    """
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self.first: Mapping[str, Any] = {}
+        self.said: dict[str, None] = {}
+
+    def progress(self, done: int, total: int, text: str) -> None:
+        """Pass on progress and remember its text, without the stage's name."""
+        self.said[text.partition(": ")[2]] = None
+        self._progress(done, total, text)
+
+    def ended_by(self, budget: Budget, wanted: Stage) -> StageResult:
+        """Return the result of a stage that its budget has ended: what it had come to, and what was not tried."""
+        last = next(reversed(self.said), "")
+        begun = [p for p in wanted.parts if any(t.startswith(p) for t in self.said)]
+        open_parts = [words for p, words in wanted.parts.items() if p not in begun]
+        rest = f"the rest of {wanted.parts[begun[-1]]}" if begun else ""
+        not_tried = [t for t in (rest, *open_parts) if t]
+        message = f"ended by {budget.text}" + (f" at: {last}" if last else "")
+        message += f"; not tried: {listed(not_tried)}" if not_tried else ""
+        done = [t for t in self.said if _is_outcome(t)]
+        data = {**self.first, "status": UNFINISHED, "message": message, "done": done, "not_tried": not_tried}
+        return StageResult(data, failed=message, unfinished=True)
+
+
+def _is_outcome(text: str) -> bool:
+    """Return True for progress that tells an outcome, and not what begins: how a start of a search ended."""
+    return " evaluations, " in text
+
+
+def _not_tried(budget: Budget) -> StageResult:
+    """Return the result of a stage that was not begun."""
+    message = f"not tried: {budget.text} was over"
+    return StageResult({"status": UNFINISHED, "message": message}, failed=message, unfinished=True)
 
 
 def _failed(error: HvdcIdentError) -> StageResult:
@@ -185,7 +267,12 @@ def _failed(error: HvdcIdentError) -> StageResult:
 
 
 def _written(
-    study: Study, wanted: Stage, folder: Path, options: StageOptions, outcome: StageResult, levels: tuple[InitialValue, ...]
+    study: Study,
+    wanted: Stage,
+    folder: Path,
+    options: StageOptions,
+    outcome: StageResult,
+    levels: tuple[InitialValue, ...],
 ) -> Done:
     heading = heading_of(study, options.seed)
     wrong = [] if outcome.failed else violations(wanted.name, plain(outcome.data))
@@ -193,10 +280,12 @@ def _written(
         outcome = replace(
             outcome, failed=f"what it found is not plausible, and is kept but no result: {'; '.join(wrong)}"
         )
-    mark = "" if outcome.failed else _mark(study, wanted, folder, options)
+    mark = _mark(study, wanted, folder, options)
     about = {
         "stage": wanted.name,
-        "fingerprint": mark,
+        "fingerprint": "" if outcome.failed else mark,
+        "attempt": mark,
+        "failed": outcome.failed,
         "files": list(outcome.files),
         "rest_levels": levels,
         "steady_state": steady_notes(study, searches=wanted.searches),
@@ -253,14 +342,31 @@ def standing(study: Study, name: str, folder: Path) -> tuple[dict[str, Any], str
     if data.get("sources") != dict(study.sources):
         return data, f"the {name} in {folder} is of an earlier state of the study or its files"
     if not data.get("fingerprint"):
-        end = str(data.get("message", "no reason is kept")).rstrip(".")
+        end = str(data.get("message") or data.get("failed") or "no reason is kept").rstrip(".")
         return data, f"the {name} in {folder} ended as {data.get('status', 'failed')}: {end}"
-    known: dict[str, Any] = data["options"] if isinstance(data.get("options"), dict) else {}
-    taken: dict[str, Any] = {n: tuple(known[n]) for n in wanted.takes if isinstance(known.get(n), list)}
-    taken |= {n: known[n] for n in wanted.takes if isinstance(known.get(n), float)}
-    if _kept(study, wanted, folder, StageOptions(seed=int(data.get("seed", 0)), **taken)) is None:
+    if _kept(study, wanted, folder, _asked_before(wanted, data)) is None:
         return data, f"the {name} in {folder} is of another version of hvdc_ident, or not whole"
     return data, ""
+
+
+def _ended(study: Study, wanted: Stage, folder: Path) -> Done | None:
+    """The stage as it ended in the folder, whole or not, whatever its seed and options; None where it has not on this study, its files
+    and this software."""
+    data = _read(folder / wanted.file)
+    known = _asked_before(wanted, data)
+    if not data.get("attempt") or data["attempt"] != _mark(study, wanted, folder, known) or data.get("status") == FIRST:
+        return None
+    if not data.get("failed") and _kept(study, wanted, folder, known) is None:
+        return None  # some of its files are gone
+    return Done(wanted, data, str(data.get("failed", "")), fresh=False)
+
+
+def _asked_before(wanted: Stage, data: Mapping[str, Any]) -> StageOptions:
+    """The options that decided a stage's JSON: its seed, and those that it alone takes."""
+    known: Mapping[str, Any] = data["options"] if isinstance(data.get("options"), dict) else {}
+    taken: dict[str, Any] = {n: tuple(known[n]) for n in wanted.takes if isinstance(known.get(n), list)}
+    taken |= {n: known[n] for n in wanted.takes if isinstance(known.get(n), float)}
+    return StageOptions(seed=int(data.get("seed") or 0), **taken)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from hvdc_ident.summary.gaps import SignalGap
 from hvdc_ident.summary.levels import NoiseNote
 
 Json = Mapping[str, Any]
-NO_ESTIMATES = ("failed", "not-converged")
+NO_ESTIMATES = ("failed", "not-converged", "unfinished")
 """Ends of a fit whose numbers are no estimates."""
 
 

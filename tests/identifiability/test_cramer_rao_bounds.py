@@ -113,8 +113,10 @@ def test_an_interrupt_leaves_the_first_answer_marked_as_such_and_never_instead_o
         assert "irst answer" in (tmp_path / "s-results" / "report.html").read_text()
         patch.setattr(identifiability, "identifiability", lambda *_, **__: signal.pause())
         result = run("identify", "--budget", "1")
-        assert result.exit_code == 1 and "the 1 s of --budget are over" in result.output
-        assert stands() == left
+        assert result.exit_code == 1 and "identify: ended by the budget of 1 s at: first answer" in result.output
+        ended = stands()
+        assert ended["status"] == "unfinished" and ended["fingerprint"] == "" and ended["first"] == left["first"]
+        assert "the profiles, on which the verdicts rest" in ended["not_tried"]
     assert run("identify").exit_code == 0
     whole = stands()
     assert whole["parameters"]["T"]["verdict"] == "identifiable" and "first" not in whole

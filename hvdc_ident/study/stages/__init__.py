@@ -14,11 +14,16 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hvdc_ident.budget import Budget
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.executor import Progress, silent
 
 if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
+
+
+UNFINISHED = "unfinished"
+"""Status of a result whose stage its budget has ended."""
 
 
 def unkept(data: Mapping[str, Any]) -> None:
@@ -37,8 +42,8 @@ class StageOptions:
     announce: who is told, in lines, what to know before the work begins, or while a long one goes on.
     keep: who writes a first answer, so that it stands where the work is interrupted; the stage runner sets it.
     force: candidates to fit whatever the verdict on them. folder: where results go and finished work is kept;
-    None: nothing is kept. executor: where the work is done, "" for this machine. budget: seconds after which a search that can
-    answer at any time begins nothing further; None: as the study says.
+    None: nothing is kept. executor: where the work is done, "" for this machine. budget: of the whole run; None: no limit but those
+    that the study states.
     """
 
     workers: int | None = 1
@@ -47,7 +52,7 @@ class StageOptions:
     force: tuple[str, ...] = ()
     folder: Path | None = None
     executor: str = ""
-    budget: float | None = None
+    budget: Budget | None = None
     announce: Callable[[Sequence[str]], None] = unheard
     keep: Callable[[Mapping[str, Any]], None] = unkept
 
@@ -56,12 +61,14 @@ class StageOptions:
 class StageResult:
     """The result of a stage. data: the JSON without its heading. files: text by name, written beside it.
 
-    failed: why the work did not come to an end, empty where it did; what there is, is kept all the same.
+    failed: why the work did not come to an end, empty where it did; what there is, is kept all the same. unfinished: whether that is
+    its budget, so that the same stage is to go on another time.
     """
 
     data: Mapping[str, Any]
     files: Mapping[str, str] = field(default_factory=dict)
     failed: str = ""
+    unfinished: bool = False
 
 
 def no_lines(data: Mapping[str, Any]) -> Sequence[str]:
@@ -95,12 +102,14 @@ class Stage:
 
     name: its command. file: its JSON in DIR. run: the work, given the study, the options and the data of the stages it
     builds on, by name; what the study lacks for it is a StudyError. wanted: whether `run STUDY` includes it.
-    after: the stages it builds on; they run first. order: place among the stages of a run.
+    after: the stages it builds on; they run first. despite: those of them whose failure does not end it, for it asks why. order: place
+    among the stages of a run.
     uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
     takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
     from its JSON; told_in_part: also where a part of the work failed. verdict: the same in one phrase, for the screen of a run.
     searches: whether it also runs at the start values, where a search begins; all run at the given ones. phases: how many
-    things it counts, one after the other, as progress. follow: the files that rest on its result and on those beside it in the
+    things it counts, one after the other, as progress. parts: what it does, in order: how the texts of its progress begin, and in
+    words. follow: the files that rest on its result and on those beside it in the
     folder, whatever its end was, given the study, the folder and its JSON.
     """
 
@@ -111,6 +120,7 @@ class Stage:
     wanted: Callable[[Study], bool]
     order: int
     after: tuple[str, ...] = ()
+    despite: tuple[str, ...] = ()
     uses: tuple[str, ...] = ()
     takes: tuple[str, ...] = ()
     tell: Callable[[Mapping[str, Any]], Sequence[str]] = no_lines
@@ -118,6 +128,7 @@ class Stage:
     searches: bool = False
     told_in_part: bool = False
     phases: Callable[[Study], int] = one_phase
+    parts: Mapping[str, str] = field(default_factory=dict)
     follow: Callable[[Study, Path, Mapping[str, Any]], Mapping[str, str]] = no_files
 
 

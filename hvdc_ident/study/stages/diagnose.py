@@ -8,9 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hvdc_ident.budget import TO_TELL, Budget
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.next_step import NextStep
-from hvdc_ident.study.stages import Stage, StageOptions, StageResult
+from hvdc_ident.study.stages import UNFINISHED, Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
     from hvdc_ident.discrepancy import Diagnosis
@@ -40,14 +41,28 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     with executor_of(study, options, "diagnose") as executor:
         try:
             found = diagnosed(
-                study, report, seed=options.seed, budget=options.budget, executor=executor, progress=options.progress
+                study,
+                report,
+                seed=options.seed,
+                budget=_of(options.budget),
+                executor=executor,
+                progress=options.progress,
             )
         except NothingIdentified as e:
             return StageResult({"status": "failed", "message": str(e)}, failed=str(e))
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
     beside, curves = compared(study, found)
     data = {**found.to_dict(), "sizes": sizes, **beside}
+    if found.verdict == "unfinished":
+        return StageResult(
+            {"status": UNFINISHED, **data}, {**found.files, **curves}, failed=found.text, unfinished=True
+        )
     return StageResult(data, {**found.files, **curves})
+
+
+def _of(budget: Budget | None) -> Budget | None:
+    """Return the part of a run's budget after which a diagnosis looks for nothing further."""
+    return None if budget is None else Budget(budget.to_search / (1.0 - TO_TELL), budget.clock(), budget.clock)
 
 
 def _need(study: Study) -> None:
@@ -63,11 +78,11 @@ def diagnosed(
     report: IdentifiabilityReport,
     *,
     seed: int = 0,
-    budget: float | None = None,
+    budget: Budget | None = None,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """Return the diagnosis of the study's model. report: on its candidates. budget: seconds, instead of the study's.
+    """Return the diagnosis of the study's model. report: on its candidates. budget: beside that of the study.
 
     Raises StudyError where it lacks data or candidates, NothingIdentified where the report leaves no parameter to be fitted.
     """
@@ -92,7 +107,7 @@ def diagnosed(
         places=None if asked.places is None else places_of(study.model, asked.places),
         tolerance=asked.tolerances,
         report=report,
-        options=DiagnosisOptions(most=asked.most, thorough=asked.thorough, budget=budget or asked.budget),
+        options=DiagnosisOptions(most=asked.most, thorough=asked.thorough, budget=shorter(budget, asked.budget)),
         seed=seed,
         executor=executor,
         progress=progress,
@@ -103,6 +118,11 @@ def diagnosed(
     names = ", ".join(r.name for r in study.responses)
     note = f"The measured frequency responses ({names}) are not used here: an effect is looked for in recordings alone."
     return replace(found, notes=(*found.notes, note))
+
+
+def shorter(budget: Budget | None, seconds: float | None) -> Budget | float | None:
+    """Return the one that ends first of a budget and of seconds from now."""
+    return budget if seconds is None or (budget is not None and budget.left < seconds) else seconds
 
 
 def places_of(model: AnyModel, patterns: Sequence[str]) -> list[str]:
@@ -151,9 +171,15 @@ STAGE = Stage(
     wanted=lambda study: study.settings.diagnose is not None,
     order=50,
     after=("identify", "fit"),
-    takes=("budget",),
+    despite=("fit",),
     tell=lines_of,
     verdict=verdict,
     searches=True,
     follow=follow,
+    told_in_part=True,
+    parts={
+        "the nominal model": "the fit of the model as it is",
+        "round": "rounds of candidates",
+        "before and after": "before and after",
+    },
 )

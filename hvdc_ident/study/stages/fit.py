@@ -139,5 +139,6 @@ STAGE = Stage(
     verdict=verdict,
     searches=True,
     phases=two_by_group,
+    parts={"search for the optimum": "the search for the optimum", "'": "the fits to single experiments"},
     follow=follow,
 )

@@ -79,6 +79,8 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
         options.announce([f"There is no first answer at the given values: {error}"])
         return
     rest = starts * A_START * first.seconds / (options.workers or available_cores())
+    message = "this is the first answer, from the curvature at the given values: the stage has not come to its end"
+    options.keep({"message": message, "first": first.to_dict(), "candidates": candidate_lines(study)})
     if rest < SOON:
         return
     about = (
@@ -86,8 +88,6 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
         f"of about {A_START} each, {duration(rest)} or so, then profiles. An interrupt keeps this answer and what is finished."
     )
     options.announce([*first.lines, about])
-    message = "this is the first answer, from the curvature at the given values: the stage has not come to its end"
-    options.keep({"message": message, "first": first.to_dict(), "candidates": candidate_lines(study)})
 
 
 def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
@@ -139,4 +139,12 @@ STAGE = Stage(
     verdict=verdict,
     searches=True,
     phases=two_by_group,
+    parts={
+        "first answer": "the answer at the given values",
+        "structure": "the structure of the model",
+        "search for the optimum": "the search for the optimum",
+        "profile": "the profiles, on which the verdicts rest",
+        "other optima": "other optima",
+        "what to measure next": "what to measure next",
+    },
 )
