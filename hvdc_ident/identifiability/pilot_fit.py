@@ -20,7 +20,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.errors import FitError, SimulationError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Problem, fit
-from hvdc_ident.fit.adequacy import Adequacy, adequacy
+from hvdc_ident.fit.adequacy import MATTERS, Adequacy, adequacy
 from hvdc_ident.fit.assessment import deviations_from_misfit
 from hvdc_ident.fit.descent import descend
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit
@@ -253,13 +253,19 @@ class CramerRaoBounds(Coded):
     def lines(self) -> list[str]:
         """Lines of text."""
         found = ["First answer, from the curvature at the given values; the search for the optimum follows."]
+        misses = self.chi2_per_dof is not None and self.chi2_per_dof > MATTERS
         if self.chi2_per_dof is not None:
-            found.append(f"Misfit of the given values: chi2/dof {self.chi2_per_dof:.3g}.")
+            left = ": no interval holds there, and none is told" if misses else ""
+            found.append(f"Misfit of the given values: chi2/dof {self.chi2_per_dof:.3g}{left}.")
         width = max(map(len, self.parameters), default=0)
         for name, p in self.parameters.items():
             at = f"{name:{width}}  {quantity(p.value, p.unit)}"
             if p.std is None:
                 found.append(f"{at}: not determined there, held")
+            elif misses:
+                found.append(
+                    f"{at}: determined there" + (f" with {listed(p.conditional_on)} held" if p.conditional_on else "")
+                )
             else:
                 share = f" ({100.0 * HALF_95 * p.std / abs(p.value):.2g} %)" if p.value else ""
                 held = f" with {listed(p.conditional_on)} held" if p.conditional_on else ""

@@ -70,10 +70,12 @@ class Verdict:
         return replace(self, reason=" ".join([self.reason, *(n for n in notes if n)]))
 
     def under_misfit(self) -> Verdict:
-        """Return the verdict without interval and standard deviation, what it says of them made conditional on the model."""
+        """Return the verdict without interval and standard deviation: these records refute the model that they are of."""
         if self.ci95 is None:
             return self
         reason = f"If nothing else is missing, {self.reason[:1].lower()}{self.reason[1:]}"
+        if self.verdict != "weak":
+            reason = f"If nothing else is missing, it is {self.verdict}; the model leaves more than noise, and no interval of it holds."
         return replace(self, reason=reason, ci95=None, std=None, relative_std=None)
 
 
@@ -107,7 +109,13 @@ def insensitive_verdict(
     """
     effect = "the outputs do not change at all" if rise < 1e-9 else f"it changes the cost by {rise:.2g} at most"
     why = "" if rise < 1e-9 else f", where {threshold:.3g} would be needed to see it"
-    return Verdict(free.name, "insensitive", f"Anywhere between {span(*ends, unit)} {effect}{why}. {also}".rstrip(), free.given, unit)
+    return Verdict(
+        free.name,
+        "insensitive",
+        f"Anywhere between {span(*ends, unit)} {effect}{why}. {also}".rstrip(),
+        free.given,
+        unit,
+    )
 
 
 def open_verdict(profile: Profile, words: str, unit: str) -> Verdict:

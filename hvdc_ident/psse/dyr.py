@@ -142,6 +142,16 @@ class DyrFile:
             content = content[: place[0]] + new.encode(ENCODING) + content[place[1] :]
         return _parsed(self.path, content)
 
+    def with_comment(self, record: DyrRecord, text: str) -> DyrFile:
+        """Return the file with a comment behind a record, on its last line, and every other byte as it was. text: one line of Latin-1.
+
+        record: of this file, or of the one that this file is a changed copy of.
+        """
+        last = self.records[record.number].spans[-1][1]
+        slash = self.content.index(b"/", last)
+        end = next((k for k in range(slash, len(self.content)) if self.content[k] in b"\r\n"), len(self.content))
+        return _parsed(self.path, self.content[:end] + f"// {text}".encode(ENCODING, "replace") + self.content[end:])
+
     def write(self, path: str | Path) -> Path:
         """Write the bytes of the file, whole or not at all, and return its path."""
         return write_bytes(Path(path), self.content)

@@ -136,7 +136,8 @@ def write(
         written = Written(write_linear(_reduced(source, model) if reduced else model, path))
     if selected is None:
         return written
-    note = "; ".join(t for t in (written.note, selected.note) if t)
+    told = () if written.note.startswith(selected.note) else (selected.note,)
+    note = "; ".join(t for t in (written.note, *told) if t)
     return Written(written.path, note, selected.name, selected.of, selected.next)
 
 
@@ -157,8 +158,20 @@ def _card(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOp
     from hvdc_ident.files import write_text
     from hvdc_ident.model import write_card
 
-    head = f"# {' '.join(selected.note.split())}\n" if selected else ""
-    return Written(write_text(path, head + write_card(_model(source, selected))))
+    # With an effect the values hold together; without one each is determined by itself, or the given one stands.
+    if isinstance(source, Study) and selected is not None and selected.of == "fit" and selected.name == "fitted":
+        selected = selected.determined(source.given)
+    head = "".join(f"# {line}\n" for line in _about(selected))
+    written = Written(write_text(path, head + write_card(_model(source, selected))))
+    return written if selected is None else replace(written, note=selected.note)
+
+
+def _about(selected: ValueSet | None) -> list[str]:
+    """Return the lines of a comment on values: where they are from, and of each estimate the interval."""
+    if selected is None:
+        return []
+    each = [f"{n}: {selected.values[n]:.7g} ({told})" for n, told in selected.told.items() if n in selected.values]
+    return [" ".join(selected.note.split()), *each]
 
 
 def _fmu(source: Study | Model, selected: ValueSet | None, path: Path, options: FmuOptions) -> Written:
@@ -196,8 +209,9 @@ def _parameters(source: Study | Model, selected: ValueSet | None, path: Path, _:
 
 def _dyr(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOptions) -> Written:
     """Write the .dyr file that the study's unit is from, with the selected values in its records."""
-    from hvdc_ident.plants import with_unit_values
+    from hvdc_ident.plants import part_name, with_unit_values
     from hvdc_ident.psse import read_dyr
+    from hvdc_ident.shelf import source_of
 
     asked = source.settings.model.dyr if isinstance(source, Study) else None
     if asked is None or not isinstance(source, Study):
@@ -208,13 +222,27 @@ def _dyr(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOpt
             next=(NextStep("new-unit"),),
         )
     file = read_dyr(source.path.parent / asked.file)
-    fitted = dict(selected.values) if selected else {}
-    values = {n: v for n, v in fitted.items() if n in source.candidates}
-    changed, left = with_unit_values(file, file.at(asked.bus, asked.machine), values)
-    note = f"no record has {', '.join(left)}" if left else ""
+    values = {n: selected.values[n] for n in source.candidates if n in selected.values} if selected else {}
+    if selected is not None and selected.of in ("fit", "effect"):
+        values = {n: v for n, v in values.items() if n in selected.intervals}  # what has none stays as the file has it
+    records = file.at(asked.bus, asked.machine)
+    changed, left = with_unit_values(file, records, values)
+    for record in records:
+        part = source_of(record.model)
+        if selected is not None and part is not None and changed.records[record.number].values != record.values:
+            told = [
+                f"{n} {values[n]:.7g} ({t})"
+                for n, t in selected.told.items()
+                if n.startswith(f"{part_name(part)}.") and n in values
+            ]
+            changed = changed.with_comment(record, "; ".join(told)) if told else changed
+    notes = [
+        selected.determined(source.given).note if selected else "",
+        f"no record has {', '.join(left)}" if left else "",
+    ]
     if selected is not None and selected.of == "effect":
-        note = "; ".join(t for t in (note, "a .dyr file has no place for the effect that the values hold with") if t)
-    return Written(changed.write(path), note)
+        notes.append("a .dyr file has no place for the effect that the values hold with")
+    return Written(changed.write(path), "; ".join(filter(None, notes)))
 
 
 _WRITERS: dict[str, Callable[[Study | Model, ValueSet | None, Path, FmuOptions], Written]] = {
@@ -267,10 +295,11 @@ def _linear(source: Study | Model | LinearModel, selected: ValueSet | None) -> L
 
 
 def letter(study: Study, folder: Path, options: StageOptions) -> tuple[Path, Done]:
-    """The path of the letter in the folder, and the diagnosis it is about, which is run where the folder has none, and so is the
-    comparison at the given values: the letter draws the model before and after.
+    """The path of the letter in the folder, and the diagnosis it is about.
 
-    Raises ComputationError with the reason where the diagnosis fails.
+    The diagnosis is read as it stands in the folder, whatever its options were, and run only where there is none of this study; so is
+    the comparison at the given values: the letter draws the model before and after. Raises ComputationError, with its reason, where
+    the diagnosis came to no end.
     """
     have_stage(study, "simulate", folder, options)
     done = have_stage(study, "diagnose", folder, options)

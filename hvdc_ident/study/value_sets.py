@@ -7,23 +7,23 @@ estimated together with an effect, and the model with that effect. fitted: which
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, get_args
 
 from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.errors import StudyError
-from hvdc_ident.fit import FitResult
+from hvdc_ident.fit import Estimate, FitResult
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.next_step import NextKind, NextStep
 from hvdc_ident.study.augmented import augmented_model
 from hvdc_ident.study.study import Study
-from hvdc_ident.summary.decisions import counting_of
+from hvdc_ident.summary.decisions import conditional, counting_of
 from hvdc_ident.summary.run_summary import Counting
 from hvdc_ident.summary.stage_results import NO_ESTIMATES, diagnosis_of, fit_of
-from hvdc_ident.text import figures, listed, probability_text
+from hvdc_ident.text import figures, listed, probability_text, span
 
 SetName = Literal["given", "start", "fitted", "effect", "fit"]
 SETS: tuple[SetName, ...] = get_args(SetName)
@@ -40,7 +40,8 @@ class ValueSet:
     name: as it was asked for: given, start, fitted, effect or fit. of: what they are: given, start, fit or effect. note: what is
     to be said of them, in words that stand alone: where they come from, and why they are not the fitted ones where those might
     be expected. fit, diagnosis: the fingerprints of the results that they come from. model: that they hold in, where it has an
-    effect that the study's model lacks; None where it is the study's own. next: another set that may be meant.
+    effect that the study's model lacks; None where it is the study's own. next: another set that may be meant. intervals: of 95 %, of
+    those that the records determine; unsure: of the other estimates why they have none.
     """
 
     name: SetName
@@ -51,6 +52,24 @@ class ValueSet:
     diagnosis: str = ""
     model: AnyModel | None = None
     next: tuple[NextStep, ...] = ()
+    intervals: FrozenMap[tuple[float, float]] = field(default_factory=FrozenMap)
+    unsure: FrozenMap[str] = field(default_factory=FrozenMap)
+
+    @property
+    def told(self) -> FrozenMap[str]:
+        """The interval of each estimate in words; of one without, the reason."""
+        each = {n: f"{span(low, high)}, 95 %" for n, (low, high) in self.intervals.items()}
+        return FrozenMap(each | {n: f"no interval: {why}" for n, why in self.unsure.items()})
+
+    def determined(self, given: Mapping[str, float]) -> ValueSet:
+        """Return the values without the estimates that have no interval, in whose place the given ones stand; the note says so."""
+        left = {n: v for n, v in given.items() if n in self.values and self.values[n] != v and n not in self.intervals}
+        if not left or self.of not in ("fit", "effect"):
+            return self
+        why = listed(dict.fromkeys(self.unsure.get(n, "it is held there, and not estimated") for n in left))
+        names = listed(left)
+        note = f"{self.note}; {names} as given, for only a value with a 95 % interval is written: {why}"
+        return replace(self, values=self.values | left, note=note)
 
 
 def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> ValueSet:
@@ -136,7 +155,10 @@ class _Results:
             no_fit, result = f"the fit in {folder} ended as {result.status}: {result.message}", None
         diagnosis, why = standing(study, "diagnose", folder)
         diagnosed = None if why else diagnosis_of(diagnosis)
-        marks = (fit["fingerprint"] if result is not None else "", diagnosis["fingerprint"] if diagnosed is not None else "")
+        marks = (
+            fit["fingerprint"] if result is not None else "",
+            diagnosis["fingerprint"] if diagnosed is not None else "",
+        )
         return cls(study, folder, result, no_fit, diagnosed, why if diagnosis else "", marks)
 
     @property
@@ -173,7 +195,25 @@ class _Results:
         why = [counts.doubt, f"with {counts.added} they are others" if counts.added else ""]
         note += f": {'; '.join(filter(None, why))}" if any(why) else ""
         note += f"; {self.stale}" if self.stale else ""
-        return ValueSet(name, values, note, "fit", *self.marks, next=(NextStep("values", "effect"),) if counts.added else ())
+        next_ = (NextStep("values", "effect"),) if counts.added else ()
+        known = self._known({n: fit.estimates.get(n) for n in fit.fitted}, effect=False)
+        return ValueSet(name, values, note, "fit", *self.marks, None, next_, *known)
+
+    def _known(
+        self, estimates: Mapping[str, Estimate | None], *, effect: bool
+    ) -> tuple[FrozenMap[tuple[float, float]], FrozenMap[str]]:
+        """Return the intervals of the estimates that hold, and why the others have none. effect: of the model with the effect."""
+        beyond = conditional(self.fit, self.diagnosis, effect=effect)
+        intervals, unsure = dict[str, tuple[float, float]](), dict[str, str]()
+        for n, e in estimates.items():
+            low, high = (e.ci95 if e is not None else None) or (None, None)
+            if beyond:
+                unsure[n] = "the model leaves more than the noise of these records"
+            elif low is None or high is None:
+                unsure[n] = "these records do not bound it"
+            else:
+                intervals[n] = (low, high)
+        return FrozenMap(intervals), FrozenMap(unsure)
 
     def with_effect(self, name: Literal["fitted", "effect"]) -> ValueSet:
         """Return the values fitted together with the effect, by that name, and the model that they hold in."""
@@ -183,7 +223,10 @@ class _Results:
         moved = {n: q.value for n, q in model.parameters.items() if n not in own or q.value != own[n].value}
         values = FrozenMap({n: model.parameters[n].value for n in study.given} | moved)
         note = f"{name} values of study '{study.name}', with {self.counts.added} in the model, {self._standing_of_effect()}"
-        return ValueSet(name, values, note, "effect", *self.marks, model)
+        estimates = {
+            n: self.diagnosis.estimates_after.get(n) for n in study.candidates if values.get(n) != study.given.get(n)
+        }
+        return ValueSet(name, values, note, "effect", *self.marks, model, (), *self._known(estimates, effect=True))
 
     def _standing_of_effect(self) -> str:
         """Return how sure the diagnosis is of the effect, and of its places, in words."""

@@ -139,3 +139,36 @@ def test_a_study_without_a_dyr_file_writes_none(tmp_path) -> None:
     called("new", tmp_path / "x", "--quiet")
     code, _, err = called("export", tmp_path / "x" / "study.toml", "--to", tmp_path / "y.dyr")
     assert code == 2 and "does not say which .dyr file" in err
+
+
+def test_a_value_is_written_with_its_interval_or_not_at_all(folder, tmp_path) -> None:
+    """Of a fit of the unit and of the same with the verdict that it misses its record."""
+    unit = tmp_path / "unit"
+    new = ["new", unit, "--dyr", folder / "plant.dyr", "--raw", folder / "grid.raw", "--bus", 101]
+    assert called(*new, "--from", folder / "event.csv")[0] == 0
+    assert called("fit", unit / "study.toml", "--quiet")[0] == 0
+    results = unit / "study-results" / "fit.json"
+    fit = json.loads(results.read_text())
+    code, out, _ = called("export", unit / "study.toml", "--to", tmp_path / "fitted.dyr")
+    before, after = read_dyr(folder / "plant.dyr"), read_dyr(tmp_path / "fitted.dyr")
+    written = {
+        f"{part}.{name}": (before.records[k].values[i], after.records[k].values[i], text)
+        for k, i, part, name in ((0, 4, "gen", "H"), (1, 2, "avr", "K"), (3, 1, "gov", "R"))
+        for text in [after.content.decode().splitlines()[after.records[k].line - 1]]
+    }
+    for name, (old, new_value, line) in written.items():
+        estimate = fit["estimates"].get(name)
+        if name in fit["fitted"] and None not in estimate["ci95"]:
+            assert new_value == pytest.approx(estimate["value"], rel=1e-6)
+            assert f"{name} {estimate['value']:.7g} (" in line and ", 95 %)" in line
+        else:
+            assert new_value == old and name not in line
+    assert sum(new_value != old for old, new_value, _ in written.values()) >= 2
+    fit["adequacy"]["verdict"] = "does-not-fit"
+    results.write_text(json.dumps(fit))
+    code, out, _ = called("export", unit / "study.toml", "--to", tmp_path / "kept.dyr")
+    assert code == 0 and (tmp_path / "kept.dyr").read_bytes() == (folder / "plant.dyr").read_bytes()
+    assert "as given, for only a value with a 95 % interval is written: the model leaves more than the noise" in out
+    called("export", unit / "study.toml", "--to", tmp_path / "kept.toml")
+    card = (tmp_path / "kept.toml").read_text()
+    assert hi.load_model(tmp_path / "kept.toml").values["gen.H"] == before.records[0].values[4], card[:300]
