@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
 import typer
 
-from hvdc_ident.budget import Budget
+from hvdc_ident.budget import Budget, BudgetSpent
 from hvdc_ident.errors import HvdcIdentError, InputError, one_line
 from hvdc_ident.executor import Progress, progress_bar
 from hvdc_ident.study.stages import StageOptions
@@ -303,6 +303,8 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             end(2 if isinstance(e, InputError) else 1, str(e.read_in("shell")))
         except CommandFailed as e:
             end(1, str(e))
+        except BudgetSpent as e:
+            end(1, f"{e}; what was finished is kept, and the same command goes on from there")
         except KeyboardInterrupt:
             end(130, "what was finished is kept, and the same command goes on from there")
         except BrokenPipeError:

@@ -124,13 +124,19 @@ class StageProgress:
     total is another one, or the count falls. The time left is that of the phase at its pace so far, and for each phase that
     is still to come the mean time of those so far. A line with nothing counted (0 of 1) changes the text alone.
 
-    phases: how many there will be. label: before each text. clock: returns s.
+    phases: how many there will be. label: before each text. clock: returns s. limit: returns the s that are left of a budget, within
+    which any work ends.
     """
 
     def __init__(
-        self, progress: Progress, label: str, phases: int = 1, clock: Callable[[], float] = time.monotonic
+        self,
+        progress: Progress,
+        label: str,
+        phases: int = 1,
+        clock: Callable[[], float] = time.monotonic,
+        limit: Callable[[], float] = lambda: math.inf,
     ) -> None:
-        self._progress, self._label, self._phases, self._clock = progress, label, phases, clock
+        self._progress, self._label, self._phases, self._clock, self._limit = progress, label, phases, clock, limit
         self._begun = self._last = clock()
         self._finished: list[float] = []
         self._phase: tuple[float, int, int] | None = None
@@ -157,6 +163,7 @@ class StageProgress:
         whole = (now - begun) / share
         to_come = max(0, self._phases - len(self._finished) - 1)
         left = (1.0 - share) * whole + to_come * (sum(self._finished) + whole) / (len(self._finished) + 1)
+        left = min(left, max(self._limit(), 0.0))
         elapsed = now - self._begun
         if elapsed + left > 0.0:
             self._reached = max(self._reached, min(SCALE, round(SCALE * elapsed / (elapsed + left))))

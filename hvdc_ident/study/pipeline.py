@@ -194,7 +194,7 @@ def _run_after(
 def _run(
     study: Study, wanted: Stage, folder: Path, options: StageOptions, earlier: Mapping[str, Any], rest: Rest
 ) -> Done:
-    levels = rest()
+    levels: tuple[InitialValue, ...] = ()
     so_far = _SoFar(options.progress)
 
     def keep(first: Mapping[str, Any]) -> None:
@@ -204,12 +204,14 @@ def _run(
             _written(study, wanted, folder, options, StageResult({"status": FIRST, **first}, failed=FIRST), levels)
 
     budget = options.budget
-    progress: Progress = StageProgress(so_far.progress, wanted.name, wanted.phases(study))
+    limit: dict[str, Any] = {} if budget is None else {"limit": lambda: budget.left}
+    progress: Progress = StageProgress(so_far.progress, wanted.name, wanted.phases(study), **limit)
     inside = replace(
         options, folder=folder, keep=keep, progress=progress if budget is None else budget.watched(progress)
     )
     try:
         with nullcontext() if budget is None else budget.timed():
+            levels = rest()
             outcome = wanted.run(study, inside, earlier)
     except ComputationError as error:
         outcome = _failed(error)
@@ -288,7 +290,7 @@ def _written(
         "failed": outcome.failed,
         "files": list(outcome.files),
         "rest_levels": levels,
-        "steady_state": steady_notes(study, searches=wanted.searches),
+        "steady_state": () if outcome.unfinished else steady_notes(study, searches=wanted.searches),
     }
     taken = {"options": {n: getattr(options, n) for n in wanted.takes}} if wanted.takes else {}
     implausible = {"implausible": wrong} if wrong else {}

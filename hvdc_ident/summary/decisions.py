@@ -62,7 +62,9 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
     another version, and say nothing. Without one it is that of the results. Raises InputError for what is no result.
     """
     heading = heading or stages.get("run") or stages.get("fit") or next(iter(stages.values()), {})
-    stages = {n: data for n, data in stages.items() if all(data.get(k) == heading.get(k) for k in ("sources", "software"))}
+    stages = {
+        n: data for n, data in stages.items() if all(data.get(k) == heading.get(k) for k in ("sources", "software"))
+    }
     found = StageResults.read(stages)
     counting = counting_of(found.fit, found.diagnosis)
     judgements = judgements_of(found)
@@ -125,6 +127,8 @@ def counting_of(fit: FitResult | None, diagnosis: Diagnosis | None) -> Counting:
         doubt = f"the diagnosis is ambiguous{what}"
     elif verdict == "unnameable":
         doubt = "something is missing that the diagnosis cannot name"
+    elif verdict == "unfinished":
+        doubt = "the diagnosis was ended by its budget, before it could tell whether something is missing"
     return Counting("" if fit is None or fit.status in NO_ESTIMATES else "fit", added, kind, doubt)
 
 
@@ -280,7 +284,9 @@ def _parameters(found: StageResults, counting: Counting) -> tuple[ParameterSumma
     lines = found.of_fit.candidates or found.of_identified.candidates or found.simulated.candidates
     if not lines and diagnosis is not None:
         known = diagnosis.estimates_after
-        lines = {n: Candidate(v, unit=known[n].unit if n in known else "") for n, v in diagnosis.parameters_before.items()}
+        lines = {
+            n: Candidate(v, unit=known[n].unit if n in known else "") for n, v in diagnosis.parameters_before.items()
+        }
     fitted, estimates = found.fitted, found.estimates
     later: Mapping[str, Estimate] = {} if diagnosis is None else diagnosis.estimates_after
     bounds = {n: e for n, e in estimates.items() if fitted and n not in fitted and e.method == "one-sided"}
@@ -356,7 +362,9 @@ def _findings(diagnosis: Diagnosis) -> tuple[FindingSummary, ...]:
         delay = f.equivalent_delay.value if f.equivalent_delay is not None else None
         text, listed_places = (said or f.text).rstrip("."), () if f.effect == "parameter" else places
         sizes = _quantities(f.parameters)
-        found.append(FindingSummary(f.effect, f.same_as or (f.effect,), text, f.probability, sizes, listed_places, delay))
+        found.append(
+            FindingSummary(f.effect, f.same_as or (f.effect,), text, f.probability, sizes, listed_places, delay)
+        )
     return tuple(found)
 
 

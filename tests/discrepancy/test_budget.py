@@ -10,6 +10,7 @@ import pytest
 from cases import FREE, experiments, model
 
 from hvdc_ident import Experiment
+from hvdc_ident.budget import Budget
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, hypothesis, search
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob
@@ -51,10 +52,11 @@ def test_more_is_refitted_where_a_thorough_search_is_asked_for(monkeypatch: pyte
 
 def test_a_budget_ends_the_search_and_what_was_not_tried_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(search, "REFITS_PER_EFFECT", 1)
-    options = DiagnosisOptions(bootstraps=100, budget=1e-6)
+    options = DiagnosisOptions(bootstraps=100, budget=Budget(1.0, 0.0, lambda: 2.0))
     found = diagnose(model(), rough(), FREE, effects=NAMES, options=options)
     assert any("The budget ended before" in note for note in found.notes)
     assert len({line.round for line in found.candidates}) == 1
-    # The verdict so far is of the one that was refitted; the others say why they were not.
+    # What was refitted is told as no verdict: the others, which say why they were not, may explain more.
+    assert found.verdict == "unfinished" and not found.effects and not found.findings and found.augmented is None
     status = [line.status for line in found.candidates]
     assert status.count("refitted") >= 1 and any("the budget ended" in s for s in status)
