@@ -6,12 +6,14 @@ long. What it has found by then is told; see `study/pipeline.py`.
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NoReturn
 
 from hvdc_ident.executor import Progress
@@ -40,6 +42,11 @@ class Budget:
     def of(cls, seconds: float, clock: Callable[[], float] = time.monotonic) -> Budget:
         """Return a budget that begins now."""
         return cls(seconds, clock(), clock)
+
+    @classmethod
+    def of_process(cls, seconds: float) -> Budget:
+        """Return a budget that began with this process, whose start counts for who waits for it; without a way to know, now."""
+        return cls(seconds, time.monotonic() - _age())
 
     @property
     def left(self) -> float:
@@ -88,3 +95,13 @@ class Budget:
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             signal.signal(signal.SIGALRM, before)
+
+
+def _age() -> float:
+    """Return the s since this process began, by the operating system; 0 where it does not say."""
+    stat = Path("/proc/self/stat")
+    if not stat.is_file():
+        return 0.0
+    # The 22nd field, in ticks since the system began; the second, the command in brackets, may hold blanks.
+    ticks = int(stat.read_text().rpartition(")")[2].split()[19])
+    return max(0.0, time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK"))

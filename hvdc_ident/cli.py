@@ -15,6 +15,7 @@ import typer
 
 from hvdc_ident import run_commands
 from hvdc_ident.command import (
+    OWN_PROCESS,
     Access,
     Console,
     FmuFormat,
@@ -458,4 +459,4 @@ def main() -> None:
     # The matrices are narrow: threads of the linear algebra would cost more than they save. Workers inherit this.
     for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    app()
+    app(obj=OWN_PROCESS)

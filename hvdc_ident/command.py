@@ -18,6 +18,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
+import click
 import typer
 
 from hvdc_ident.budget import Budget, BudgetSpent
@@ -86,9 +87,16 @@ Out = Annotated[Path | None, option("--out", "DIR", "Folder for results; default
 Open = Annotated[bool, typer.Option("--open", help="Open the page in the browser.")]
 
 
+OWN_PROCESS = "own process"
+"""Object of the context of a command line that has a process for itself (click's `obj`)."""
+
+
 def _budget(text: Any) -> Budget:
-    """Return a budget that begins now."""
-    return Budget.of(_number("--budget", "seconds, at least 0.001", "600", 0.001)(text))
+    """Return a budget that began with the process, where that is the command's own, else now."""
+    seconds = _number("--budget", "seconds, at least 0.001", "600", 0.001)(text)
+    context = click.get_current_context(silent=True)
+    alone = context is not None and context.find_root().obj == OWN_PROCESS
+    return Budget.of_process(seconds) if alone else Budget.of(seconds)
 
 
 WithinBudget = Annotated[

@@ -153,7 +153,7 @@ def test_a_value_is_written_with_its_interval_or_not_at_all(folder, tmp_path) ->
     before, after = read_dyr(folder / "plant.dyr"), read_dyr(tmp_path / "fitted.dyr")
     written = {
         f"{part}.{name}": (before.records[k].values[i], after.records[k].values[i], text)
-        for k, i, part, name in ((0, 4, "gen", "H"), (1, 2, "avr", "K"), (3, 1, "gov", "R"))
+        for k, i, part, name in ((0, 4, "gen", "H"), (1, 2, "avr", "K"), (3, 0, "gov", "R"))
         for text in [after.content.decode().splitlines()[after.records[k].line - 1]]
     }
     for name, (old, new_value, line) in written.items():

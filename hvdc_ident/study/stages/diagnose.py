@@ -52,7 +52,8 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             return StageResult({"status": "failed", "message": str(e)}, failed=str(e))
     sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
     beside, curves = compared(study, found)
-    data = {**found.to_dict(), "sizes": sizes, **beside}
+    asked = {"budget": None if options.budget is None else options.budget.seconds}
+    data = {**found.to_dict(), "sizes": sizes, "options": asked, **beside}
     if found.verdict == "unfinished":
         return StageResult(
             {"status": UNFINISHED, **data}, {**found.files, **curves}, failed=found.text, unfinished=True
@@ -93,8 +94,12 @@ def diagnosed(
 
     _need(study)
     asked = study.settings.diagnose or DiagnoseTable()
+    known: IdentifiabilityReport | None = report
     fitted = gate(report, diagnosis=True).fitted
-    if not fitted:
+    moving = ("at-bound", "practically-unidentifiable")
+    if not fitted and any(v.verdict in moving for v in report.parameters.values()):
+        known = None  # a search of its own, over what the records tell apart: why nothing is to be estimated is what is asked
+    elif not fitted:
         raise NothingIdentified(
             "nothing can be diagnosed: these recordings identify none of the parameters, so no gap is the model's own",
             next=(NextStep("identify"),),
@@ -106,7 +111,7 @@ def diagnosed(
         effects="all" if asked.effects == "all" else list(asked.effects),
         places=None if asked.places is None else places_of(study.model, asked.places),
         tolerance=asked.tolerances,
-        report=report,
+        report=known,
         options=DiagnosisOptions(most=asked.most, thorough=asked.thorough, budget=shorter(budget, asked.budget)),
         seed=seed,
         executor=executor,
