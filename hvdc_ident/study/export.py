@@ -304,7 +304,10 @@ def letter(study: Study, folder: Path, options: StageOptions) -> tuple[Path, Don
     have_stage(study, "simulate", folder, options)
     done = have_stage(study, "diagnose", folder, options)
     if done.failed:
-        raise ComputationError("there is no diagnosis to write a letter about", where="letter", got=done.failed)
+        goes_on = (NextStep("diagnose"),) if done.unfinished else ()
+        raise ComputationError(
+            "there is no diagnosis to write a letter about", where="letter", got=done.failed, next=goes_on
+        )
     attach(folder)
     said = (study.settings.letter or LetterTable()).model_dump()
     return write_letter(folder, Letterhead(**{**said, "date": said["date"] or date.today().isoformat()})), done
