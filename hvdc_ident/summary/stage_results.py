@@ -128,7 +128,9 @@ class StageResults:
         simulated, of_fit, of_identified = contexts
         with located("discrepancy.json"):
             beside = DiagnosisContext.from_dict(diagnosis)
-        return cls(fit_of(fit), identified_of(identified), diagnosis_of(diagnosis), simulated, of_fit, of_identified, beside)
+        return cls(
+            fit_of(fit), identified_of(identified), diagnosis_of(diagnosis), simulated, of_fit, of_identified, beside
+        )
 
     @property
     def estimates(self) -> dict[str, Estimate]:
