@@ -68,6 +68,14 @@ class Profile:
         """Evaluations of the objective for both sides."""
         return self.lower.evaluations + self.upper.evaluations
 
+    def within_bounds(self) -> Profile:
+        """Return the profile with the ends that it has if the bounds of the search hold for the other unknowns."""
+        lower, upper = (
+            s if s.leaning is None else replace(s, status="closed", limit=s.leaning, reason="")
+            for s in (self.lower, self.upper)
+        )
+        return replace(self, lower=lower, upper=upper)
+
 
 @dataclass(frozen=True, eq=False)
 class Profiles:

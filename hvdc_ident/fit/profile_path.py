@@ -16,6 +16,7 @@ from typing import Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hvdc_ident.codec import NOT_STORED
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit.descent import LONGEST, DescentResult
@@ -36,12 +37,14 @@ class Side:
 
     status: closed (limit is the crossing, or a bound set by physics that was reached); open-at-bound (the bound was
     reached first: limit is None); not-found. reason: why it is not closed, or which bound ended it.
+    leaning: where the cost rises only because others cannot leave the bounds of the search, the value at which it does.
     """
 
     status: SideStatus
     limit: float | None
     reason: str = ""
     evaluations: int = 0
+    leaning: float | None = field(default=None, metadata=NOT_STORED)
 
     @property
     def crossing(self) -> float | None:
@@ -247,12 +250,11 @@ class ProfilePath:
             high = x[k] >= self.high[k] > self.x0[k] and not above
             if k != self.i and (low or high):
                 leaning.append(u.name)
+        value = float(point.theta[self.i])
         if leaning:
-            names = ", ".join(leaning)
-            return self._ended(
-                "not-found", f"the cost rises only because {names} cannot leave the bounds of the search"
-            )
-        return self._ended("closed", "", float(point.theta[self.i]))
+            why = f"the cost rises only because {', '.join(leaning)} cannot leave the bounds of the search"
+            return Side("not-found", None, why, self.evaluations, leaning=value)
+        return self._ended("closed", "", value)
 
     def _value(self, x: float) -> float:
         full = self.x0.copy()

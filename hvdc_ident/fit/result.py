@@ -40,8 +40,8 @@ class Estimate:
 
     std: standard deviation, corrected for autocorrelated residuals; std_raw: as if they were independent; None where
     there is none, with the reason. ci95: the 95 % interval; an end that is None is not known.
-    method: "covariance" (t times std), "one-sided" (on a bound: the bound and a limit from the curvature), "between-rows" (it
-    sets the instant of a jump) or "none".
+    method: "covariance" (t times std), "profile" (up to where the cost, the others fitted again, has risen by what noise may),
+    "one-sided" (on a bound: the bound and a limit), "between-rows" (it sets the instant of a jump) or "none".
     conditional_on: parameters held without which this one could not be determined.
     ci95_independent: the interval as if the residuals were independent, where they are not.
     """

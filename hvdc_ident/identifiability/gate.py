@@ -9,8 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from hvdc_ident.errors import require_known
+import numpy as np
+
+from hvdc_ident.errors import SimulationError, require_known
+from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Estimate, FitResult, Problem
+from hvdc_ident.fit.assessment import in_final_weights
+from hvdc_ident.fit.profile import Profile
+from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
+from hvdc_ident.identifiability.practical import Assessment, profiles_of
 from hvdc_ident.identifiability.report import Held, IdentifiabilityReport
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
@@ -70,12 +77,15 @@ def gated_fit(
     *,
     force: Sequence[str] = (),
     whole: bool = True,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
 ) -> FitResult:
     """Return the fit of the identifiable set, its estimates as the report allows them to be stated.
 
     fit: does the fit it is given. Weak and local parameters get the profile's
-    interval and no std; those at a bound stand at it with their one-sided limit; forced ones are marked.
-    whole: the fit is of all data at once, as the report's profiles are; else only weak ones take theirs.
+    interval and no std; those at a bound stand at it with their one-sided limit. Where some are forced, the report's profiles are of
+    another set: those of this fit are walked, and are the intervals of all; forced ones are marked.
+    whole: the fit is of all data at once, as the report's profiles are; else only weak ones take theirs, and forced ones have none.
     Where nothing is left to fit the status is "failed" and the message says so. One that is held on a bound makes the
     status "at-bound", for that is where the fit of all would have ended.
     """
@@ -97,9 +107,13 @@ def gated_fit(
     if result.status == "failed":
         return result
     systematic = result.adequacy is not None and result.adequacy.systematic  # then neither has an interval
-    estimates = {
-        n: e if systematic else _stated(n, e, report, selection, whole=whole) for n, e in result.estimates.items()
-    }
+    if systematic:
+        estimates = dict(result.estimates)
+    elif selection.forced and whole:
+        walked = _profiles_of_fit(gated(problem, selection), result, executor, progress)
+        estimates = {n: _by_profile(n, e, walked, report, selection) for n, e in result.estimates.items()}
+    else:
+        estimates = {n: _stated(n, e, report, selection, whole=whole) for n, e in result.estimates.items()}
     on_bound = _at_bound(report, selection)
     ordered = {n: {**estimates, **on_bound}.get(n) for n in report.parameters}
     stated = FrozenMap({n: e for n, e in ordered.items() if e is not None})
@@ -116,11 +130,10 @@ def _stated(name: str, e: Estimate, report: IdentifiabilityReport, selection: Ga
     """Return an estimate in the form its verdict allows."""
     line = report.parameters[name]
     if name in selection.forced:
-        return replace(e, reason=f"forced, against the report: {line.verdict}. {line.reason}")
+        return e.without_interval(f"{_forced(line)}; of such a fit no profile is walked")
     interval = _interval(line)
     weak = line.verdict == "weak" or line.std is None
-    other_set = bool(selection.forced) or not whole
-    if interval is None or (other_set and not weak):
+    if interval is None or (not whole and not weak):
         return replace(e, std=None, std_raw=None) if weak else e
     if line.verdict == "locally-identifiable" and not interval[0] <= e.value <= interval[1]:
         return replace(e, reason=f"at another optimum than the report's. {line.reason}")
@@ -132,9 +145,63 @@ def _stated(name: str, e: Estimate, report: IdentifiabilityReport, selection: Ga
         )
     if not weak:
         return replace(e, std=line.std, ci95=interval, method="profile")
-    note = " (its interval is that of the report's own fit, of all data and without forced ones)" if other_set else ""
+    note = "" if whole else " (its interval is that of the report's own fit, of all data)"
     return replace(
         e, std=None, std_raw=None, ci95=interval, method="profile", reason=f"{line.verdict}: {line.reason}{note}"
+    )
+
+
+def _forced(line: Verdict) -> str:
+    """Return the remark on a forced estimate."""
+    return f"forced, against the report: {line.verdict}"
+
+
+def _profiles_of_fit(
+    problem: Problem, result: FitResult, executor: Executor | None, progress: Progress | None
+) -> FrozenMap[Profile]:
+    """Return the profiles around a fit's own optimum, by parameter; none where the model cannot be simulated there again."""
+    final = in_final_weights(problem, result)
+    theta = [result.values[f.name] for f in final.free]
+    theta += [result.nuisance[e.name][n].value for e in final.fitted_experiments for n in e.nuisance]
+    assessment = Assessment(final, progress=progress, placed=result.instants)
+    try:
+        return profiles_of(assessment, LocalAnalysis(final, np.array(theta, dtype=float)), executor)[1]
+    except SimulationError:
+        return FrozenMap()
+
+
+def _by_profile(
+    name: str, e: Estimate, walked: FrozenMap[Profile], report: IdentifiabilityReport, selection: Gate
+) -> Estimate:
+    """Return an estimate of a fit with forced ones, with the interval of its own profile; an end that is open is None, with the reason."""
+    line = report.parameters[name]
+    remarks = [_forced(line)] if name in selection.forced else []
+    if name not in walked:
+        return e.without_interval("; ".join([*remarks, "its profile cannot be walked: the simulation fails"]))
+    profile = walked[name].within_bounds()
+    low, high = profile.ci95
+    if profile.one_sided:
+        low, high = (e.value, high) if low is None else (low, e.value)
+    sides = (("lower", walked[name].lower), ("upper", walked[name].upper))
+    remarks += [
+        f"{end} end: {s.reason}" for end, s in sides if s.reason and not (profile.one_sided and s.limit is None)
+    ]
+    remarks += [e.reason] if e.reason else []
+    if low is None and high is None:
+        return replace(
+            e, std=None, std_raw=None, ci95=None, ci95_independent=None, method="none", reason="; ".join(remarks)
+        )
+    if (low is not None and e.value < low) or (high is not None and e.value > high):
+        return e.without_interval("; ".join([*remarks, "its profile met a lower cost elsewhere"]))
+    told = line.verdict == "identifiable" and name not in selection.forced and not profile.one_sided
+    return replace(
+        e,
+        std=e.std if told else None,
+        std_raw=e.std_raw if told else None,
+        ci95=(low, high),
+        ci95_independent=None,
+        method="one-sided" if profile.one_sided else "profile",
+        reason="; ".join(remarks),
     )
 
 

@@ -54,7 +54,7 @@ from hvdc_ident.identifiability.verdicts import (
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.sensitivity import Combination, independent, normalised, pivoted_order, rise_over_range
 from hvdc_ident.sensitivity.information import inflation_index
-from hvdc_ident.text import quantity
+from hvdc_ident.text import listed, quantity
 
 WORTH = 0.02
 """A fall of the cost by less than this share of a threshold moves no interval: the walks of profiles restart from there too."""
@@ -68,7 +68,8 @@ class Assessment:
     problem: all candidates free. verdicts: the first on each. held: reason by parameter. held_at: the value of a held one
     where that is not its start. remark: said of every parameter. quiet: no input moves. unmoved: parameters that show only
     where an input is moved that was not. ends: where the starts of the pilot fit ended, with their costs. optima: others
-    as good as the last one. placed: instants of jumps that lie between two rows, by the parameter that sets them.
+    as good as the last one. placed: instants of jumps that lie between two rows, by the parameter that sets them. opened: those held for an
+    open profile, in their order. profiled: by parameter its first profile with two ends, and how many of these were held then.
     """
 
     problem: Problem
@@ -87,6 +88,8 @@ class Assessment:
     ends: tuple[tuple[Mapping[str, float], float], ...] = ()
     optima: tuple[OtherOptimum, ...] = ()
     placed: Mapping[str, PlacedInstant] = field(default_factory=dict)
+    opened: list[str] = field(default_factory=list)
+    profiled: dict[str, tuple[Profile, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.free: dict[str, FitParameter] = {f.name: f for f in self.problem.free}
@@ -240,11 +243,15 @@ def profile_remaining(
     """
     restarts = 0
     while optimum is not None:
-        optimum, by_name = _profiles(assessment, optimum, executor)
+        optimum, by_name = profiles_of(assessment, optimum, executor)
         limits = {n: assessment.thresholds[n] for n in optimum.names}
         reach = assessment.profile_options.reach
         ranges = {n: range_of(assessment.free[n], p.value, reach) for n, p in by_name.items()}
-        still_open = [n for n, p in by_name.items() if not bounded(p) or undetermined(optimum, p, ranges[n])]
+        flat = {n for n, p in by_name.items() if undetermined(optimum, p, ranges[n])}
+        still_open = [n for n, p in by_name.items() if not bounded(p) or n in flat]
+        for n, p in by_name.items():
+            if n not in flat and p.within_bounds().closed:
+                assessment.profiled.setdefault(n, (p, len(assessment.opened)))
         if not still_open:
             assessment.report_stage("other optima")
             others = other_optima(optimum, limits, assessment.ends)
@@ -268,10 +275,11 @@ def profile_remaining(
         if combo:
             assessment.combinations.append(replace(combo, held=(least,)))
         optimum = assessment.hold(optimum, {least: assessment.verdicts[least].reason})
+        assessment.opened.append(least)
     return None
 
 
-def _profiles(
+def profiles_of(
     assessment: Assessment, optimum: LocalAnalysis, executor: Executor | None
 ) -> tuple[LocalAnalysis, FrozenMap[Profile]]:
     """Return the optimum that the profiles start from, a better one where they met it, and the profiles by name.
@@ -341,6 +349,29 @@ def _open_combination(assessment: Assessment, optimum: LocalAnalysis, opened: Se
     return found[0] if len(found[0].members) > 1 else None
 
 
+def _with_held_free(assessment: Assessment, profile: Profile) -> Profile:
+    """Return the profile with those free, inside their bounds, that came to be held later; that with them held where there is none.
+
+    Those were held because these data do not bound them; an interval beside a value at which one is held would not hold for others.
+    profile: of the set that is fitted, whose best value is to lie in the interval.
+    """
+    earlier, _ = assessment.profiled.get(profile.name, (profile, 0))
+    if earlier is profile or profile.one_sided or earlier.one_sided:
+        return profile
+    earlier = earlier.within_bounds()
+    low, high = earlier.ci95
+    assert low is not None and high is not None
+    # The estimate is that beside the held ones.
+    return replace(earlier, value=profile.value) if low <= profile.value <= high else profile
+
+
+def _std_of(profile: Profile) -> float:
+    """Return the standard deviation that a closed profile's interval would have as a normal distribution's."""
+    low, high = profile.ci95
+    assert low is not None and high is not None
+    return 0.5 * (high - low) / HALF_95
+
+
 def _judge_closed(assessment: Assessment, optimum: LocalAnalysis, by_name: Mapping[str, Profile]) -> None:
     """Add the verdicts on the set whose profiles are closed."""
     seen = _beside_instants(assessment, optimum)
@@ -362,16 +393,37 @@ def _judge_closed(assessment: Assessment, optimum: LocalAnalysis, by_name: Mappi
             assessment.judge(at_bound_verdict(profile, free, physical[n][int(profile.value >= free.max)], unit))
             continue
         best = max(shares, key=lambda e: shares[e][n])
-        low, high = profile.lower.limit, profile.upper.limit
+        judge = partial(
+            closed_verdict,
+            free=free,
+            collinearity=float(index[i]),
+            partner=partner(seen, i),
+            best=f"'{best}'",
+            unit=unit,
+        )
+        whole = _with_held_free(assessment, profile)
+        std = spread[n].std if whole is profile and not assessment.placed else max(spread[n].std, _std_of(whole))
+        verdict = judge(whole, std=std)
+        if whole is not profile and not assessment.profiled[n][0].closed and verdict.verdict == "weak":
+            # Where the ends are those of the bounds of the search, what the records tell beside a held one is told instead.
+            whole = profile
+            verdict = judge(profile, std=spread[n].std)
+        low, high = whole.lower.limit, whole.upper.limit
         assert low is not None and high is not None
-        std = spread[n].std if not assessment.placed else max(spread[n].std, 0.5 * (high - low) / HALF_95)
-        verdict = closed_verdict(profile, free, std, float(index[i]), partner(seen, i), f"'{best}'", unit)
         rivals = [o for o in assessment.optima if o.rise < profile.threshold and not low <= o.values[n] <= high]
         if rivals:
             verdict = local_verdict(verdict, [o.values[n] for o in rivals], rivals[0].rise)
-        given = conditional.get(n, ())
+        first_free = assessment.profiled[n][1] if whole is not profile else len(assessment.opened)
+        later = assessment.opened[first_free:]
+        given = tuple(
+            dict.fromkeys(m for m in (*conditional.get(n, ()), *assessment.opened[:first_free]) if m not in later)
+        )
         verdict = replace(verdict, conditional_on=given)
-        if n in assessment.verdicts:  # a member of a combination: its verdict stands, its interval is of the fitted set
+        if later:
+            verdict = verdict.noted(f"It holds for every {listed(later)} within the bounds.")
+        elif (
+            n in assessment.verdicts
+        ):  # a member of a combination: its verdict stands, its interval is of the fitted set
             first = assessment.verdicts[n]
             verdict = replace(verdict, verdict=first.verdict, reason=first.reason).noted(
                 f"With {', '.join(given)} held it is {verdict.reason.removeprefix('It is ')}" if given else ""

@@ -13,10 +13,12 @@ from typer.testing import CliRunner
 from hvdc_ident.cli import app
 from hvdc_ident.errors import UnknownNameError
 from hvdc_ident.fit import FitParameter, Problem, fit
+from hvdc_ident.fit.descent import descend
+from hvdc_ident.fit.uncertainty import TWO_SIDED
 from hvdc_ident.identifiability import gate, gated_fit, identifiability
 from hvdc_ident.parameters import Parameter
 from tests.fit.simulators import line, recorded
-from tests.identifiability.cases import closed, line_and_nothing, measured, product
+from tests.identifiability.cases import closed, line_and_nothing, measured, product, saturating
 
 
 def both(plant, data, free, force=()):
@@ -56,7 +58,9 @@ def test_what_a_fit_elsewhere_than_the_report_may_state() -> None:
     problem = Problem(plant, tuple(data), (FitParameter("a", -line.value, -5, 5), free[1]))
     there = gated_fit(problem, report, partial(fit, starts=1))
     a, b = there.estimates["a"], there.estimates["b"]
-    assert a.value == pytest.approx(-line.value, rel=1e-3) and a.reason.startswith("at another optimum than the report's")
+    assert a.value == pytest.approx(-line.value, rel=1e-3) and a.reason.startswith(
+        "at another optimum than the report's"
+    )
     assert a.ci95[0] < a.value < a.ci95[1] and a.method == "covariance"
     assert b.ci95 == report.parameters["b"].ci95 and b.method == "profile"
     # Of records with another offset b is not where the report has it: a known one keeps the fit's own interval, a weak one none.
@@ -98,6 +102,72 @@ def test_forced_ones_are_fitted_and_marked() -> None:
     assert gate(report, ("c", "a")).forced == ("c",)
     with pytest.raises(UnknownNameError, match="no candidate 'd'"):
         gate(report, ("d",))
+
+
+def two_decays(t, p):
+    """y = a1 exp(-t/t1) + a2 exp(-t/t2)."""
+    e1, e2 = np.exp(-t / p["t1"]), np.exp(-t / p["t2"])
+    slopes = {"a1": e1, "a2": e2, "t1": p["a1"] * e1 * t / p["t1"] ** 2, "t2": p["a2"] * e2 * t / p["t2"] ** 2}
+    return p["a1"] * e1 + p["a2"] * e2, slopes
+
+
+def test_the_interval_of_a_forced_one_is_that_of_its_profile() -> None:
+    """Two decays that hide each other, all forced: at every end the cost, the others fitted inside their bounds, has risen by 1.92."""
+    truth = {"a1": 3.0, "a2": -5.0, "t1": 2.0, "t2": 10.0}
+    plant = closed(two_decays, **truth)
+    free = [
+        FitParameter("a1", 3, 0.01, 50), FitParameter("a2", -5, -50, -0.01),
+        FitParameter("t1", 2, 0.05, 20), FitParameter("t2", 10, 0.5, 100),
+    ]  # fmt: skip
+    data = [measured(plant, {}, 0.2, seed=3, t=np.linspace(0.3, 10.0, 100))]
+    report, found = both(plant, data, free, force=tuple(truth))
+    problem, k = Problem(plant, tuple(data), tuple(free)), 0
+    assert report.parameters["a1"].verdict == "practically-unidentifiable"
+    theta = np.array([found.values[n] for n in problem.names])
+    for i, name in enumerate(problem.names):
+        e = found.estimates[name]
+        forced = name not in report.identifiable
+        assert e.method == "profile" and e.reason.startswith("forced") == forced and not (forced and e.std)
+        for end in (v for v in e.ci95 if v is not None and problem.unknowns[i].min < v < problem.unknowns[i].max):
+            begin = theta.copy()
+            begin[i] = end
+            rise = descend(problem, begin, np.arange(4) == i, enough=1e-6).at.cost - found.cost
+            assert rise == pytest.approx(TWO_SIDED, rel=0.01), (name, end)
+            k += 1
+    assert k >= 4
+    # Of a fit in other terms than the report's no profile is walked, and a forced one has no interval.
+    other = gated_fit(problem, report, partial(fit, starts=2), force=tuple(truth), whole=False).estimates["a1"]
+    assert (other.method, other.ci95, other.std) == ("none", None, None) and "no profile" in other.reason
+
+
+def test_an_interval_beside_a_held_one_holds_wherever_that_one_may_be() -> None:
+    """A line a t + b, b <= 0, which these data leave open at its bound: it is held, two standard deviations off.
+
+    The interval of a is that over every b within the bounds, though its value is that beside b as it is held.
+    """
+    t = np.linspace(0.0, 1.0, 30)
+    y = 2.0 * t - 0.017 + 0.1 * np.random.default_rng(3).standard_normal(30)
+    plant = closed(lambda t, p: (p["a"] * t + p["b"], {"a": t, "b": np.ones_like(t)}), a=1.5, b=-0.1)
+    free = [FitParameter("a", 1.5, 0.0, 5.0), FitParameter("b", -0.1, -1.0, 0.0)]
+    report, found = both(plant, [recorded("e", t, {"y": 0.1}, y=y)], free)
+    a = found.estimates["a"]
+    assert found.values["b"] == -0.1 and a.conditional_on == () and report.parameters["a"].verdict == "identifiable"
+    grid = np.linspace(1.0, 3.0, 20_001)
+    b = np.clip(np.mean(y) - grid * np.mean(t), -1.0, 0.0)
+    cost = 0.5 * np.sum((y - np.outer(grid, t) - b[:, None]) ** 2, axis=1) / 0.1**2
+    inside = grid[cost <= cost.min() + TWO_SIDED]
+    assert a.ci95 == pytest.approx((inside[0], inside[-1]), abs=2e-4)
+    assert a.value == pytest.approx(float(t @ (y + 0.1) / (t @ t)), rel=1e-6)
+
+
+def test_an_interval_that_the_records_give_only_beside_a_held_one_is_marked() -> None:
+    """Of a rise the record shows neither the rate nor the end: beside the held rate the end is known."""
+    rise = closed(saturating, a=1.0, k=1.0)
+    free = [FitParameter("a", 1.0, 0.1, 100.0), FitParameter("k", 1.0, 0.001, 20.0)]
+    report, found = both(rise, [measured(rise, {"a": 2.0, "k": 0.7}, 0.1, t=np.linspace(0, 1, 50))], free)
+    a = report.parameters["a"]
+    assert found.fitted == ("a",) and found.estimates["a"].conditional_on == a.conditional_on == ("k",)
+    assert a.verdict == "practically-unidentifiable" and "With k held" in a.reason
 
 
 def test_nothing_identifiable_is_no_success() -> None:
@@ -160,7 +230,9 @@ def test_the_commands(study) -> None:
     assert result.exit_code == 0, result.output
     said = result.stdout.splitlines()
     assert said[0].startswith("k     identifiable: It is known to ±") and said[1].startswith("flat  ")
-    assert any("none narrows the interval of flat further" in line for line in said) and said[-1].startswith("identify: done")
+    assert any("none narrows the interval of flat further" in line for line in said) and said[-1].startswith(
+        "identify: done"
+    )
     folder = study.parent / "study-results"
     report = json.loads((folder / "identifiability.json").read_text())
     assert {"schema", "study", "model", "software", "seed"} <= set(report)

@@ -102,7 +102,10 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
 def _conditions(fit: FitResult, about: Context) -> list[str]:
     """The held parameters on whose values the estimates rest: those that these records do not tell, yet answer to."""
     given = {n for e in fit.estimates.values() for n in e.conditional_on}
-    given |= {n for n, why in fit.held.items() if why.startswith(("practically-unidentifiable", "not-judged"))}
+    # A profile says on which held values its interval rests; of other intervals any of these may be one.
+    unknown = any(e.method == "covariance" for e in fit.estimates.values())
+    asked = ("practically-unidentifiable", "not-judged") if unknown else ("not-judged",)
+    given |= {n for n, why in fit.held.items() if why.startswith(asked)}
     names = ", ".join(n for n in about.candidates if n in given and n in fit.held)
     if not names or not fit.fitted:
         return []
