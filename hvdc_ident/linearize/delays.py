@@ -16,6 +16,8 @@ from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.system import Array, CompiledSystem, Layout
 from hvdc_ident.model import Model
 
+EPS = float(np.finfo(float).eps)
+
 
 @dataclass(frozen=True, eq=False)
 class SchurComplement:
@@ -32,8 +34,11 @@ class SchurComplement:
 
 
 def eliminate(matrix: Array, rows: int, columns: int) -> SchurComplement:
-    """Return the Schur complement that removes the rows and columns after the given counts.
+    """Return the Schur complement that removes the rows and columns after the given counts; what rounding leaves of a 0 in it is 0.
 
+    An entry no larger than the rounding of the terms that it is the sum of may be of either sign: a state that its unknowns only seem
+    to act back on would be a slow, perhaps a growing one. (Error of a product and of a solution with d, entry by entry: Higham,
+    Accuracy and Stability of Numerical Algorithms, 3.5 and 7.2.)
     A singular block gives the condition infinity and a result that must not be used.
     """
     a, b, c, d = matrix[:rows, :columns], matrix[:rows, columns:], matrix[rows:, :columns], matrix[rows:, columns:]
@@ -50,8 +55,11 @@ def eliminate(matrix: Array, rows: int, columns: int) -> SchurComplement:
     if not np.isfinite(condition) or condition > 1e15:
         return SchurComplement(a, np.inf, b, c)
     inverse = np.linalg.inv(scaled / size_c) / size_c[:, None] / size_r[None, :]
-    right = np.linalg.solve(d, c)
-    return SchurComplement(a - b @ right, condition, b @ inverse, right)
+    right, left = np.linalg.solve(d, c), b @ inverse
+    result = a - b @ right
+    terms = np.abs(a) + np.abs(b) @ np.abs(right) + np.abs(left) @ (np.abs(c) + np.abs(d) @ np.abs(right))
+    rounding = (1 + d.shape[0]) * EPS * terms
+    return SchurComplement(np.where(np.abs(result) <= rounding, 0.0, result), condition, left, right)
 
 
 MAX_ORDER = 12

@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 import scipy.linalg
 
-from hvdc_ident.linearize.delays import Channel
-from hvdc_ident.linearize.stability import EPS, Change, Roots, counted_eigenvalues, first_roots
+from hvdc_ident.linearize.delays import EPS, Channel
+from hvdc_ident.linearize.stability import Change, Roots, counted_eigenvalues, first_roots
 from hvdc_ident.linearize.system import Array
 
 

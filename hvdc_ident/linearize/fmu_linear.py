@@ -11,12 +11,13 @@ from hvdc_ident.errors import LinearizationError, ModelError, SimulationError, S
 from hvdc_ident.fmu import FmuModel, FmuPoint, at_point, smooth_inputs
 from hvdc_ident.fmu.differences import ParameterRuns, extrapolated_difference, together
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.linearize.delays import EPS
 from hvdc_ident.linearize.equilibrium import EquilibriumSearch, PointOptions, solved
 from hvdc_ident.linearize.kinds import LinearOptions
 from hvdc_ident.linearize.limits import Limit
 from hvdc_ident.linearize.linear_model import Gradient, LinearModel
 from hvdc_ident.linearize.point import OperatingPoint, unstable_by
-from hvdc_ident.linearize.stability import EPS, Characteristic, quartered
+from hvdc_ident.linearize.stability import Characteristic, quartered
 from hvdc_ident.linearize.system import Array, Layout
 from hvdc_ident.model import External
 

@@ -13,10 +13,10 @@ from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, ModelError, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.lazy import method
-from hvdc_ident.linearize.delays import eliminate
+from hvdc_ident.linearize.delays import EPS, eliminate
 from hvdc_ident.linearize.descriptor import Descriptor
 from hvdc_ident.linearize.point import OperatingPoint
-from hvdc_ident.linearize.stability import EPS, Change, Characteristic
+from hvdc_ident.linearize.stability import Change, Characteristic
 from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:

@@ -18,14 +18,13 @@ from scipy.sparse.csgraph import connected_components
 from hvdc_ident.codec import Coded, stored_as
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize.characteristic import NEUTRAL, Part, Undecided, reaches, spectral_radius
-from hvdc_ident.linearize.delays import Channel, SchurComplement, eliminate
+from hvdc_ident.linearize.delays import EPS, Channel, SchurComplement, eliminate
 from hvdc_ident.linearize.sampling import multipliers
 from hvdc_ident.linearize.system import Array
 
 EIGENVALUES = "eigenvalues of A"
 COUNTED = "roots of the exact characteristic equation, counted by the argument principle"
 MULTIPLIERS = "multipliers over the period of the sampled blocks (modes: without aliases)"
-EPS = float(np.finfo(float).eps)
 ON_AXIS = 1e-9
 """Damping below which rounding may hide on which side of the imaginary axis an eigenvalue lies."""
 TOLERANCES = (1e-12, 1e-10, 1e-8)
@@ -417,7 +416,9 @@ def with_errors(matrix: Array, error: float = EPS) -> tuple[Array, Array]:
     first = moved / np.maximum(np.abs((left.conj() * right).sum(axis=0)), 1e-300)
     apart = np.abs(values[:, None] - values)
     np.fill_diagonal(apart, np.inf)
-    gap = np.maximum(apart.min(axis=1), np.sqrt(moved * np.abs(values)) + 1e-300)  # of two computed as one, that of their errors
+    gap = np.maximum(
+        apart.min(axis=1), np.sqrt(moved * np.abs(values)) + 1e-300
+    )  # of two computed as one, that of their errors
     return values, gap * first / (0.5 * gap + np.sqrt(0.25 * gap**2 + gap * first))
 
 
@@ -510,7 +511,10 @@ def poles_of_transfer(equation: Characteristic, where: str) -> tuple[int, Array]
     nearest = roots.values[np.argsort(np.abs(roots.values.real), kind="stable")[: roots.axis]]
     axis = nearest[np.argsort(np.abs(nearest), kind="stable")[sliding_means(equation) :]]
     if not any(c.kind == "delay" for c in equation.channels):
-        return right.size, axis  # of a minimal realisation; or logarithms of multipliers, which are no roots of the pencil
+        return (
+            right.size,
+            axis,
+        )  # of a minimal realisation; or logarithms of multipliers, which are no roots of the pencil
     whole = equation.whole
 
     def shown(root: complex) -> bool:

@@ -6,7 +6,7 @@ import pytest
 from hvdc_ident.errors import ModelError, SteadyStateError, UnknownNameError
 from hvdc_ident.expression import parse
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.linearize import continuation, find_operating_point, point_at
+from hvdc_ident.linearize import continuation, find_operating_point, linearize, point_at
 from hvdc_ident.model import Model, Output, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter
@@ -136,3 +136,30 @@ def test_a_point_away_from_rest_solves_its_unknowns(link):
     assert point.outputs["P2"] == pytest.approx(0.6, abs=1e-12)
     with pytest.raises(UnknownNameError):
         point_at(link, {"Vdc1": 1.0})
+
+
+@pytest.mark.parametrize("place", ["signals", "algebraic"])
+def test_an_integrator_whose_terms_cancel_to_rounding_is_at_the_limit(place):
+    """x' = 3 a x - b x + u with 3 a = b: in floating point 0.3 - 3 * 0.1 is -6e-17, and of the other sign as often as not."""
+    table = {"v": "3*a*x"} if place == "signals" else {"v": {"equation": "3*a*x + 0*v"}}
+
+    def linear(b):
+        states = {"x": {"derivative": "v - b*x + u", "start": "0"}}
+        return linearize(
+            Model(
+                "cancels",
+                parameters={"a": 0.1, "b": b},
+                inputs={"u": 0.0},
+                states=states,
+                outputs={"y": "x"},
+                **{place: table},
+            )
+        )
+
+    assert 3 * 0.1 - 0.3 > 0
+    found = linear(0.3)
+    assert found.stability().verdict == "on the limit of stability" and found.point.stable and not found.point.notes
+    assert found.A.tolist() == [[0.0]]
+    # What is no rounding stays.
+    grows = linear(0.3 - 1e-13)
+    assert grows.stability().verdict == "unstable" and grows.A[0, 0] == pytest.approx(1e-13, rel=1e-2)
