@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import chdtrc, fdtri
 
+from hvdc_ident.codec import NOT_STORED
 from hvdc_ident.data import FLOOR_SHARE, MAD_TO_STD, Array, Experiment
 from hvdc_ident.fit.noise import GIVEN, MISFIT, from_misfit, scatter_of, source_of
 from hvdc_ident.fit.problem import Problem
@@ -78,7 +79,8 @@ class Adequacy:
     stated. outputs: by output, of all its records together, or of one that alone is above its noise. signals: by output and
     experiment. text: the verdict in words, empty where it fits; next: what to do, the first thing first.
     systematic: whether a residual is more than a noise that is known: the model lacks something, which moves the estimates by
-    what no residual tells. Rows alone do not tell correlated noise from that.
+    what no residual tells. Rows alone do not tell correlated noise from that. foretold: by output of which no noise is known how many
+    times the residual is what earlier rows do not foretell of it, where that is less than half of its power.
     """
 
     verdict: Verdict
@@ -88,6 +90,17 @@ class Adequacy:
     next: tuple[NextStep, ...] = ()
     systematic: bool = False
     signals: FrozenMap[FrozenMap[ResidualSize]] = field(default_factory=FrozenMap)
+    foretold: FrozenMap[float] = field(default_factory=FrozenMap, metadata=NOT_STORED)
+
+    @property
+    def structure(self) -> FrozenMap[float]:
+        """By output how many times the residual is what can be white noise in it, where more than half of its power is not.
+
+        White noise is what was stated or, where nothing was, the scatter from row to row, and where no rows show that, what earlier
+        rows of the residual do not foretell of it. Of noise that is not known this may be the noise's own colour.
+        """
+        found = {o: s.times for o, s in self.outputs.items() if s.verdict in TOO_LARGE and s.times is not None}
+        return FrozenMap(found) | self.foretold
 
     @property
     def widening(self) -> float:
@@ -128,24 +141,29 @@ def adequacy(
     chi2 = power / (sum(b.residual.size for b in known) * share) if known else None
     verdict = min((s.verdict for s in sizes.values()), key=WORST_FIRST.index)
     systematic = any(s.verdict == "does-not-fit" and not from_misfit(sources[o]) for o, s in sizes.items())
-    text, advice = _sentence(sizes, verdict, sources, systematic=systematic)
-    return Adequacy(verdict, chi2, FrozenMap(sizes), text, advice, systematic, FrozenMap(signals))
+    foretold = _foretold([o for o, s in sizes.items() if s.verdict == "not-judged"], blocks)
+    text, advice = _sentence(sizes, verdict, sources, foretold, systematic=systematic)
+    return Adequacy(verdict, chi2, FrozenMap(sizes), text, advice, systematic, FrozenMap(signals), foretold)
 
 
-def structure_left(judged: Adequacy, blocks: Sequence[ResidualBlock]) -> FrozenMap[float]:
-    """Return by output how many times the residual is what can be white noise in it, where more than half of its power is not.
-
-    blocks: the residuals that were judged. White noise is what was stated or, where nothing was, the scatter from row to row, and where
-    no rows show that, the part of the residual that earlier rows of it do not foretell. Of noise that is not known this may be the
-    noise's own colour.
-    """
-    found = {o: s.times for o, s in judged.outputs.items() if s.verdict in TOO_LARGE and s.times is not None}
-    for output in (o for o, s in judged.outputs.items() if s.verdict == "not-judged"):
+def _foretold(outputs: Sequence[str], blocks: Sequence[ResidualBlock]) -> FrozenMap[float]:
+    """Return, by output, `foretold` of an `Adequacy`."""
+    found = {}
+    for output in outputs:
         parts = [b.residual[part] for b in blocks if b.output == output for part in b.stretches]
         share = innovation_share(autoregression([r - r.mean() for r in parts]))
         if share * MATTERS < 1.0:
             found[output] = 1.0 / math.sqrt(share)
     return FrozenMap(found)
+
+
+def structure_text(foretold: Mapping[str, float]) -> str:
+    """Return in words what a residual leaves of which no noise is known; empty where nothing. foretold: as of an `Adequacy`."""
+    return "; ".join(
+        f"the residual of {o} is {times_text(times)} what its earlier rows do not foretell: a better optimum may exist, the model may "
+        "lack something, or the noise is correlated"
+        for o, times in foretold.items()
+    )
 
 
 def sizes_of_runs(
@@ -305,11 +323,16 @@ def _quantile(dof: float, behind: float, chance: float) -> float:
 
 
 def _sentence(
-    sizes: Mapping[str, ResidualSize], verdict: Verdict, sources: Mapping[str, str], *, systematic: bool
+    sizes: Mapping[str, ResidualSize],
+    verdict: Verdict,
+    sources: Mapping[str, str],
+    foretold: Mapping[str, float],
+    *,
+    systematic: bool,
 ) -> tuple[str, tuple[NextStep, ...]]:
     """Return the verdict in words, and what to do."""
     parts = [_line(o, s, sources[o]) for o, s in sizes.items() if s.verdict == verdict]
-    text = "; ".join(p for p in parts if p)
+    text = "; ".join(p for p in (structure_text(foretold), *parts) if p)
     if verdict == "does-not-fit":
         return f"{text}: {MOVED if systematic else CORRELATED}", (NextStep("diagnose"),)
     values = ", ".join(

@@ -15,7 +15,7 @@ import numpy as np
 from hvdc_ident.data import MAD_TO_STD, Array
 from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
-from hvdc_ident.fit.adequacy import adequacy, structure_left
+from hvdc_ident.fit.adequacy import adequacy
 from hvdc_ident.fit.fit_parameter import starting_points
 from hvdc_ident.fit.jump_instants import within_own_stretches
 from hvdc_ident.fit.noise import MISFIT, floor_of, models_before_event, source_text
@@ -212,7 +212,7 @@ def leaves_more_than_noise(problem: Problem, theta: Array) -> bool:
     blocks = problem.blocks(theta, derivatives=False)
     rho, effective = samples_by_output(blocks, theta.size)
     sources = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
-    return bool(structure_left(adequacy(problem, blocks, sources, effective, rho), blocks))
+    return bool(adequacy(problem, blocks, sources, effective, rho).structure)
 
 
 def slack_of(cost: float, unit: float = 1.0, effective_share: float = 1.0) -> float:

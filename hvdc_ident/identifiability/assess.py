@@ -16,6 +16,7 @@ from hvdc_ident.data import Experiment
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter, FitResult, Problem, Simulator
+from hvdc_ident.fit.adequacy import structure_text
 from hvdc_ident.fit.frequency_data import WithResponses, in_time
 from hvdc_ident.fit.jump_instants import moving_parameters
 from hvdc_ident.fit.noise import unknown_noise
@@ -202,6 +203,7 @@ def _assembled(
             first.misfit,
             dict(first.uncertainty.effective),
             dict(result.noise_source),
+            structure_left=structure_text(first.adequacy.foretold),
         ),
         notes=(*assessment.notes, CONDITIONS),
         not_judged=unjudged,

@@ -22,7 +22,7 @@ from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.next_step import NextStep, next_sentence
 from hvdc_ident.sensitivity import Collinear, Combination
-from hvdc_ident.text import interval_text
+from hvdc_ident.text import capital, interval_text
 
 CONDITIONS = (
     "Every verdict holds for these outputs, experiments, noise and bounds, at the optimum of the pilot fit; with other "
@@ -49,7 +49,8 @@ class Contribution:
 class Pilot:
     """The pilot fit at whose optimum the verdicts stand.
 
-    search_doubt: in words, that one start alone reached the lowest cost. starts: how many; ends: their outcomes. cost, chi2_per_dof: at
+    search_doubt: in words, that one start alone reached the lowest cost. structure_left: in words, what it leaves of outputs of which no
+    noise is known, where that is not white. starts: how many; ends: their outcomes. cost, chi2_per_dof: at
     the optimum of all that is structurally admissible. effective_samples, noise_source: by output. groups: the pilot fits of a
     report by groups, each with its `parameters`; of all together there is none then.
     """
@@ -65,6 +66,13 @@ class Pilot:
     noise_source: Mapping[str, str] = field(default_factory=dict)
     parameters: tuple[str, ...] = field(default=(), metadata=stored_as("parameters", optional=True))
     groups: tuple[Pilot, ...] = field(default=(), metadata=stored_as("groups", optional=True))
+    structure_left: str = field(default="", metadata=stored_as("structure_left", optional=True))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What is to be said before any verdict, a sentence each: that the optimum may not be the best, or leaves structure."""
+        own = (self.search_doubt, self.structure_left)
+        return (*(f"{capital(d)}." for d in own if d), *(d for group in self.groups for d in group.doubts))
 
     def ends_over(self, names: Sequence[str]) -> tuple[StartOutcome, ...]:
         """Return the outcomes of the search over these parameters, for a fit of them to take up; none where it made none.
@@ -145,20 +153,28 @@ class IdentifiabilityReport(Coded, Shown):
         return axes
 
     def _screen(self) -> Iterator[str | Table]:
-        fitted = ", ".join(self.identifiable) or "none"
-        yield f"Identifiable: {fitted} (of {len(self.parameters)} asked about)."
-        rows = [(n, v.verdict, v.value, v.unit, interval_text(v.ci95)) for n, v in self.parameters.items()]
-        yield Table(("parameter", "verdict", "value", "unit", "95 % interval"), tuple(rows))
-        yield "\n".join(f"{n}: {v.reason}" for n, v in self.parameters.items())
         signs = self.misspecification
+        yield "\n".join(self.pilot.doubts)
         if signs.flag:
             yield f"The model does not explain these data: {'; '.join(signs.signs)}."
             yield next_sentence(NextStep("diagnose"), "python")
+        yield self._counted()
+        rows = [(n, v.verdict, v.value, v.unit, interval_text(v.ci95)) for n, v in self.parameters.items()]
+        yield Table(("parameter", "verdict", "value", "unit", "95 % interval"), tuple(rows))
+        yield "\n".join(f"{n}: {v.reason}" for n, v in self.parameters.items())
         if self.recommended is not None:
             yield f"Measure next: {self.recommended.text}"
         elif self.not_recommended:
             yield self.not_recommended
         yield "\n".join(self.notes)
+
+    def _counted(self) -> str:
+        """Return the parameters that are identifiable, those that a fit estimates all the same, and those that it holds."""
+        told = [n for n, v in self.parameters.items() if v.verdict == "identifiable"]
+        also = [n for n in self.identifiable if n not in told]
+        text = f"Identifiable: {', '.join(told) or 'none'} (of {len(self.parameters)} asked about)."
+        text += f" A fit estimates {', '.join(also)} too, as the table says." if also else ""
+        return f"{text} It holds {', '.join(self.held)}." if self.held else text
 
     def __str__(self) -> str:
         return "\n\n".join(str(block) for block in self._screen() if block)  # reasons stay whole: they are searched for

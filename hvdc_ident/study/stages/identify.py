@@ -98,11 +98,9 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     from hvdc_ident.next_step import NextStep, next_sentence
     from hvdc_ident.summary import summarise
     from hvdc_ident.summary.stage_results import identified_of
-    from hvdc_ident.text import capital
-
     report = identified_of(data)
     width = max(map(len, report.parameters), default=0)
-    lines = [f"{capital(report.pilot.search_doubt)}."] if report.pilot.search_doubt else []
+    lines = [*report.pilot.doubts]
     beside = ""
     if report.misspecified:
         signs = "; ".join(report.misspecification.signs)
