@@ -9,7 +9,7 @@ import pytest
 from hvdc_ident.errors import ComputationError, UnknownNameError
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.identifiability import identifiability
-from tests.fit.simulators import line
+from tests.fit.simulators import line, recorded
 from tests.identifiability.cases import closed, line_and_nothing, measured
 
 mpl.use("Agg")
@@ -75,3 +75,15 @@ def test_the_collinearity_of_an_offset_and_a_slope_is_that_of_their_columns() ->
     assert found[0]["index"] == pytest.approx(1.0 / np.sqrt(1.0 - cosine), rel=1e-6)
     alone = identifiability(LINE, data, FREE[:1], held={"b": 2.0}, starts=1)
     assert alone.collinear == ()
+
+
+def test_what_the_optimum_leaves_is_said_before_any_verdict() -> None:
+    """A line through a wave, of which no noise is known; and one through a line, whose first line counts its verdicts alone."""
+    t = np.linspace(0.0, 10.0, 120)
+    plant = closed(lambda t, p: (p["a"] * t + p["b"], {"a": t, "b": np.ones_like(t)}), a=1.5, b=0.1)
+    free = [FitParameter("a", 1.5, -5.0, 5.0), FitParameter("b", 0.1, -3.0, 3.0)]
+    wave = identifiability(plant, [recorded("e", t, {}, y=np.sin(1.1 * t) + 0.3 * t)], free, starts=1)
+    assert str(wave).startswith("The residual of y is") and "earlier rows do not foretell" in wave.pilot.doubts[0]
+    straight = identifiability(plant, [measured(plant, {}, 0.1, t=t)], free, starts=1)
+    told = [n for n, v in straight.parameters.items() if v.verdict == "identifiable"]
+    assert str(straight).startswith(f"Identifiable: {', '.join(told)} (of 2 asked about).") and straight.pilot.doubts == ()
