@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hvdc_ident.data.level_steps import without_steps
+from hvdc_ident.data.rounding import RoundedNoise, distinct_levels, flicker_of, resolution, rounded_noise
 from hvdc_ident.data.signals import distinct, robust_std
 from hvdc_ident.data.trajectory import Array, is_even
 
@@ -34,12 +36,6 @@ TANH = np.linspace(-0.55, 3.0, 72)
 RHO = np.tanh(TANH)
 COLOURED = 1.645
 """Standard errors that a coefficient lies off 0 if it is one (5 %, one-sided)."""
-FLICKER = 0.58
-"""Standard error of the logarithm of the noise that the flicker of one record tells, for it stands on few levels; of k records over
-sqrt(k). By simulation of noise of 0.3 steps, as the next."""
-FREEDOM_OF_ROUNDED = 12.0
-"""Degrees of freedom of the standard deviation of a record whose rounding no noise hides: by where its level lies between two steps
-it scatters by 20 %, whatever the noise and the number of rows."""
 
 _ANY = np.tanh(np.linspace(-0.5, 3.5, 21))  # lag-1 coefficients of noise that a motion is compared with, to 0.998
 _WHITE = np.concatenate([[0.0], np.geomspace(1e-2, 1e2, 9)])  # white noise beside that of first order, in its variances
@@ -50,7 +46,6 @@ _LIKELIER = math.log(1000.0)  # of two likelihoods
 _LONGEST = 1000  # rows in which a motion is looked for, the last of a longer record: tens of milliseconds
 _PIECE = 500  # rows of a record that are taken as one in a likelihood
 _SPREADS = 0.0, 0.1, 0.2, 0.4, 0.8, 1.6  # of artanh(rho) among outputs that are told together, as a standard deviation
-_QUANTISED_CHANGES = 20  # changes needed before a resolution is read off them
 _SCATTER_ERROR = 0.9  # standard error of the logarithm of `row_scatter`, times the root of the number of rows
 _SMOOTH = 0.05  # see `is_smooth`
 _SLOW = 0.5  # lag-1 coefficient from which the noise of a rounded record is coloured, and not white noise that flickers
@@ -117,8 +112,10 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> N
     step, records = resolution(v), [quiet.values]
     if is_coarse(records, step):
         flicker = flicker_of([v], step)
-        std = rounded_std(step, flicker)
-        return NoiseEstimate(std, FREEDOM_OF_ROUNDED, ROUNDED) if flicker else NoiseEstimate(source=ROUNDED)
+        if flicker == 0.0 and not np.any(quiet.values):
+            return NoiseEstimate(source=ROUNDED)
+        found = below_rounding(records, step, flicker)
+        return NoiseEstimate(found.std, found.freedom, ROUNDED)
     if white_std(records) <= noise_floor(v):
         return NoiseEstimate(source=ESTIMATED)
     if not is_even(t):
@@ -134,8 +131,8 @@ def input_noise(time: ArrayLike, values: ArrayLike, event: float | None) -> Inpu
     if found.source != ROUNDED:
         return InputNoise(found.std, found.std)
     step = resolution(v)
-    flicker = step * flicker_of([v], step)
-    return InputNoise(math.hypot(step / math.sqrt(12.0), flicker), flicker, step / math.sqrt(12.0))
+    below = math.sqrt(max(found.std**2 - step**2 / 12.0, 0.0))
+    return InputNoise(math.hypot(step / math.sqrt(12.0), below), below, step / math.sqrt(12.0))
 
 
 def before_event(time: Array, values: Array, event: float | None) -> NDArray[np.bool_]:
@@ -163,18 +160,26 @@ def quiet_rows(
     rows = np.flatnonzero(before_event(time, values, event))
     moves = np.zeros(time.size) if run is None else run
     size = np.ones(time.size) if profile is None else profile
-    first, least = 0, FEWEST_QUIET
+    first, least, known, step = 0, FEWEST_QUIET, noise_floor(values), resolution(values)
     while rows.size - first >= least:
         own = rows[first:]
-        rest, near = without_line(time[own], values[own] - moves[own], size[own], noise_floor(values))
+        floor = max(known, _least_gap(values[own]) / math.sqrt(12.0)) if step == 0.0 else known
+        rest, near = without_line(time[own], values[own] - moves[own], size[own], floor)
         motion = (moves[own] - moves[own].mean()) / size[own]
         if motion @ motion <= math.sqrt(2.0 / rest.size) * (rest @ rest):
             if not at_rest(rest):
                 break
-            return QuietRows(own[near], rest[near], first)
+            # Only now: steps enough come close to any motion.
+            return QuietRows(own[near], without_steps(rest[near], known), first)
         first, least = first + (rows.size - first + 1) // 2, ENOUGH
     none = np.zeros(0, dtype=np.intp)
     return QuietRows(none, np.zeros(0), rows.size if rows.size >= FEWEST_QUIET else 0)
+
+
+def _least_gap(values: Array) -> float:
+    """Return the smallest difference of different values, a step of a rounding that too few rows tell of; 0 of one value."""
+    gaps = np.diff(distinct_levels(values))
+    return float(gaps.min()) if gaps.size else 0.0
 
 
 def without_line(
@@ -423,56 +428,25 @@ def noise_floor(values: ArrayLike) -> float:
     return max(FLOOR_SHARE * float(np.ptp(v)), resolution(v) / math.sqrt(12.0)) if v.size else 0.0
 
 
-def resolution(values: ArrayLike) -> float:
-    """Return the step that a record's values are rounded to, in its unit; 0 where they are not, or too few change to tell.
-
-    values: (n,), NaN where not recorded. It is the smallest change between rows, where every change is a multiple of it, as a
-    converter or few written digits make them.
-    """
-    v = np.asarray(values, dtype=float)
-    v = v[np.isfinite(v)]
-    change = np.diff(v)
-    change = change[change != 0]
-    if change.size < _QUANTISED_CHANGES:
-        return 0.0
-    size = np.abs(change)
-    step = float(size.min())
-    if step < 16 * np.finfo(float).eps * float(np.abs(v).max()):
-        return 0.0
-    multiple = np.round(size / step)
-    if (np.abs(size - multiple * step) > 0.01 * step).any():
-        return 0.0
-    # a ramp changes by one step in every row, too: different multiples, or a value that flickers, tell a quantised one
-    flickers = float(np.mean(change[1:] * change[:-1] < 0)) > 0.25
-    return step if flickers or np.unique(multiple).size >= 3 else 0.0
-
-
 def is_coarse(records: Sequence[Array], step: float) -> bool:
-    """Return whether the noise in rows at rest, less their lines, is white and too small to hide that they are rounded."""
-    power = sum(float(r @ r) for r in records)
-    slow = sum(float(r[1:] @ r[:-1]) for r in records) > _SLOW * power
-    # Noise of more than a step hides the rounding, which is then white noise of step/sqrt(12) beside it.
-    return step > 0.0 and (power == 0.0 or (white_std(records) < step and not slow))
+    """Return whether the noise in rows at rest, less their lines, is too small to hide that they are rounded.
 
-
-def flicker_of(records: Sequence[Array], step: float) -> float:
-    """Return the standard deviation of the white noise below a quantiser, in its steps, from how much records flicker.
-
-    records: (n,) all rows of each, for one level tells only its own flicker: none in the middle of a step, most at its edge. Noise
-    of sigma steps makes rounded values scatter by sigma/sqrt(pi) (variance, averaged over where the level lies between
-    two steps) while it is below a third of a step, and by sigma^2 + 1/12 above.
+    Noise of more than a step hides it, which is then white noise of step/sqrt(12) beside it; slow noise does from that size on, for
+    its rows are rounded to several levels in turn.
     """
-    recorded = [r[np.isfinite(r)] for r in records]
-    bends = np.concatenate([np.diff(r, 2) / step for r in recorded] or [np.zeros(1)])
-    power = np.sort(bends**2)
-    scatter = float(power[: max(1, int(0.98 * power.size))].mean()) / 6.0  # the largest are the events
-    low = scatter * math.sqrt(math.pi)
-    return low if low < 1.0 / 3.0 else math.sqrt(max(scatter - 1.0 / 12.0, 0.0))
+    return step > 0.0 and white_std(records) < (step if _lag_one(records) <= _SLOW else step / math.sqrt(12.0))
 
 
-def rounded_std(step: float, flicker: float) -> float:
-    """Return the standard deviation of rounded values: of the rounding, and of the noise below it, flicker in steps."""
-    return step * math.sqrt(1.0 / 12.0 + flicker**2)
+def below_rounding(records: Sequence[Array], step: float, flicker: float) -> RoundedNoise:
+    """Return the noise of rows at rest, less their lines, that `is_coarse`. flicker: what all rows tell, in steps."""
+    slow = max(_lag_one(records), 0.0)
+    return rounded_noise(records, step, flicker, (1.0 - slow) / (1.0 + slow))
+
+
+def _lag_one(records: Sequence[Array]) -> float:
+    """Return the correlation of neighbouring rows; 0 of rows that are all equal."""
+    power = sum(float(r @ r) for r in records)
+    return sum(float(r[1:] @ r[:-1]) for r in records) / power if power else 0.0
 
 
 def _line(count: int) -> Array:

@@ -31,21 +31,18 @@ from hvdc_ident.data import (
 )
 from hvdc_ident.data.noise import (
     ESTIMATED,
-    FLICKER,
-    FREEDOM_OF_ROUNDED,
     ROUNDED,
     SCATTER,
     Colour,
     FirstOrder,
     QuietRows,
+    below_rounding,
     common_colours,
-    flicker_of,
     freedom_of_scatter,
     is_coarse,
-    resolution,
-    rounded_std,
     white_std,
 )
+from hvdc_ident.data.rounding import flicker_of, resolution
 from hvdc_ident.errors import StudyError
 from hvdc_ident.fit.likelihood import QuantisedNoise
 from hvdc_ident.fit.whitening import AR, FEWEST, autoregression, sum_of_squares
@@ -416,18 +413,11 @@ def _noise(pool: _Pool, colour: Colour) -> OutputNoise:
     if not pool.rows and pool.scatter is not None and not pool.step:
         return _from_scatter(found, *pool.scatter)
     if pool.step and (still or is_coarse(pool.records, pool.step)):
-        # A level tells its own flicker only: none in the middle of a step, most at its edge. So all rows are asked.
-        rounded = rounded_std(pool.step, pool.flicker)
-        if given is not None and given >= rounded:
+        # A level tells its own flicker only: none in the middle of a step, most at its edge. So all rows are asked beside those at rest.
+        told = below_rounding(pool.records, pool.step, pool.flicker)
+        if given is not None and given >= told.std:
             return replace(found, std=given)
-        count = len(pool.own) or 1
-        return replace(
-            found,
-            std=rounded,
-            error=FLICKER / math.sqrt(count),
-            source=ROUNDED,
-            freedom=int(FREEDOM_OF_ROUNDED * count),
-        )
+        return replace(found, std=told.std, error=told.error, source=ROUNDED, freedom=max(round(told.freedom), 1))
     if still:
         return replace(found, std=None, source=MISFIT)
     freedom = max(pool.rows - 2 * len(pool.records), 1)

@@ -8,7 +8,9 @@ from scipy.signal import lfilter
 from scipy.stats import binom, chi2, t
 
 from hvdc_ident.data import noise_estimate, quiet_rows, without_line
-from hvdc_ident.data.noise import ESTIMATED, ROUNDED, SCATTER, FirstOrder, resolution
+from hvdc_ident.data.level_steps import without_steps
+from hvdc_ident.data.noise import ESTIMATED, ROUNDED, SCATTER, FirstOrder
+from hvdc_ident.data.rounding import resolution
 from hvdc_ident.data.trajectory import Array
 
 AFTER = 120
@@ -110,3 +112,42 @@ def test_the_resolution_is_that_of_the_rounding() -> None:
     values[3] = np.nan
     assert resolution(values) == pytest.approx(0.25, rel=1e-12)
     assert resolution(random.standard_normal(100)) == 0.0
+
+
+@pytest.mark.parametrize("digits", [1e-1, 1e-2, 1e-3])
+def test_a_recorders_step_is_seen_through_the_digits_of_its_file(digits: float) -> None:
+    """A step of 0.1831 with two decimals makes levels 0.18 and 0.19 apart; both round, so that their errors add up."""
+    step = 750.0 / 4096.0
+    values = np.round((200.0 + 4.0 * np.random.default_rng(2).standard_normal(400)) / step) * step
+    assert resolution(np.round(values / digits) * digits) == pytest.approx(np.hypot(step, digits), rel=1e-2)
+    assert resolution(values.astype(np.float32).astype(float)) == pytest.approx(step, rel=1e-2)
+
+
+@pytest.mark.parametrize("noise", [0.3, 0.6, 1.2])
+def test_rounded_rows_show_their_noise_though_most_lie_on_one_level(noise: float) -> None:
+    step, found = 750.0 / 4096.0, []
+    for seed in range(20):
+        time, values, event = record(50, seed)
+        seen = np.round(np.round(200.0 / step + noise * values) * step, 2)
+        found.append(noise_estimate(time, seen, event).std)
+    assert min(found) > 0.0
+    assert np.median(found) == pytest.approx(np.hypot(step, 0.01) * np.hypot(noise, 1.0 / np.sqrt(12.0)), rel=0.12)
+
+
+def test_a_step_of_the_level_is_no_noise() -> None:
+    for rho, rows in ((0.0, 60), (0.6, 200)):
+        stepped, plain = [], []
+        for seed in range(10):
+            time, values, event = record(rows, seed, rho)
+            plain.append(noise_estimate(time, values, event).std)
+            stepped.append(noise_estimate(time, values + 8.0 * (time > 0.4 * event), event).std)
+        assert np.median(np.array(stepped) / np.array(plain)) == pytest.approx(1.0, abs=0.05)
+
+
+def test_noise_is_seldom_taken_for_steps_of_the_level() -> None:
+    for rho in (0.0, 0.6, 0.9):
+        seen = 0
+        for seed in range(60):
+            rows = without_line(np.arange(60.0), record(60, seed, rho)[1][:60])[0]
+            seen += not np.array_equal(without_steps(rows), rows)
+        assert seen <= binom.ppf(0.999, 60, 0.03)
