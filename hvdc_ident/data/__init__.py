@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hvdc_ident.data.bad_rows import BadRows, bad_rows, gaps
 from hvdc_ident.data.contradiction import Contradiction
 from hvdc_ident.data.experiment import Experiment, SignalLike, experiment, recording_lines
 from hvdc_ident.data.noise import (
@@ -41,6 +42,7 @@ __all__ = [
     "PREFIXES",
     "UNITS",
     "Array",
+    "BadRows",
     "Contradiction",
     "Experiment",
     "InputNoise",
@@ -52,10 +54,12 @@ __all__ = [
     "SignalLike",
     "Trajectory",
     "at_rest",
+    "bad_rows",
     "before_event",
     "conversion",
     "event_time",
     "experiment",
+    "gaps",
     "input_noise",
     "input_signal",
     "is_even",

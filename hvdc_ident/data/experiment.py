@@ -190,11 +190,12 @@ class Experiment(Shown):
 
     @property
     def recording(self) -> dict[str, Any]:
-        """Return what became of the file's rows: {rows, dropped, jumps, time_unit, time_column, converted, notes, not_recorded}.
+        """Return what became of the file's rows: {rows, dropped, jumps, time_unit, time_column, converted, notes, not_recorded,
+        contradictions}.
 
         rows: compared or not. dropped: of the file, left out. jumps: instants with two rows. time_unit: as the file or
         the study says it, None where neither does (then s). notes: what else the reader of the file has to tell.
-        not_recorded: by output the number of rows without a value.
+        not_recorded: by output the number of rows without a value. contradictions: stretches that cannot be right, with times in s.
         """
         origin = self.measured.origin if self.measured is not None else Origin()
         gaps = {o: self.measured.gaps(o) for o in self.outputs} if self.measured is not None else {}
@@ -207,6 +208,10 @@ class Experiment(Shown):
             "converted": list(origin.converted),
             "notes": list(origin.notes),
             "not_recorded": {o: n for o, n in gaps.items() if n},
+            "contradictions": [
+                {"kind": c.kind, "columns": list(c.columns), "times": list(c.times or ()), "text": c.text}
+                for c in origin.contradictions
+            ],
         }
 
 

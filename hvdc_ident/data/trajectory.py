@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.codec import Coded, read_fields
+from hvdc_ident.data.contradiction import Contradiction
 from hvdc_ident.display import Shown, Table, axes_of, data_frame, first_rows, library
 from hvdc_ident.errors import StudyError, WaveformError, unknown_name
 from hvdc_ident.text import with_unit
@@ -33,7 +34,7 @@ class Origin:
     s in any case. time_column: the column that the time came from, where it was not the first. converted: the signals whose
     unit was changed to the model's, in words. notes: what else a reader has to tell, in words. records: the names of signals that
     were recorded together, where several records of other instants make up the rows; () where all stand at all rows. since: ns since
-    1970 of the first row, where the file counts times so in whole numbers, else 0.
+    1970 of the first row, where the file counts times so in whole numbers, else 0. contradictions: rows that cannot be right.
     """
 
     rows: int = 0
@@ -44,6 +45,7 @@ class Origin:
     notes: tuple[str, ...] = ()
     records: tuple[tuple[str, ...], ...] = ()
     since: int = 0
+    contradictions: tuple[Contradiction, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

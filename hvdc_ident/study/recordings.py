@@ -44,6 +44,7 @@ from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
 from hvdc_ident.study import schema
+from hvdc_ident.study.left_out import RowsLeftOut
 from hvdc_ident.summary.levels import NoiseNote
 from hvdc_ident.toml_tables import check_names
 
@@ -209,6 +210,8 @@ def _experiment(
     mapped = {s: scaled(data[c], mappings[s][0]) for s, c in columns.items()}
     mapped |= {s: mapped[s] + offset for s, (_, offset) in mappings.items() if offset != 0.0}
     mapped |= {s: _in_frame(table, s, time, mapped[s], place) for s in columns if same_unit(_unit(model, s), "rad")}
+    out = RowsLeftOut(table, time, {s: data[c] for s, c in columns.items()}, _turns(model, mappings))
+    mapped = {s: out.without(s, time, v, bridged=s not in table.outputs) for s, v in mapped.items()}
     inputs = {}
     for s in (*table.inputs, *table.drive):
         rows = data.own_rows(columns[s])
@@ -238,6 +241,7 @@ def _experiment(
         time_unit=_time_unit(table, data.origin),
         converted=(*data.origin.converted, *(line for line in converted if line)),
         records=tuple(tuple(s for s, c in columns.items() if c in record) for record in data.origin.records),
+        contradictions=out.contradictions,
     )
     measured = Trajectory(time, np.column_stack([mapped[o] for o in outputs]), outputs, units, origin)
     instrument = {o: line.model_dump(by_alias=True, exclude_none=True) for o, line in table.instrument.items()}
@@ -378,6 +382,11 @@ def _in_frame(table: schema.ExperimentTable, signal: str, time: Array, angle: Ar
     line = table.columns.get(signal)
     turn = line.turn if line is not None else None
     return unwrapped(angle) if turn is None else unwrapped(angle) - 2.0 * np.pi * turn * (time - time[0])
+
+
+def _turns(model: AnyModel, mappings: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Return a whole turn of each signal that is an angle, in the unit of its column."""
+    return {s: 2.0 * np.pi / abs(m[0]) for s, m in mappings.items() if same_unit(_unit(model, s), "rad")}
 
 
 def _conversion_words(

@@ -88,6 +88,11 @@ def _rising(ends: list[float]) -> list[float]:
     return ends
 
 
+def _not_falling(ends: list[float]) -> list[float]:
+    """The ends of a span, which may be one instant."""
+    return ends if ends[0] == ends[1] else _rising(ends)
+
+
 def _check_spread(low: float, high: float, scale: str) -> None:
     """Raise ValueError where values cannot be spread from min to max."""
     if not low < high:
@@ -108,6 +113,7 @@ Axes = Annotated[list[Name], Field(min_length=1, max_length=2), BeforeValidator(
 Two = Annotated[list[Name], Field(min_length=2, max_length=2)]
 Three = Annotated[list[Name], Field(min_length=3, max_length=3)]
 Range = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2), AfterValidator(_rising)]
+Span = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2), AfterValidator(_not_falling)]
 Band = Annotated[list[NotNegative], Field(min_length=2, max_length=2), AfterValidator(_rising)]
 Texts = Annotated[dict[Name, Name], ByName()]
 Columns = Annotated[dict[Name, Name], BeforeValidator(_column_by_name, json_schema_input_type=Names | Texts)]
@@ -341,6 +347,10 @@ class ExperimentTable(TomlTable):
     event: FiniteFloat | None = optional("Instant at which an input first moves. If left out, found from the inputs.", "event = 0.1", "s")
     window: Range | None = optional(
         "First and last instant that are compared. If left out, the whole recording.", "window = [0.0, 0.8]", "s")
+    leave_out: Annotated[dict[Name, list[Span]], ByName()] | None = optional(
+        "By signal: spans of time whose rows are no measurement. Those of an output are not compared; over those of an input it follows "
+        "the line between the rows beside them, and no output is compared there. If left out, the rows that cannot be right, which `check` "
+        "names. {} leaves out none.", "leave_out = {P = [[1.65, 1.72]]}", "s", of="signal of the experiment")
     values: Numbers = optional("Inputs that are constant in this experiment at other than the model's values.",
         "values = {Pref2 = 0.5}", "the model's", default={}, of="input")
     trim: Columns = optional(

@@ -1,0 +1,119 @@
+"""Rows of an experiment that are left out: as the study states, or else those that cannot be right; and what to write about these."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hvdc_ident.data import Array, BadRows, Contradiction, bad_rows, gaps
+from hvdc_ident.data.signals import HOLD_SHARE
+from hvdc_ident.model.card import toml_key
+from hvdc_ident.study import schema
+
+CUT = ("angle step", "gap")
+"""Kinds after which nothing that follows belongs to what was before: no row can be left out for them."""
+
+
+class RowsLeftOut:
+    """The rows of one experiment that are left out, by signal, and the contradictions that were found in the others.
+
+    rows: (n,) by signal. contradictions: of the recording, each with what to write.
+    """
+
+    def __init__(
+        self, table: schema.ExperimentTable, time: Array, columns: Mapping[str, Array], angles: Mapping[str, float]
+    ) -> None:
+        """Find the rows. columns: (n,) by signal, as recorded. angles: a whole turn in the units of those that are angles."""
+        stated = table.leave_out
+        self.rows = {s: _inside(time, (stated or {}).get(s, ())) for s in columns}
+        compared = _inside(time, [table.window] if table.window is not None else [[-np.inf, np.inf]])
+        needed = time <= (table.window[1] if table.window is not None else np.inf)  # an input is, from the first row on
+        asked = {
+            s: np.where((compared if s in table.outputs else needed) & ~self.rows[s], v, np.nan)
+            for s, v in columns.items()
+        }
+        bad = list(bad_rows(time, asked, table.event, angles))
+        inputs = [asked[s] for s in (*table.inputs, *table.drive)]
+        if any(
+            np.mean(v[1:] == v[:-1]) < HOLD_SHARE for v in inputs if v.size > 1
+        ):  # one that is held is known in a gap too
+            bad += [b for b in gaps(time) if needed[b.last]]
+        self.contradictions = tuple(_contradiction(b, bad, table, time, applied=stated is None) for b in bad)
+        if stated is None:
+            for b in (b for b in bad if b.kind not in (*CUT, "constant")):
+                for s in b.columns:
+                    self.rows[s][b.first : b.last + 1] = True
+        # Where an input is not known, what the model answers to it is not either.
+        unknown = np.logical_or.reduce(
+            [self.rows[s] for s in (*table.inputs, *table.drive)] or [np.zeros(time.size, dtype=bool)]
+        )
+        for o in table.outputs:
+            self.rows[o] = self.rows[o] | unknown
+
+    def without(self, signal: str, time: Array, values: Array, *, bridged: bool) -> Array:
+        """Return the values without the rows that are left out: NaN, or bridged by the line between the rows beside them."""
+        out = self.rows[signal]
+        kept = ~out & np.isfinite(values)
+        if not out.any() or (bridged and not kept.any()):
+            return values
+        return np.where(out, np.interp(time, time[kept], values[kept]) if bridged else np.nan, values)
+
+
+def _inside(time: Array, spans: Iterable[Sequence[float]]) -> NDArray[np.bool_]:
+    """Return (n,) which rows lie in one of some spans, whose ends may be rounded as text rounds them."""
+    slack = 1e-6 * float(np.median(np.diff(time))) if time.size > 1 else 0.0
+    found = np.zeros(time.size, dtype=bool)
+    for low, high in spans:
+        found |= (time >= low - slack) & (time <= high + slack)
+    return found
+
+
+def _contradiction(
+    b: BadRows, bad: Sequence[BadRows], table: schema.ExperimentTable, time: Array, *, applied: bool
+) -> Contradiction:
+    """Return what is said of a stretch. applied: whether its rows are left out already, without the study saying so."""
+    first, last = float(time[b.first]), float(time[b.last])
+    if b.kind == "constant":
+        return Contradiction(b.kind, table.name, b.what, b.columns, write=_without_column(b, table))
+    several = b.last > b.first
+    where = (
+        f"rows {b.first + 1} to {b.last + 1} ({first:.6g} to {last:.6g} s)"
+        if several
+        else f"row {b.first + 1} ({first:.6g} s)"
+    )
+    what = f"{where}: {b.what}"
+    if b.kind not in CUT and applied:
+        what += "; left out here, though the study does not say so"
+    write = _window(b, table, time) if b.kind in CUT else _spans(bad, table, time)
+    return Contradiction(b.kind, table.name, what, b.columns, (b.first + 1, b.last + 1), (first, last), write)
+
+
+def _spans(bad: Sequence[BadRows], table: schema.ExperimentTable, time: Array) -> str:
+    """Return the line that leaves out every stretch of the experiment that can be."""
+    spans: dict[str, list[tuple[float, float]]] = {
+        s: [(v[0], v[1]) for v in spans] for s, spans in (table.leave_out or {}).items()
+    }
+    for b in bad:
+        if b.kind not in (*CUT, "constant"):
+            for s in b.columns:
+                spans.setdefault(s, []).append((float(time[b.first]), float(time[b.last])))
+    lines = (f"{toml_key(s)} = [{', '.join(f'[{a:.12g}, {b:.12g}]' for a, b in found)}]" for s, found in spans.items())
+    return f"leave_out = {{{', '.join(lines)}}}"
+
+
+def _window(b: BadRows, table: schema.ExperimentTable, time: Array) -> str:
+    """Return the line that ends the comparison before a stretch; "" where nothing would be left."""
+    start = table.window[0] if table.window is not None else float(time[0])
+    return f"window = [{start:.12g}, {time[b.first]:.12g}]" if _inside(time, [(start, time[b.first])]).sum() > 2 else ""
+
+
+def _without_column(b: BadRows, table: schema.ExperimentTable) -> str:
+    """Return the line of the outputs without a column that says nothing; "" where it is an input, or no output is left."""
+    left = {o: c for o, c in table.outputs.items() if o not in b.columns}
+    if b.columns[0] not in table.outputs or not left:
+        return ""
+    from hvdc_ident.model.card import toml_string
+
+    return f"outputs = {{{', '.join(f'{toml_key(o)} = {toml_string(c)}' for o, c in left.items())}}}"
