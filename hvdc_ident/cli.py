@@ -22,7 +22,6 @@ from hvdc_ident.command import (
     Open,
     Out,
     PsseUnit,
-    Seed,
     StudyFile,
     WithinBudget,
     Work,
@@ -132,7 +131,7 @@ def check(
     build: Annotated[
         bool, typer.Option("--compile", help="Compile the C sources of an FMU into a new file beside it.")
     ] = False,
-    seed: Seed = 0,
+    work: Work,
     console: Console,
     access: Access,
     out: Out = None,
@@ -150,7 +149,7 @@ def check(
         raise InputError("--find, --all and --compile are about an FMU", where=str(study), expected="a path to an .fmu")
     from hvdc_ident.study.summary import Summary
 
-    found = Summary.of(access.study(study), seed)
+    found = Summary.of(access.study(study), work.seed)
     console.print_json(found.to_dict())
     console.say(*(pasteable(line, study, out, access) for line in str(found).splitlines()))
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.data.noise import ENOUGH, noise_estimate, row_scatter
+from hvdc_ident.data.noise import ENOUGH, FEWEST_QUIET, noise_estimate, row_scatter
 from hvdc_ident.data.signals import HOLD_SHARE, off_line, robust_std
 from hvdc_ident.data.trajectory import Array
 
@@ -164,6 +164,8 @@ def _noise(time: Array, values: Array, same: NDArray[np.bool_], event: float | N
         if last - first >= _FEWEST_REPEATED:
             standing[first : last + 2] = True
     rows = np.flatnonzero(np.isfinite(values) & ~standing)[:_NOISE_ROWS]
+    if rows.size < FEWEST_QUIET:
+        return 0.0
     t, v = time[rows], values[rows]
     scatter = row_scatter(t, v) if rows.size >= ENOUGH else None
     if scatter is not None:
@@ -219,8 +221,11 @@ def _decimals(values: Array) -> int:
 
 def _zeros(columns: Sequence[_Column], rows: int) -> Iterator[BadRows]:
     """Yield the rows in which columns with noise are exactly zero."""
-    zero = np.array([c.values == 0.0 for c in columns]).reshape(len(columns), rows)
-    for first, last in _stretches(zero.any(axis=0)):
+    zero = [np.equal(c.values, 0.0) for c in columns]
+    some = np.zeros(rows, dtype=bool)
+    for z in zero:
+        some |= z
+    for first, last in _stretches(some):
         evidence = {
             c.name: -math.log(c.chance) * float(z[first : last + 1].sum()) for c, z in zip(columns, zero, strict=True)
         }

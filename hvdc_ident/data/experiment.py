@@ -9,8 +9,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hvdc_ident.data.noise import InputNoise
-from hvdc_ident.data.signals import InputSignal, input_signal
+from hvdc_ident.data.noise import InputNoise, noise_estimate
+from hvdc_ident.data.signals import InputSignal, event_time, input_signal
 from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import WaveformError, unknown_name
@@ -140,7 +140,8 @@ class Experiment(Shown):
         return (self.time >= self.window[0]) & (self.time <= self.window[1])
 
     def _screen(self) -> Iterator[str | Table]:
-        event = "no event" if self.event is None else f"event at {self.event:g} s"
+        at = self.event if self.event is not None else event_time(self.inputs)
+        event = "no event" if at is None else f"event at {at:g} s"
         yield f"Experiment {self.name} ({self.role}): {self.time.size} rows, {self.time[0]:g} to {self.time[-1]:g} s, {event}"
         inputs = [
             (n, float(s.values[0]), float(s.values[-1]), "constant" if s.is_constant else f"{s.jumps.size} jumps")
@@ -149,12 +150,20 @@ class Experiment(Shown):
         yield Table(("input", "first", "last", "moves"), tuple(inputs)) if inputs else ""
         table = self.measured
         outputs = (
-            [(n, table.unit(n), *_ends(table[n]), self.noise.get(n), table.gaps(n)) for n in table.names]
+            [(n, table.unit(n), *_ends(table[n]), self._noise(n, at), table.gaps(n)) for n in table.names]
             if table
             else []
         )
         header = ("output", "unit", "smallest", "largest", "noise", "gaps")
         yield Table(header, tuple(outputs)) if outputs else ""
+
+    def _noise(self, output: str, event: float | None) -> float | None:
+        """Return the noise of an output as stated, else as its rows show it; None where they do not."""
+        values = self.measured[output] if self.measured is not None else np.empty(0)
+        known = values[np.isfinite(values)]
+        if output in self.noise or self.domain == "frequency" or not known.size or np.ptp(known) == 0.0:
+            return self.noise.get(output)
+        return noise_estimate(self.time, values, event).std or None
 
     def table(self) -> Trajectory:
         """Return inputs and recorded outputs over time, as one table."""

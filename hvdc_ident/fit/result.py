@@ -200,6 +200,7 @@ class FitResult(Coded, Shown):
             if rows
             else ""
         )
+        yield self._held_at() if rows else ""
         own = [(x, n, *_cells(e)) for x, table in self.nuisance.items() for n, e in table.items()]
         yield Table(("experiment", "nuisance", "estimate", "unit", "95 % interval"), tuple(own)) if own else ""
         yield self._held()
@@ -228,6 +229,14 @@ class FitResult(Coded, Shown):
         chi2 = "" if self.adequacy.chi2_per_dof is None else f" (chi2/dof {self.adequacy.chi2_per_dof:.3g})"
         words = FIT_WORDS[self.adequacy.verdict]
         return f"{words}{chi2}" + (f": {self.adequacy.text}." if self.adequacy.text else ".")
+
+    def _held_at(self) -> str:
+        """Return the values at which candidates and partners are held, under which the intervals of the table hold; "" without any."""
+        asked = {n for n, why in self.held.items() if why != NOT_ASKED and n not in self.estimates}
+        needed = {n for e in self.estimates.values() for n in e.conditional_on}
+        held = {n: self.values[n] for n in self.values if n in asked | needed and n not in self.fitted}
+        values = ", ".join(f"{n} = {v:.6g}" for n, v in held.items())
+        return f"The intervals hold at {values}, held." if values else ""
 
     def _held(self) -> str:
         """Return the parameters that are held, a line each; those not asked about in one."""

@@ -90,6 +90,11 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     check_size(rows, len(record.names), path)
     content = _content(record)
     time, notes = _time(record, content, rows)
+    if (more := _available(record) - rows) > 0:
+        notes = (
+            *notes,
+            f"{path.name} says {rows} samples, the data hold {more} more: not read; the last sample of its rates says how many",
+        )
     columns = []
     for i in wanted:
         if i >= record.header.analog_count:
@@ -210,17 +215,19 @@ def _check_numbers(path: Path, header: Any) -> None:
 
 def _rows(record: _Record) -> int:
     """The number of rows, as the header claims and the data hold."""
-    header = record.header
-    claimed = int(header.sample_rates[-1][1])
-    if header.ft.upper() == "ASCII":
-        available = sum(1 for line in record.data.splitlines() if line.strip(b" \t\x1a"))
-    else:
-        available = len(record.data) // _width(header)
+    claimed, available = int(record.header.sample_rates[-1][1]), _available(record)
     if available < claimed:
         raise damaged(
             record.path, "the data end early", expected=f"{claimed} samples as in the header", got=f"{available}"
         )
     return claimed
+
+
+def _available(record: _Record) -> int:
+    """The number of rows that the data hold."""
+    if record.header.ft.upper() == "ASCII":
+        return sum(1 for line in record.data.splitlines() if line.strip(b" \t\x1a"))
+    return len(record.data) // _width(record.header)
 
 
 def _width(header: Any) -> int:

@@ -25,7 +25,8 @@ def hindrances(study: Study, values: InitialValues, contradictions: Sequence[Con
     values, and all at the start values where these differ and a search begins there. contradictions: in the recordings; those that are
     mended already hinder nothing, and of an experiment with one that is not, nothing else is told.
     """
-    found = [*(c.text for c in contradictions if not c.done), *values.failures, *values.mistakes, *_bounds(study)]
+    found = [c.text for c in contradictions if not c.done]
+    found += [*values.failures, *values.mistakes, *_bounds(study), *_nothing_recorded(study)]
     found += _runs(study, at_start=False)
     searches = any(s.searches and s.wanted(study) for s in stages())
     if searches and study.start != study.given:
@@ -37,6 +38,17 @@ def hindrances(study: Study, values: InitialValues, contradictions: Sequence[Con
             except HvdcIdentError as error:
                 found.append(str(error))
     return list(dict.fromkeys(found))
+
+
+def _nothing_recorded(study: Study) -> list[str]:
+    """Return a sentence where stages are asked for that compare with records, and the study has none."""
+    asked = [s.name for s in stages() if s.wanted(study) and s.name in ("screen", "identify", "fit", "diagnose")]
+    if not asked or study.experiments or study.responses:
+        return []
+    return [
+        f"{study.path.name} has no record for {', '.join(asked)}: no [[experiment]] with data and outputs, and no [[response]]; "
+        "take out the # before the lines of one that are right, or run `hvdc-ident new DIR --from RECORD --model MODEL`"
+    ]
 
 
 def _bounds(study: Study) -> list[str]:

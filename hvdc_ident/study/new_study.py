@@ -342,6 +342,8 @@ def _noise(r: Mapped) -> str:
 
 def _open_lines(r: Mapped) -> Iterator[str]:
     """Lines on the columns and signals that are not mapped."""
+    if r.experiment is not None and r.experiment.measured is not None:
+        yield from (c.text for c in r.experiment.measured.origin.contradictions)
     if r.levels:
         yield r.levels
     yield from r.notes

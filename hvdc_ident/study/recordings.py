@@ -28,6 +28,7 @@ from hvdc_ident.data import (
     scaled,
     seconds_of,
 )
+from hvdc_ident.data.noise import ESTIMATED
 from hvdc_ident.data.three_phase import (
     PhaseFilter,
     PhasorColumns,
@@ -138,7 +139,8 @@ def with_noise(
         rows = recorded[_apart(e.time[recorded], means.get(o, 0.0))]
         time, values = e.time[rows], table[o][rows]
         told = o not in stated and int(before_event(time, values, event).sum()) >= FEWEST_QUIET
-        found = noise_estimate(time, values, event) if told else NoiseEstimate()
+        moves = values.size > 0 and float(np.ptp(values)) > 0.0  # a column that does not has no scatter to measure others by
+        found = noise_estimate(time, values, event) if told and moves else NoiseEstimate(source=ESTIMATED if told else "")
         notes[o] = _noise(stated.get(o), found, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
         if notes[o].source == "estimated":
             dof[o], told_by[o] = max(1.0, found.freedom), found.source
@@ -291,7 +293,7 @@ def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapp
     levels = {n: level_before(experiment.time, v, experiment.event) for n, v in mapped.items()}
     inputs = {n: i.begun_at(levels[n]) for n, i in experiment.inputs.items()}
     values = {n: levels[o] for n, o in table.trim.items()}
-    known = {n: np.isfinite(mapped[n]) for n in inputs}
+    known = {n: k for n in inputs if (k := np.isfinite(mapped[n])).any() and np.ptp(mapped[n][k]) > 0.0}
     noise = {n: input_noise(experiment.time[k], mapped[n][k], experiment.event) for n, k in known.items()}
     return experiment.with_(
         inputs=inputs,

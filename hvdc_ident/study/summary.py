@@ -116,8 +116,10 @@ class Summary(Coded):
     @classmethod
     def of(cls, study: Study, seed: int = 0, *, in_python: bool = False) -> Summary:
         """Return the summary of a study. The model is run once an experiment, and once more where the start values differ."""
-        model, initial, contradictions = study.model, initial_values(study), column_contradictions(study)
-        wrong = {c.where for c in contradictions if not c.done}
+        model, initial, of_columns = study.model, initial_values(study), column_contradictions(study)
+        wrong = {c.where for c in of_columns if not c.done}
+        of_rows = (c for e in study.experiments if e.measured is not None for c in e.measured.origin.contradictions)
+        contradictions = (*of_rows, *of_columns)
         others = initial.without(where.removeprefix("experiment ") for where in wrong)
         steady = steady_notes(study, searches=any(s.searches and s.wanted(study) for s in stages()))
         return cls(
