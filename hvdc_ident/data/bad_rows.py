@@ -112,7 +112,8 @@ def bad_rows(
     noisy = [c for c in known if c.shows_noise]
     for kind in (_zeros, _stuck, _repeated, _filled):
         take(kind([_still(c, values[c.name]) for c in noisy], time.size))
-    moving = {c.name: values[c.name] for c in known if not c.holds}
+    # A column of a slower rate than its neighbours has no two rows in a row: its changes are not known.
+    moving = {c.name: v for c in known if not c.holds and np.isfinite(np.diff(v := values[c.name])).any()}
     take(_spikes(time, moving))
     found += _angle_steps(moving, {n: turn for n, turn in (angles or {}).items() if n in moving})
     return tuple(sorted(found, key=lambda b: (b.first, b.last, b.kind)))
