@@ -205,6 +205,7 @@ def _experiment(
     table: schema.ExperimentTable, model: AnyModel, data: Trajectory, place: str
 ) -> tuple[Experiment, FrozenMap[NoiseNote]]:
     columns = dict(_channels(table))
+    recorded = data.names
     data = with_derived(table.phases, table.phasors, data, place)
     data = _within_inputs(data, [columns[s] for s in (*table.inputs, *table.drive)], place)
     time = _time(table, data, place)
@@ -212,7 +213,9 @@ def _experiment(
     mapped = {s: scaled(data[c], mappings[s][0]) for s, c in columns.items()}
     mapped |= {s: mapped[s] + offset for s, (_, offset) in mappings.items() if offset != 0.0}
     mapped |= {s: _in_frame(table, s, time, mapped[s], place) for s in columns if same_unit(_unit(model, s), "rad")}
-    out = RowsLeftOut(table, time, {s: data[c] for s, c in columns.items()}, _turns(model, mappings))
+    # What is computed from phases has no digits of its own, and repeats itself where they are periodic: it is not judged.
+    raw = {s: data[c] if c in recorded else np.full(time.size, np.nan) for s, c in columns.items()}
+    out = RowsLeftOut(table, time, raw, _turns(model, mappings))
     mapped = {s: out.without(s, time, v, bridged=s not in table.outputs) for s, v in mapped.items()}
     inputs = {}
     for s in (*table.inputs, *table.drive):
