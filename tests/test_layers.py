@@ -25,7 +25,8 @@ stand_ins moves known_errors remainder forms size_search search candidate_table 
 """,
     "linearize": """
 limits system delays sampling characteristic stability descriptor equilibrium plot derivatives point branches linear_model zeros
-delayed_zeros frequency realisation gramians norms kinds fmu_linear jacobian operating_point linearisation mode delayed_modes modal root_loci gain_limits loops reduction
+delayed_zeros frequency realisation gramians norms kinds fmu_linear jacobian operating_point linearisation mode delayed_modes
+modal root_loci gain_limits loops reduction
 distance transfer_function formula impedance response_file export
 """,
     "fmu": """

@@ -8,8 +8,9 @@ import numpy as np
 import scipy.linalg
 
 from hvdc_ident.errors import LinearizationError
+from hvdc_ident.linearize.delays import EPS
 from hvdc_ident.linearize.linear_model import LinearModel
-from hvdc_ident.linearize.stability import EPS, Characteristic
+from hvdc_ident.linearize.stability import Characteristic
 from hvdc_ident.linearize.system import Array
 
 TOLERANCE = 1e-10
