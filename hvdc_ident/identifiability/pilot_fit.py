@@ -276,12 +276,12 @@ class CramerRaoBounds(Coded):
 
 
 def cramer_rao_bounds(problem: Problem) -> CramerRaoBounds:
-    """Return the local analysis of a fit's parameters at their given values; one evaluation with derivatives.
+    """Return the local analysis of a fit's parameters at their given values; two evaluations with derivatives.
 
     Standard deviations that are not given are the misfit's there. Raises SimulationError where it cannot be made.
     """
-    begun = time.perf_counter()
     at, result = at_given_values(problem)
+    begun = time.perf_counter()  # only now: the first evaluation also compiles the model and factors the covariance of its noise
     columns = at.columns
     seconds = time.perf_counter() - begun
     names, k = at.names, len(at.names)
