@@ -24,6 +24,7 @@ _CHANGES = (
 )
 _WINDOW = 128  # levels that a lattice is looked for in
 _FARTHEST = 400  # steps that they span at most
+_AT_ONCE = 2**18  # distances that are looked at together: they stay in the cache
 _BELOW = np.geomspace(
     0.05, 1.6, 27
 )  # noise below a rounding that is compared, in steps: less adds 2 % to the rounding, more hides it
@@ -91,6 +92,8 @@ def _recorder_step(levels: Array, digit: float) -> float:
     Two neighbouring levels are a step apart, to a digit. All steps about that are tried: each level has to lie within half a digit of a
     multiple from some origin on, which by chance one level in step/digit does.
     """
+    if levels.size < 3:  # any two stand on a lattice
+        return 0.0
     slack = max(0.5 * digit, SINGLE * float(np.abs(levels).max()))
     least = float(np.diff(levels).min())
     if least < 2.0 * slack * (1.0 - 1e-6):
@@ -103,6 +106,7 @@ def _recorder_step(levels: Array, digit: float) -> float:
     steps = np.linspace(low + width, high, count)
     near = steps[_spread(at, steps) < 2.5 * slack]
     finer = (near[:, None] + width * np.linspace(-1.0, 1.0, 33)).ravel()
+    finer = finer[finer > slack]  # any level stands on a finer lattice
     # A level half way between two digits goes either way; where a step holds few digits, two of a step would be two levels.
     share = np.where(finer > 3.0 * digit, 1.02, 1.0 - 1e-6)
     fits = np.unique(finer[(_spread(at, finer) < share * 2.0 * slack) & (finer > digit * (1.0 + 1e-6))])
@@ -117,7 +121,8 @@ def _recorder_step(levels: Array, digit: float) -> float:
 
 def _spread(at: Array, steps: Array) -> Array:
     """Return (k,) by how much the distances of levels from multiples of each step differ."""
-    return np.asarray(np.ptp(at - np.round(at / steps[:, None]) * steps[:, None], axis=1))
+    parts = np.array_split(steps, -(-steps.size * at.size // _AT_ONCE) or 1)
+    return np.concatenate([np.ptp(at - np.round(at / s[:, None]) * s[:, None], axis=1) for s in parts])
 
 
 def _densest(levels: Array, span: float) -> tuple[int, int]:
