@@ -79,7 +79,11 @@ def _framed(name: str, title: str, body: str) -> str:
 
 def _warnings(results: Results, s: RunSummary) -> list[str]:
     """Stages that failed, experiments without a run, and results of an earlier state of the study."""
-    lines = [f"<strong>{text(n)} failed</strong>: {prose(why.rstrip('.'))}." for n, why in s.failures.items()]
+    unfinished = {data.get("stage") for data in results.stages.values() if data.get("status") == "unfinished"}
+    lines = [
+        f"<strong>{text(n)} {'is unfinished' if n in unfinished else 'failed'}</strong>: {prose(why.rstrip('.'))}."
+        for n, why in s.failures.items()
+    ]
     lines += [
         f"Experiment <strong>{text(n)}</strong> could not be simulated: {prose(e.reason.rstrip('.'))}."
         for n, e in results.experiments.items()
@@ -229,6 +233,8 @@ def _undiagnosed(s: RunSummary, door: Door) -> str:
         return "Not asked: a diagnosis needs parameters that may be fitted, in <code>[parameters]</code>."
     if s.verdict == "pass" and s.judged is not None and s.judged.on_noise.verdict:
         return "No sign of anything: what is left is noise."
+    if "diagnose" in s.failures:
+        return "Asked, and not answered: the line above says why."
     asked = f"Not asked{' yet' if s.verdict == 'fail' else ''}."
     if any(step.kind == "diagnose" for step in s.next) and not advice(s):  # the tile on what to do next says how
         return asked

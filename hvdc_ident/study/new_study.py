@@ -418,7 +418,7 @@ def _study_text(
         names = ", ".join(map(toml_string, settable))
         yield from ("", "# [inputs]", f"# settable = [{names}]   # those that a person can move for a recording")
     for r in recordings:
-        yield from ("", *_experiment_text(r, _measured_inputs(r, model)))
+        yield from ("", *_experiment_text(r, _measured_inputs(r, model, played=dyr is not None)))
     yield ""
     yield "# The stages. A stage runs if its table is in this file; `simulate` always runs."
     mark = "" if asked and any(r.experiment is not None for r in recordings) else "# "
@@ -428,13 +428,16 @@ def _study_text(
         yield f"{mark}places = [{', '.join(map(toml_string, dyr.places))}]   # the controls, and what they act on"
 
 
-def _measured_inputs(r: Mapped, model: AnyModel) -> list[str]:
-    """Return the inputs that are recorded as they were measured: nobody sets them, and they move from row to row."""
+def _measured_inputs(r: Mapped, model: AnyModel, *, played: bool) -> list[str]:
+    """Return the inputs that are recorded as they were measured: nobody sets them, and they move from row to row.
+
+    played: whether they are a unit's terminals, which no record holds from row to row, however still it is most of the time.
+    """
     if r.experiment is None:
         return []
     mapped = {m.target.name: m for m in r.columns.mapped if m.target.kind == "input"}
     moving = {n: r.experiment.inputs[n] for n in mapped if not model.inputs[n].settable}
-    return [n for n, s in moving.items() if not (s.is_constant or _is_staircase(s))]
+    return [n for n, s in moving.items() if played or not (s.is_constant or _is_staircase(s))]
 
 
 def _is_staircase(signal: InputSignal) -> bool:

@@ -263,6 +263,15 @@ def test_a_failed_stage_is_said_first(like_the_demo: Path, tmp_path: Path) -> No
     )
 
 
+def test_a_diagnosis_that_its_budget_ended_is_told_as_unfinished(like_the_demo: Path, tmp_path: Path) -> None:
+    ended = {"status": "unfinished", "message": "ended by the budget of 20 s; not tried: round 1", "stage": "diagnose"}
+    bare = changed(tmp_path / "bare", like_the_demo, discrepancy=None)
+    folder = changed(tmp_path / "ended", bare, discrepancy=ended)
+    whole = page(folder)
+    assert "<strong>diagnose is unfinished</strong>: ended by the budget of 20 s" in whole
+    assert "Asked, and not answered" in tile(whole, "missing")
+
+
 def test_a_study_without_recordings_shows_its_sections_open(tmp_path: Path) -> None:
     (tmp_path / "s.toml").write_text('schema = 1\n[model]\nsource = "vsc-hvdc-link"\n[linearize]\ninputs = ["Vdcref1"]\n', "utf-8")
     run_stage(load_study(tmp_path / "s.toml"), "linearize", tmp_path / "r", StageOptions())
