@@ -47,7 +47,7 @@ def _nothing_recorded(study: Study) -> list[str]:
         return []
     return [
         f"{study.path.name} has no record for {', '.join(asked)}: no [[experiment]] with data and outputs, and no [[response]]; "
-        "take out the # before the lines of one that are right, or run `hvdc-ident new DIR --from RECORD --model MODEL`"
+        "take out the # before the lines of one that are right"
     ]
 
 

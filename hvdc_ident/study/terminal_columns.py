@@ -319,7 +319,7 @@ def _left_open(match: Match, about: Terminals) -> Match:
     base = None
     why = f"no unit or base is known with which {match.target.name} is where a plant rests"
     if match.target.name == "V" and about.base_kv is None and unit and conversion(unit, "kV") is not None:
-        why = "the base of the voltage is not known, which a power flow (--raw) states"
+        why = "the base of the voltage is not known, which a power flow (a .raw file) states"
     elif match.target.name == "V" and unit and (by := conversion(unit, "kV")) is not None and about.base_kv is not None:
         base = _round(about.base_kv / by[0])
         why = f"that is not where a bus of {about.base_kv:g} kV rests"

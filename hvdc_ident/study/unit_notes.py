@@ -110,7 +110,7 @@ def _of_shelf(unit: RecordedUnit) -> str:
     ]
     if not found:
         return ""
-    return f"no power flow is given (--raw), which has these: {listed(found)}, as on the shelf"
+    return f"no power flow (a .raw file) is given, which has these: {listed(found)}, as on the shelf"
 
 
 def _unused_values(records: Sequence[DyrRecord]) -> Iterator[str]:
