@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import correlate
 
 from hvdc_ident.data import Array, Contradiction, Experiment, InputSignal, Trajectory, before_event, conversion
 from hvdc_ident.data.quantities import read_columns
@@ -23,6 +24,7 @@ from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.plants import LEVELS
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study import schema
+from hvdc_ident.study.apparent_power import ApparentPower
 from hvdc_ident.study.conversions import STRONG
 from hvdc_ident.study.initial_values import outputs_of
 from hvdc_ident.study.terminal_columns import (
@@ -43,13 +45,18 @@ if TYPE_CHECKING:
     from hvdc_ident.study.study import Study
 
 FOLLOWS = 0.5
-"""Share of the square of the recorded movement that a model of the plant leaves at most, whose gains may be wrong; one that plays in a
-voltage with the wrong sign or unit leaves more than all of it."""
+"""Share of the square of the recorded movement that a model of the plant leaves at most, whose gains may be wrong. A mistake is told where
+without it the model leaves no more than this, and by odds of `STRONG` less than with it: so a model that leaves a tenth of this as the
+record is written is asked for none."""
 SOON = 1.0
 """Time in s after the event in which network, machine and its inertia tell the movement, before most controls do."""
 SEEN = 5.0
 """Times its noise by which a movement is one."""
 ROOT = math.sqrt(3.0)
+RESTS = (0.9, 1.1)
+"""Voltage in pu at which a plant stays for longer than a disturbance: limits of operation in an emergency."""
+PEAK = math.sqrt(2.0 / 3.0)
+"""Peak of the voltage of a phase to ground over the rms value from line to line: near enough to 1 to pass for a low voltage."""
 
 
 def column_contradictions(study: Study) -> tuple[Contradiction, ...]:
@@ -64,10 +71,41 @@ def column_contradictions(study: Study) -> tuple[Contradiction, ...]:
     tables = {t.name: t for t in study.settings.experiment}
     for e in (e for e in study.experiments if e.name in tables and e.measured is not None):
         case = _Case(study, e, tables[e.name], about)
-        by_level = [*case.voltage(), *case.frequency(), *case.turns_twice(), *case.power()]
+        by_level = [*case.voltage(), *case.frequency(), *case.turns_twice(), *case.power(), *case.current()]
         by_turn = [] if by_level else [*case.turn()]
         found += by_level or by_turn or [*case.movement()]
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Mistake:
+    """A mistake of a record: what is right is a factor times the column. kind, words: of the finding. sources: by output the one in
+    whose column it is; late: s by which the outputs' clock is; write: the line that mends it, "" where the factors say it."""
+
+    kind: str = ""
+    words: str = ""
+    factors: Mapping[str, float] = field(default_factory=dict)
+    sources: Mapping[str, str] = field(default_factory=dict)
+    late: float = 0.0
+    write: str = ""
+
+    def of(self, signal: str) -> float:
+        """Return the factor of a signal."""
+        return self.factors.get(signal, 1.0)
+
+    def source(self, output: str) -> str:
+        """Return the output in whose column another one is."""
+        return self.sources.get(output, output)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The signals it is about."""
+        return tuple(self.factors)
+
+    @property
+    def ways(self) -> dict[str, Way]:
+        """The ways in which the columns are to be written."""
+        return {n: Way(k) for n, k in self.factors.items()}
 
 
 @dataclass(frozen=True)
@@ -82,7 +120,12 @@ class _Case:
     def voltage(self) -> Iterator[Contradiction]:
         """Yield a voltage that is not near 1 pu before the event."""
         level = self._level("V")
-        if level is None or NORMAL[0] <= level <= NORMAL[1]:
+        if level is None:
+            return
+        if NORMAL[0] <= level <= NORMAL[1]:
+            if level < RESTS[0] and RESTS[0] <= level / PEAK <= RESTS[1]:
+                what = f"V is at {level:.4g} pu {self._when}, below where a plant stays: it is the peak of the voltage of a phase"
+                yield self._finding("base", ("V",), what, self._columns({"V": Way(1.0 / PEAK)}))
             return
         ways = [(ROOT, "it is the voltage from phase to ground"), (1.0 / ROOT, "the base is that of a phase")]
         ways += [(k, words) for k, words in ((1e3, "a k is missing"), (1e-3, "a k is too much"))]
@@ -133,6 +176,26 @@ class _Case:
         else:
             yield self._finding("unit", ("P", "Q"), f"{what}: what is their unit?")
 
+    def current(self) -> Iterator[Contradiction]:
+        """Yield a power that is another one than the recorded voltage and current make."""
+        found = self._beside_current()
+        if found is None or found.holds:
+            return
+        what = f"P and Q are {found.words} before the event"
+        if found.level_holds:
+            what = f"P and Q move otherwise than {found.named}: these leave {100 * found.left:.3g} % of the square of the movement"
+            yield self._finding("current", ("P", "Q"), f"{what}; one of them is another plant's")
+            return
+        ways = [(3.0, "phase", "they are those of one phase")]
+        ways += [(k, "unit", f"they are in {u}W and {u}var") for k, u in ((1e-3, "k"), (1e-6, ""), (1e3, "G"))]
+        near = [w for w in ways if found.times(w[0]).level_holds]
+        if len(near) == 1:
+            ((k, kind, words),) = near
+            powers = {o: Way(k) for o in LEVELS.values() if o in self.experiment.outputs}
+            yield self._finding(kind, tuple(powers), f"{what}: {words}", self._columns(powers))
+        else:
+            yield self._finding("current", ("P", "Q"), f"{what}: which of them is in another unit, or another plant's?")
+
     def turn(self) -> Iterator[Contradiction]:
         """Yield an angle that turns otherwise than the recorded frequency of the same voltage, or as no network does."""
         if "theta" not in self.experiment.inputs:
@@ -160,35 +223,62 @@ class _Case:
             yield self._finding("unit", ("theta",), what + (": it is in degrees" if degrees else ""), write)
 
     def movement(self) -> Iterator[Contradiction]:
-        """Yield the sign or unit that the model needs to move as the record does, where as it is it does not."""
+        """Yield the mistake without which the model moves as the record does, where as it is it does not."""
         rows = self._soon()
-        if rows is None or (own := self._misfit(rows)) <= FOLLOWS:
+        if rows is None or (own := self._misfit(rows, _Mistake())) * STRONG <= FOLLOWS:
             return
-        mva = self.about.mva
-        tried: list[tuple[float, float, str, str]] = [
-            (1.0, -1.0, "sign", "P and Q have the other sign: the model counts what the plant delivers as positive"),
-            (
-                -1.0,
-                1.0,
-                "sign",
-                "theta has the other sign: an angle grows where the frequency is above that of the frame",
-            ),
-            (DEGREE, 1.0, "unit", "theta is in degrees"),
-            (1.0 / DEGREE, 1.0, "unit", "theta is in rad, and not in degrees"),
-            (1.0, 1e-3, "unit", "P and Q are in kW and kvar"),
-            (1.0, 1e3, "unit", "P and Q are in GW and Gvar"),
-        ]
-        tried += [(1.0, mva, "base", f"P and Q are in pu of the machine's {mva:g} MVA")] if mva else []
-        tried = [t for t in tried if t[0] == 1.0 or "theta" in self.experiment.inputs]
-        left = [(self._misfit(rows, turn, power), turn, power, kind, words) for turn, power, kind, words in tried]
-        misfit, turn, power, kind, words = min(left)
+        righted = [(self._on_time(rows, m), m) for m in self._mistakes()]
+        tried = [(self._misfit(e, m), m) for e, m in righted if _moves(e)]
+        misfit, mistake = min(tried, key=lambda t: t[0], default=(math.inf, _Mistake()))
         if misfit > FOLLOWS or own < STRONG * misfit:
             return
-        powers = {o: Way(power) for o in LEVELS.values() if o in self.experiment.outputs and power != 1.0}
-        ways = {**powers, **({"theta": Way(turn)} if turn != 1.0 else {})}
         now = "as it is it cannot start" if math.isinf(own) else f"as it is {100 * own:.3g} %"
-        what = f"{words}: so the model leaves {100 * misfit:.2g} % of the square of what they move within {SOON:g} s of the event, {now}"
-        yield self._finding(kind, tuple(ways), what, self._columns(ways))
+        left = f"so the model leaves {100 * misfit:.2g} % of the square of what they move within {SOON:g} s of the event, {now}"
+        yield self._finding(
+            mistake.kind, mistake.columns, f"{mistake.words}: {left}", mistake.write or self._columns(mistake.ways)
+        )
+
+    def _mistakes(self) -> Iterator[_Mistake]:
+        """Yield the mistakes of a record that are tried."""
+        e, mva = self.experiment, self.about.mva
+        powers = [o for o in LEVELS.values() if o in e.outputs]
+        if "theta" in e.inputs:
+            turns = [
+                (-1.0, "sign", "has the other sign: an angle grows where the frequency is above that of the frame"),
+                (DEGREE, "unit", "is in degrees"),
+                (1.0 / DEGREE, "unit", "is in rad, and not in degrees"),
+                (2.0 * math.pi, "unit", "is in whole turns"),
+            ]
+            yield from (_Mistake(kind, f"theta {words}", {"theta": k}) for k, kind, words in turns)
+        for group in (powers, *([o] for o in powers if len(powers) > 1)):
+            units = [self.study.model.outputs[o].unit for o in group]
+            have, are = ("have", "are") if len(group) > 1 else ("has", "is")
+            factors = [
+                (-1.0, "sign", f"{have} the other sign: the model counts what the plant delivers as positive"),
+                (1e-3, "unit", f"{are} in {' and '.join(u.replace('M', 'k') for u in units)}"),
+                (1e3, "unit", f"{are} in {' and '.join(u.replace('M', 'G') for u in units)}"),
+                (3.0, "phase", f"{are} that of one phase"),
+            ]
+            factors += [(mva, "base", f"{are} in pu of the machine's {mva:g} MVA")] if mva else []
+            yield from (
+                _Mistake(k, f"{' and '.join(group)} {words}", dict.fromkeys(group, f)) for f, k, words in factors
+            )
+        if len(powers) == 2:
+            one, other = powers
+            named = self.table.outputs | {one: self._column(other), other: self._column(one)}
+            write = f"outputs = {{{', '.join(f'{toml_key(o)} = {toml_string(c)}' for o, c in named.items())}}}"
+            yield _Mistake(
+                "exchanged",
+                f"{one} and {other} are exchanged",
+                dict.fromkeys(powers, 1.0),
+                {one: other, other: one},
+                write=write,
+            )
+        if (late := self._late()) is not None:
+            when = f"{abs(late):.4g} s {'later' if late > 0.0 else 'earlier'} than the voltage"
+            words = f"{' and '.join(powers)} come {when}, by another clock"
+            write = 'nuisance = ["time-shift"]'
+            yield _Mistake("clock", words, dict.fromkeys(powers, 1.0), late=late, write=write)
 
     # --- levels and movements ---
 
@@ -232,48 +322,93 @@ class _Case:
             data.time[rows], signal(data.time[rows]), way.scale * values[rows] + way.offset, self.about.frequency
         )
 
+    def _beside_current(self) -> ApparentPower | None:
+        """Return the recorded power beside that of the recorded voltage and the only current of the file; None where they are not all
+        recorded, in units that are known, or the event is not."""
+        e, outputs = self.experiment, list(LEVELS.values())
+        if "V" not in e.inputs or not set(outputs) <= set(e.outputs) or self.table.phases or self.table.phasors:
+            return None
+        data: Trajectory = read_waveforms(self.study.path.parent / self.table.data)
+        column = self._column("V")
+        readings = dict(zip(data.names, read_columns(data.names, data.units), strict=True))
+        currents = [n for n, r in readings.items() if r.measured == "current"]
+        if column not in data or len(currents) != 1 or data.time.size != e.time.size:
+            return None
+        line = self.table.columns.get("V")
+        units = [
+            (line.unit if line and line.unit else "") or data.unit(column) or readings[column].unit,
+            readings[currents[0]].unit,
+        ]
+        by = [conversion(u, wanted) if u else None for u, wanted in zip(units, ("kV", "kA"), strict=True)]
+        if by[0] is None or by[1] is None:
+            return None
+        assert e.measured is not None
+        power = np.hypot(*(e.measured[o] for o in outputs))
+        product = by[0][0] * data[column] * by[1][0] * data[currents[0]]
+        return ApparentPower.of(e.time, power, product, e.event, f"{column} and {currents[0]}")
+
     def _soon(self) -> Experiment | None:
-        """Return the experiment to shortly after its event; None where it has none, or its outputs do not move by more than noise."""
+        """Return the experiment to shortly after its event; None where it has none, or P and Q are not recorded."""
         e = self.experiment
         if e.event is None or e.measured is None or not set(LEVELS.values()) & set(e.outputs) or e.drive:
             return None
         rows = e.time <= e.event + SOON
         short = e.with_(time=e.time[rows], measured=e.measured.rows(rows), noise_profile={}, window=None)
         assert short.measured is not None
-        moved = noise = 0.0
-        for o in (o for o in LEVELS.values() if o in e.outputs):
-            known = np.isfinite(short.measured[o])
-            values = short.measured[o][known]
-            if values.size < 4:
-                return None
-            moved += float(np.ptp(values)) ** 2
-            noise += scatter(short.time[known], values) ** 2
-        return (
-            short
-            if moved > SEEN**2 * noise and before_event(short.time, short.measured.values[:, 0], e.event).sum() > 1
-            else None
-        )
+        return short if before_event(short.time, short.measured.values[:, 0], e.event).sum() > 1 else None
 
-    def _misfit(self, e: Experiment, turn: float = 1.0, power: float = 1.0) -> float:
-        """Return the share of the square of the movement of P and Q that the model leaves, with angle and powers times these factors;
-        infinite where it cannot run."""
+    def _misfit(self, e: Experiment, mistake: _Mistake) -> float:
+        """Return the share of the square of the movement of P and Q that the model leaves without a mistake of the record; infinite
+        where it cannot run."""
         inputs = dict(e.inputs)
-        if turn != 1.0:
+        if (turn := mistake.factors.get("theta", 1.0)) != 1.0:
             s = inputs["theta"]
             inputs["theta"] = InputSignal(s.times, turn * s.values, s.breaks)
-        values = {n: v * power if n in LEVELS else v for n, v in e.values.items()}
-        run = outputs_of(ModelSimulator(self.study.model), e.with_(inputs=inputs, values=values), self.study.given)
+        level = {o: n for n, o in LEVELS.items() if n in e.values}
+        values = {n: mistake.of(o) * e.values[level.get(mistake.source(o), n)] for o, n in level.items()}
+        run = outputs_of(
+            ModelSimulator(self.study.model), e.with_(inputs=inputs, values={**e.values, **values}), self.study.given
+        )
         if isinstance(run, str):
             return math.inf
         assert e.measured is not None
         left = moved = 0.0
         for o in (o for o in LEVELS.values() if o in e.outputs):
-            recorded = power * e.measured[o]
+            recorded = mistake.of(o) * e.measured[mistake.source(o)]
             known = np.isfinite(recorded)
             before = before_event(e.time, recorded, e.event)
             own, other = (_from_rest(v, before)[known] for v in (recorded, run[o]))
             left, moved = left + float(np.sum((own - other) ** 2)), moved + float(np.sum(own**2))
         return left / moved if moved and math.isfinite(left) else math.inf
+
+    def _late(self) -> float | None:
+        """Return by how many s P and Q come later than the model's, whose movement is then theirs as nearly as it can be; None where
+        they move at the same time, or the model cannot run."""
+        e = self.experiment
+        run = outputs_of(ModelSimulator(self.study.model), e, self.study.given)
+        if isinstance(run, str) or e.measured is None:
+            return None
+        step = float(np.median(np.diff(e.time)))
+        grid = np.arange(e.time[0], e.time[-1], step)
+        summed: Array = np.zeros(2 * grid.size - 1)
+        for o in (o for o in LEVELS.values() if o in e.outputs):
+            known = np.isfinite(e.measured[o])
+            before = before_event(e.time, e.measured[o], e.event)
+            own, other = (np.interp(grid, e.time[known], _from_rest(v, before)[known]) for v in (e.measured[o], run[o]))
+            summed = summed + correlate(own, other, method="fft")
+        late = step * (int(np.argmax(summed)) - (grid.size - 1))
+        return late if abs(late) > step else None
+
+    def _on_time(self, rows: Experiment, mistake: _Mistake) -> Experiment:
+        """Return some rows of the experiment with the outputs at the time at which they were, whose clock is off."""
+        e = self.experiment
+        if not mistake.late:
+            return rows
+        assert e.measured is not None and rows.measured is not None
+        moved = np.column_stack(
+            [np.interp(rows.time + mistake.late, e.time[k := np.isfinite(v)], v[k]) for v in e.measured.values.T]
+        )
+        return rows.with_(measured=replace(rows.measured, values=moved))
 
     # --- what to write ---
 
@@ -319,6 +454,20 @@ class _Case:
 
     def _finding(self, kind: str, columns: tuple[str, ...], what: str, write: str = "") -> Contradiction:
         return Contradiction(kind, f"experiment {self.experiment.name}", what, columns, write=write)
+
+
+def _moves(e: Experiment) -> bool:
+    """Return whether P and Q move by more than their noise."""
+    moved = noise = 0.0
+    for o in (o for o in LEVELS.values() if o in e.outputs):
+        assert e.measured is not None
+        known = np.isfinite(e.measured[o])
+        values = e.measured[o][known]
+        if values.size < 4:
+            return False
+        moved += float(np.ptp(values)) ** 2
+        noise += scatter(e.time[known], values) ** 2
+    return moved > SEEN**2 * noise
 
 
 def _from_rest(values: Array, before: NDArray[np.bool_]) -> Array:
