@@ -31,7 +31,7 @@ class Overlay:
     """A recorded output of an experiment and the model's runs by set of values ("given", "fitted", "effect").
 
     runs: tables with the columns OUTPUT and OUTPUT.measured; with OUTPUT.low and OUTPUT.high, between which a sample is
-    expected, that band is shaded.
+    expected, that band is shaded. bad: spans of time in s whose rows cannot be right or were left out.
     """
 
     experiment: str
@@ -40,6 +40,7 @@ class Overlay:
     runs: Mapping[str, Trajectory]
     event: float | None = None
     window: tuple[float, float] | None = None
+    bad: tuple[tuple[float, float], ...] = ()
 
     @property
     def record(self) -> Trajectory:
@@ -103,7 +104,29 @@ def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[st
     if not runs:
         return None
     about = results.experiments.get(experiment) or ExperimentContext()
-    return Overlay(experiment, output, str(results.units.get(output, "")), runs, about.event, about.window)
+    return Overlay(
+        experiment,
+        output,
+        str(results.units.get(output, "")),
+        runs,
+        about.event,
+        about.window,
+        _bad(results, about.recording, output),
+    )
+
+
+def _bad(results: Results, recording: Mapping[str, Any], output: str) -> tuple[tuple[float, float], ...]:
+    """Return the spans of time in s in which rows of an output, or of what is played in, cannot be right or were left out.
+
+    recording: `Experiment.recording`. What is wrong with other outputs alone is not told.
+    """
+    others = results.units.keys() - {output}
+    found = [c for c in recording.get("contradictions", ()) if len(c["times"]) == 2]
+    return tuple(
+        (float(c["times"][0]), float(c["times"][1]))
+        for c in found
+        if not set(c["columns"]) or set(c["columns"]) - others
+    )
 
 
 def worst_signal(results: Results, name: str | None, sets: Sequence[str]) -> Overlay | None:
@@ -157,6 +180,11 @@ class Sheet:
         for axes in (self.top, self.strip):
             if overlay.event is not None:
                 axes.axvline(overlay.event, color=MARK, linewidth=0.8, linestyle=":")
+            for k, (first, last) in enumerate(overlay.bad):
+                name = "rows that cannot be right, or were left out" if axes is self.top and k == 0 else "_"
+                axes.axvspan(
+                    first, last, color=GIVEN, alpha=0.25, linewidth=1.5, label=name
+                )  # the edge shows one row too
             if overlay.window is not None:
                 axes.axvspan(*overlay.window, color=FITTED, alpha=0.05, linewidth=0)
             if span is not None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, BadRows, Contradiction, bad_rows, gaps
 from hvdc_ident.data.signals import HOLD_SHARE
-from hvdc_ident.model.card import toml_key
+from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.study import schema
 
 CUT = ("angle step", "gap")
@@ -40,7 +40,8 @@ class RowsLeftOut:
             np.mean(v[1:] == v[:-1]) < HOLD_SHARE for v in inputs if v.size > 1
         ):  # one that is held is known in a gap too
             bad += [b for b in gaps(time) if needed[b.last]]
-        self.contradictions = tuple(_contradiction(b, bad, table, time, applied=stated is None) for b in bad)
+        found = (_contradiction(b, bad, table, time, applied=stated is None) for b in bad)
+        self.contradictions = (*found, *_stated(table, time, columns))
         if stated is None:
             for b in (b for b in bad if b.kind not in (*CUT, "constant")):
                 for s in b.columns:
@@ -77,17 +78,32 @@ def _contradiction(
     first, last = float(time[b.first]), float(time[b.last])
     if b.kind == "constant":
         return Contradiction(b.kind, table.name, b.what, b.columns, write=_without_column(b, table))
-    several = b.last > b.first
-    where = (
-        f"rows {b.first + 1} to {b.last + 1} ({first:.6g} to {last:.6g} s)"
-        if several
-        else f"row {b.first + 1} ({first:.6g} s)"
-    )
-    what = f"{where}: {b.what}"
+    what = f"{_where(b.first, b.last, time)}: {b.what}"
     if b.kind not in CUT and applied:
         what += "; left out here, though the study does not say so"
     write = _window(b, table, time) if b.kind in CUT else _spans(bad, table, time)
     return Contradiction(b.kind, table.name, what, b.columns, (b.first + 1, b.last + 1), (first, last), write)
+
+
+def _stated(table: schema.ExperimentTable, time: Array, columns: Iterable[str]) -> Iterator[Contradiction]:
+    """Yield the stretches that the study itself leaves out, of the signals that it has, as findings that are mended."""
+    for signal in (s for s in table.leave_out or {} if s in columns):
+        for span in (table.leave_out or {})[signal]:
+            rows = np.flatnonzero(_inside(time, [span]))
+            if rows.size:
+                times = float(time[rows[0]]), float(time[rows[-1]])
+                what = f"{_where(int(rows[0]), int(rows[-1]), time)} of {signal}"
+                ends = int(rows[0]) + 1, int(rows[-1]) + 1
+                yield Contradiction(
+                    "left out", table.name, what, (signal,), ends, times, done="left out, as the study says"
+                )
+
+
+def _where(first: int, last: int, time: Array) -> str:
+    """Return the rows of a stretch in words, counted from 1, with their instants."""
+    if last == first:
+        return f"row {first + 1} ({float(time[first]):.6g} s)"
+    return f"rows {first + 1} to {last + 1} ({float(time[first]):.6g} to {float(time[last]):.6g} s)"
 
 
 def _spans(bad: Sequence[BadRows], table: schema.ExperimentTable, time: Array) -> str:
@@ -114,6 +130,4 @@ def _without_column(b: BadRows, table: schema.ExperimentTable) -> str:
     left = {o: c for o, c in table.outputs.items() if o not in b.columns}
     if b.columns[0] not in table.outputs or not left:
         return ""
-    from hvdc_ident.model.card import toml_string
-
     return f"outputs = {{{', '.join(f'{toml_key(o)} = {toml_string(c)}' for o, c in left.items())}}}"
