@@ -357,7 +357,7 @@ def wrong() -> list[Record]:
             "another unit's current",
             Seen(),
             lambda c: full(c | {"I": 0.3 * c["I"] ** 0 * 10.0 + 0.4 * c["I"]}),
-            said=(r"\bP\b", r"\bI\b|current"),
+            said=(r"\bP\b", "I1 Mag|current", "times what"),
         ),
         # time
         Record(
@@ -391,7 +391,7 @@ def wrong() -> list[Record]:
             edit=lines(lambda r: [*r[:130], *r[180:]]),
             said=(rows, "no rows|missing"),
         ),
-        Record("the angle's clock drifts", written=drifting, said=("theta|Ang", "disagree|turn")),
+        Record("the angle's clock drifts", written=drifting, said=("theta|Ang", "disagree|otherwise|steps|drift")),
         # rows
         Record(
             "the angle stands still",
