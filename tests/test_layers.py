@@ -21,7 +21,8 @@ fmu linearize sensitivity linear fit identifiability discrepancy summary report 
 INSIDE = {
     "discrepancy": """
 options result candidates movable nominal prediction hypothesis screen location residual_checks implied evidence pushes rounds explain
-stand_ins moves known_errors remainder forms size_search search candidate_table classes findings verdict diagnosis
+stand_ins moves known_errors remainder forms size_search search candidate_table classes findings verdict
+unknown_noise diagnosis
 """,
     "linearize": """
 limits system delays sampling characteristic stability descriptor equilibrium plot derivatives point branches linear_model zeros

@@ -31,6 +31,7 @@ from hvdc_ident.discrepancy.rounds import Round
 from hvdc_ident.discrepancy.screen import NOT_TRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.search import SearchOutcome, two_start_search
 from hvdc_ident.discrepancy.stand_ins import stand_ins
+from hvdc_ident.discrepancy.unknown_noise import noise_with, without_names
 from hvdc_ident.discrepancy.verdict import (
     Conclusion,
     findings_of,
@@ -45,7 +46,7 @@ from hvdc_ident.discrepancy.verdict import (
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter, Simulator
-from hvdc_ident.fit.noise import LOUDER, QUIETER, OutputNoise
+from hvdc_ident.fit.noise import LOUDER, QUIETER, OutputNoise, misfit_sentence, of_misfit
 from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, recording
@@ -123,6 +124,10 @@ def diagnose(
         other = described(judgement.instead)
     elif judgement.verdict == "unnameable" and chosen.fallback and inside:
         other = _outside(search, outcome.rounds[0])
+    best = outcome.refit if other is None or other.refit is None else other.refit
+    sure = without_names(search, first, best, judgement)
+    if sure is not judgement:
+        judgement, other, best = sure, None, first
     if not inside:
         notes = (*notes, CLOSED)
     if left := 0 if chosen.thorough else _left_out(first, outcome.rounds[0]):
@@ -131,7 +136,7 @@ def diagnose(
         notes = (*notes, f"The budget ended before {left} candidates were looked at: their status is {NOT_BEGUN!r}.")
     if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.rounds for t in r.failed):
         notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
-    return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes))
+    return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes), noise_with(best))
 
 
 def unfinished(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclusion:
@@ -201,12 +206,14 @@ def _assembled(
     other: DescribedForm | None,
     free: tuple[FitParameter, ...],
     notes: tuple[str, ...],
+    noise: Mapping[str, OutputNoise],
 ) -> Diagnosis:
     search.tell(0, 1, "before and after")
+    unknown = of_misfit({o: n.source for o, n in noise.items()})
     in_place = judgement.verdict in ("named", "ambiguous")
     tests = judgement.tests
     effects: tuple[FoundEffect, ...] = ()
-    last = outcome.refit if judgement.verdict == "no-evidence" else first
+    last = outcome.refit if judgement.verdict == "no-evidence" and not outcome.refit.placed else first
     done = judgement.verdict != "unfinished"
     if in_place:
         last = outcome.refit
@@ -225,15 +232,17 @@ def _assembled(
     text = headline(judgement, findings, depend, tolerated=keeps_tolerance(search, last))
     others: tuple[StandIn, ...] = ()
     if judgement.verdict == "no-evidence":
-        moved = off_given(last, given, rest["adequate"], leaves_a_gap(search, last))
+        moved = off_given(last, given, rest["adequate"], leaves_a_gap(search, last), known=not unknown)
         if moved is not None:
-            others = stand_ins(search, last, outcome.rounds[0], tuple(moved.parameters))
+            others = () if unknown else stand_ins(search, last, outcome.rounds[0], tuple(moved.parameters))
             moved = beside_stand_ins(moved, others)
-            findings, text = (moved,), moved.text
+            findings, text = (moved,), moved.text if not unknown else f"{text} {moved.text}"
     if off := clocks(search, last):
         text = f"{text} {clock_sentence(off)}"
     if louder := contradiction(model, first.noise, LOUDER):
         text = f"{text} {louder}"
+    if unknown:
+        text = f"{text} {misfit_sentence(unknown)}"
     notes = (*notes, *filter(None, [contradiction(model, first.noise, QUIETER)]))
     left = judgement.remainder
     return Diagnosis(
@@ -253,12 +262,12 @@ def _assembled(
         augmented=augmented,
         augmented_model=AUGMENTED if isinstance(augmented, Model) else None,
         fallback=None if other is None else other.to_dict(),
-        noise={o: noise_told(n) for o, n in first.noise.items()},
+        noise={o: noise_told(n) for o, n in noise.items()},
         notes=notes,
         doubt=judgement.doubt,
         findings=findings,
         remainder={} if left is None else plain(left) | {"below_tolerance": left.below_tolerance},
-        hypotheses=compared(first, outcome) if done else (),
+        hypotheses=compared(first, outcome) if done and not unknown else (),
         values_by_place=FrozenMap(depend),
         stand_ins=others,
     )  # fmt: skip

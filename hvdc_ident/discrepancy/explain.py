@@ -144,11 +144,12 @@ def at_given(refitted: Refit, given: Mapping[str, float]) -> Refit:
     return replace(refitted, problem=replace(refitted.problem, held=held), theta=refitted.theta_at_given)
 
 
-def off_given(last: Refit, given: Refit, adequate: bool, matters: bool) -> Finding | None:
+def off_given(last: Refit, given: Refit, adequate: bool, matters: bool, *, known: bool = True) -> Finding | None:
     """The parameters of a model without effects that explain its gap at the given values; None where it shows none there.
 
     last: the model, refitted; given: the same at the given values. adequate: whether what `last` leaves looks like noise, which is
-    then the noise, as loud as it is; matters: whether that is clearly louder than was supposed, or beyond the tolerance.
+    then the noise, as loud as it is; matters: whether that is clearly louder than was supposed, or beyond the tolerance. known:
+    whether the noise is: taken from the misfit it does not tell that nothing is missing.
     """
     try:
         before = sum(b.chi2 for b in given.problem.blocks(given.theta, derivatives=False))
@@ -165,6 +166,8 @@ def off_given(last: Refit, given: Refit, adequate: bool, matters: bool) -> Findi
         f"That explains {gap_text(share)} of the gap",
         f"{figures(np.sqrt(last.chi2 / last.rows), 3)} times",
     )
+    if not known:  # what is left is no gap beyond noise, whatever it is: none of it tells of a share
+        return found
     if matters and not adequate:
         rest = (
             f"what remains is {louder} the noise and does not look like noise, but no effect that was tried explains it"

@@ -270,7 +270,7 @@ def nominal(
     seed: int,
     executor: Executor | None,
 ) -> tuple[Nominal, tuple[str, ...]]:
-    """The refitted nominal model, and remarks on what was held and on the noise.
+    """The refitted nominal model, and remarks on the fit and on what was held.
 
     Raises StudyError where there is nothing to compare, SimulationError where no start can be run.
     """
@@ -298,9 +298,6 @@ def nominal(
     if report is None:
         optimum, held_now = _told_apart(optimum)
         notes += [f"Held at {v:g}, for these data do not distinguish it: {n}." for n, v in held_now.items()]
-    open_outputs = [o for o, n in noise.items() if n.std is None]
-    if open_outputs:
-        notes.append(f"{', '.join(open_outputs)}: no noise in the record; the misfit stands in for it.")
     stated = {
         o: replace(n, std=optimum.problem.weights.get(o)) if n.std is None and o in optimum.problem.weights else n
         for o, n in noise.items()

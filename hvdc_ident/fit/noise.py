@@ -47,12 +47,18 @@ from hvdc_ident.errors import StudyError
 from hvdc_ident.fit.likelihood import QuantisedNoise
 from hvdc_ident.fit.whitening import AR, FEWEST, autoregression, sum_of_squares
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import listed
 
 GIVEN = "given"
 MISFIT = "misfit"
+AT_FLOOR = f"{MISFIT}, at the floor of 1e-6 of the range"
 MOVING = "estimated before the event, where the model moves: at most so much"
 """The source where inputs that are recorded with their noise keep the model moving. What it lacks is in such rows too, so that the
 noise is no more; all rows tell more of what it lacks, and no steps from row to row tell of noise that a recorder has smoothed."""
+WHAT_TELLS_NOISE = (
+    "state the noise, or record rows at rest before the event (of a frequency response, the sweep once more)"
+)
+"""What to do about a noise that is taken from the misfit."""
 LOUDER, QUIETER = "louder", "quieter"
 """Words for records that are not as loud as was stated."""
 
@@ -117,6 +123,24 @@ def from_misfit(source: str) -> bool:
     return source.startswith(MISFIT)
 
 
+def of_misfit(sources: Mapping[str, str]) -> tuple[str, ...]:
+    """Return the outputs whose misfit is taken for noise. sources: by output, as in `noise_source`.
+
+    None that a model meets to its last digits: such a record has no noise, and its misfit is none.
+    """
+    return tuple(o for o, source in sources.items() if source == MISFIT)
+
+
+def misfit_sentence(outputs: Sequence[str]) -> str:
+    """Return what is to be said beside every verdict that rests on noise taken from the misfit of these outputs; "" of none."""
+    if not outputs:
+        return ""
+    return (
+        f"The noise of {listed(outputs)} is not known and is taken from the misfit, which can hide a gap or invent one; to settle "
+        f"it, {WHAT_TELLS_NOISE}."
+    )
+
+
 def floor_of(experiments: Sequence[Experiment], output: str) -> float:
     """Return the smallest standard deviation an output may have, in its unit: 1e-6 of its largest range within one record.
 
@@ -148,7 +172,7 @@ def source_text(experiments: Sequence[Experiment], output: str, weight: float | 
     """Return the source of an output's standard deviation, in words. weight: that of the misfit, in the output's unit."""
     if source_of(experiments, output) == MISFIT:
         floor = weight is not None and weight <= floor_of(experiments, output)
-        return f"{MISFIT}, at the floor of 1e-6 of the range" if floor else MISFIT
+        return AT_FLOOR if floor else MISFIT
     measured = [e for e in experiments if output in e.outputs]
     estimated = [e for e in measured if output in e.noise_dof]
     if not estimated:

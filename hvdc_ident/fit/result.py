@@ -15,6 +15,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
 from hvdc_ident.fit.adequacy import Adequacy, ResidualTests, Whiteness
 from hvdc_ident.fit.jump_instants import PlacedInstant
+from hvdc_ident.fit.noise import misfit_sentence, of_misfit
 from hvdc_ident.fit.residual import Curve
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.next_step import NextStep, next_phrases
@@ -192,6 +193,7 @@ class FitResult(Coded, Shown):
     def _screen(self) -> Iterator[str | Table]:
         yield f"Fit: {self.status}. {self.message[:1].upper()}{self.message[1:]}."
         yield self._quality()
+        yield self.noise_note
         yield f"{self.roughness['text']}." if self.roughness else ""
         start = self.starts[0].start if self.starts else {}
         rows = [(n, *_cells(e), e.std, start.get(n), e.reason) for n, e in self.estimates.items()]
@@ -216,6 +218,11 @@ class FitResult(Coded, Shown):
         """Every parameter by name with its `value` and `interval`: the estimated ones, then those held, with the reason."""
         held = {n: Estimate(v, reason=self.held.get(n, "")) for n, v in self.values.items() if n not in self.estimates}
         return self.estimates | held
+
+    @property
+    def noise_note(self) -> str:
+        """Return in a sentence that the noise of some outputs is that of the misfit; "" where it is of none."""
+        return misfit_sentence(of_misfit(self.noise_source))
 
     @property
     def what_next(self) -> tuple[NextStep, ...]:

@@ -13,6 +13,7 @@ from hvdc_ident.codec import NOT_STORED, Coded, stored_as
 from hvdc_ident.display import Shown, Table, data_frame
 from hvdc_ident.errors import ComputationError, unknown_name
 from hvdc_ident.fit import StartOutcome
+from hvdc_ident.fit.noise import misfit_sentence, of_misfit
 from hvdc_ident.fit.profile import PairProfile, Profile
 from hvdc_ident.identifiability.experiment_design import Recommendation
 from hvdc_ident.identifiability.likelihood_intervals import OtherOptimum
@@ -70,9 +71,18 @@ class Pilot:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What is to be said before any verdict, a sentence each: that the optimum may not be the best, or leaves structure."""
+        """What is to be said before any verdict, a sentence each: that the optimum may not be the best, or leaves structure, or
+        that no noise is known."""
         own = (self.search_doubt, self.structure_left)
-        return (*(f"{capital(d)}." for d in own if d), *(d for group in self.groups for d in group.doubts))
+        told = [f"{capital(d)}." for d in own if d]
+        told += filter(None, [misfit_sentence(of_misfit(self.noise_source))])
+        return (*told, *(d for group in self.groups for d in group.doubts))
+
+    @property
+    def outputs_of_misfit(self) -> tuple[str, ...]:
+        """The outputs whose noise is taken from the misfit, of all groups."""
+        own = (*of_misfit(self.noise_source), *(o for group in self.groups for o in group.outputs_of_misfit))
+        return tuple(dict.fromkeys(own))
 
     def ends_over(self, names: Sequence[str]) -> tuple[StartOutcome, ...]:
         """Return the outcomes of the search over these parameters, for a fit of them to take up; none where it made none.
@@ -193,4 +203,3 @@ class IdentifiabilityReport(Coded, Shown):
             "reason": [v.reason for v in verdicts],
         }
         return data_frame(columns, list(self.parameters), "parameter")
-

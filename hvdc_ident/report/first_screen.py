@@ -19,6 +19,7 @@ from hvdc_ident.summary.phrases import (
     condition,
     finding_name,
     interval_name,
+    noise_sentence,
     not_judged,
     place_texts,
     remainder_sentence,
@@ -96,16 +97,17 @@ def _warnings(results: Results, s: RunSummary) -> list[str]:
 
 
 def _verdict(s: RunSummary) -> tuple[str, str]:
-    """The verdict, then the errors of its worst signal with each set of values."""
+    """The verdict, then what noise it rests on, and the errors of its worst signal with each set of values."""
     signal = s.signal(s.judged.worst) if s.judged is not None else None
+    unknown = f"<p>{text(noise_sentence(s))}</p>" if s.noise_from_misfit else ""
     if signal is None:
-        return text(verdict_sentence(s)), ""
+        return text(verdict_sentence(s)), unknown
     passed = {"pass": True, "fail": False}.get(s.verdict)
     answer = f"{badge(passed)} {text(verdict_sentence(s))}" if passed is not None else text(verdict_sentence(s))
     worst = f"Worst signal: <strong>{text(signal.output)}</strong> in <strong>{text(signal.experiment)}</strong>"
     noise = f"{number(signal.noise, 2)} {text(signal.unit)}".strip() if signal.noise else ""
     worst += f", noise {noise}." if noise else ". Its noise is not known."
-    return answer, f"<p>{worst}</p>{table_of(sets_table(s))}{_basis(s)}"
+    return answer, f"{unknown}<p>{worst}</p>{table_of(sets_table(s))}{_basis(s)}"
 
 
 def _basis(s: RunSummary) -> str:
@@ -196,7 +198,7 @@ def _missing(s: RunSummary, door: Door) -> tuple[str, str]:
     if not s.diagnosis:
         return _undiagnosed(s, door), ""
     if not s.findings:
-        return f"<strong>{text(_verdict_word(s.diagnosis))}.</strong> {prose(s.said.rstrip('.'))}.", ""
+        return f"<strong>{text(_verdict_word(s))}.</strong> {prose(s.said.rstrip('.'))}.", ""
     parts: list[str] = []
     for f in s.findings:
         told = f"{_found(f)}. {text(f.text)}."
@@ -220,7 +222,10 @@ def _found(f: FindingSummary) -> str:
     return f"<strong>{text(name[:1].upper() + name[1:])}</strong>{sure}"
 
 
-def _verdict_word(verdict: str) -> str:
+def _verdict_word(s: RunSummary) -> str:
+    verdict = s.diagnosis
+    if verdict == "no-evidence" and s.noise_from_misfit:
+        return "Not told by these recordings"
     return {
         "no-evidence": "Nothing that these recordings show",
         "not-excited": "Not excited",

@@ -25,6 +25,7 @@ from hvdc_ident.summary.phrases import (
     condition,
     error_text,
     gained_sentence,
+    noise_sentence,
     not_judged,
     place_texts,
     remainder_sentence,
@@ -100,7 +101,9 @@ def letter_of(results: Results) -> Letter:
             expected=f"{STAGE}.json",
             next=(NextStep("diagnose"),),
         )
-    sentences = (_missed(s), _consistent(s), _values_judged(s), gained_sentence(s))
+    # What a diagnosis says ends with it where the diagnosis rests on it.
+    unknown = "" if noise_sentence(s) in s.said else noise_sentence(s)
+    sentences = (_missed(s), unknown, _consistent(s), _values_judged(s), gained_sentence(s))
     return Letter(tuple(t for t in sentences if t), _request(s), _next(s), tuple(_attached(results)))
 
 
@@ -259,6 +262,8 @@ def _consistent(s: RunSummary) -> str:
 def _nothing(s: RunSummary) -> str:
     """Sentences where no effect was found: that nothing else is missing, or that something is which none that was tried explains."""
     said = _without_chance(s.said).strip()
+    if s.noise_from_misfit:
+        return said
     if not s.findings:
         said = said.partition(". ")[2]  # the first sentence says by which test nothing was found
     if s.remainder.more_than_noise:

@@ -9,6 +9,7 @@ from typing import Any
 from hvdc_ident.discrepancy import Diagnosis
 from hvdc_ident.discrepancy.result import EffectSize
 from hvdc_ident.fit.judgement import Judgement, Judgements, SignalJudgement, Yardstick
+from hvdc_ident.fit.noise import of_misfit
 from hvdc_ident.fit.result import Estimate, FitResult
 from hvdc_ident.fit.uncertainty import narrow
 from hvdc_ident.identifiability import Verdict
@@ -108,7 +109,16 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
         next=_next(found, parameters),
         unadvised="" if added_to(diagnosis) else found.identified.not_recommended,
         failures=_failures(stages),
+        noise_from_misfit=noise_from_misfit(found),
     )
+
+
+def noise_from_misfit(found: StageResults) -> tuple[str, ...]:
+    """Return the outputs whose noise is taken from the misfit by any of the results."""
+    fit, diagnosis = found.fit, found.diagnosis
+    by_fit = of_misfit(fit.noise_source) if fit is not None else ()
+    by_diagnosis = () if diagnosis is None else of_misfit({o: n.get("source", "") for o, n in diagnosis.noise.items()})
+    return tuple(dict.fromkeys((*found.identified.pilot.outputs_of_misfit, *by_fit, *by_diagnosis)))
 
 
 # --- which values count ---

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
+from hvdc_ident.fit.noise import misfit_sentence
 from hvdc_ident.fit.result import FitResult
 from hvdc_ident.fit.uncertainty import WIDER
 from hvdc_ident.next_step import TO_DO, Door
@@ -69,6 +70,11 @@ def kept(judged: SetSummary, rest: str) -> str:
     return f"keeps the tolerance{f' in {signals}' if rest else ''}"
 
 
+def noise_sentence(s: RunSummary) -> str:
+    """Return that the noise of some outputs is taken from the misfit, and what settles it; empty where all of it is known."""
+    return misfit_sentence(s.noise_from_misfit)
+
+
 def _mended(s: RunSummary, judged: SetSummary) -> str:
     if "effect" not in s.sets:
         return ""
@@ -126,7 +132,9 @@ def sizes_text(sizes: Mapping[str, Quantity]) -> str:
 
 def values_line(s: RunSummary) -> str:
     """Return the values that count in one line: "k = 5.02 1/s, T = 31 ms"; empty where nothing was fitted."""
-    known = [(p.name, Quantity(p.value, p.unit, p.interval)) for p in s.parameters if s.counting.name and p.value is not None]
+    known = [
+        (p.name, Quantity(p.value, p.unit, p.interval)) for p in s.parameters if s.counting.name and p.value is not None
+    ]
     placed = [f"{p.name} by place" for p in s.parameters if p.by_place]
     return ", ".join([*(f"{n} = {size_text(q)}" for n, q in known), *placed])
 

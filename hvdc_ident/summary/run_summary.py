@@ -247,7 +247,7 @@ class RunSummary(Coded, Shown):
     stand_ins: where values that are off explain the gap, what explains it as well with these values as given.
     conditional: by set of values, whether they hold only if nothing else is missing. fit: the status of the fit.
     next: what to do, the first thing first. unadvised: why no recording that narrows an interval is advised, where that was asked.
-    failures: by stage.
+    failures: by stage. noise_from_misfit: the outputs whose noise is not known and is taken from the misfit, in any verdict of the run.
     """
 
     study: str
@@ -278,6 +278,7 @@ class RunSummary(Coded, Shown):
     next: tuple[NextStep, ...]
     unadvised: str
     failures: Mapping[str, str]
+    noise_from_misfit: tuple[str, ...] = ()
     schema: int = 1
 
     def _screen(self) -> Iterable[str | Table]:

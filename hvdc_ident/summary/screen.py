@@ -10,6 +10,7 @@ from hvdc_ident.summary.phrases import (
     condition,
     counting_sentence,
     gained_sentence,
+    noise_sentence,
     remainder_sentence,
     verdict_sentence,
     worst_text,
@@ -19,13 +20,14 @@ from hvdc_ident.summary.tables import findings_table, values_table
 
 
 def blocks(s: RunSummary, door: Door, truth: str = "", more: str = "") -> Iterator[str | Table]:
-    """Yield the verdict, the values, what they rest on, what is missing and what is left, and what to do next.
+    """Yield the verdict, what noise is not known, the values, what they rest on, what is missing and what is left, and what to do next.
 
     truth: the values beside the true ones, where these are known, in place of the table of values. more: lines before the last.
     """
     if s.judged is not None:
         worst = worst_text(s) if s.verdict == "fail" else ""
         yield f"{s.verdict.upper()}. {verdict_sentence(s)}" + (f"\nWorst signal: {worst}." if worst else "")
+    yield noise_sentence(s)
     if s.fit or s.diagnosis:
         values = values_table(s)
         yield truth or (values if values.rows else "")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from hvdc_ident.fit import FitResult
+from hvdc_ident.fit.noise import from_misfit
 from hvdc_ident.report.html import Section, folded, number, rows_of, text
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.phrases import by_place, interval_name, remarks, why_conditional
@@ -53,7 +54,9 @@ def _cells(value: float | None, interval: Interval | None, given: float | None) 
 
 def _notes(fit: FitResult, about: Context) -> str:
     """Why parameters are held, and on what the intervals rest."""
-    lines = "".join(f"<li><strong>{text(n)}</strong>: {text(said)}.</li>" for n, said in remarks(fit, about.candidates).items())
+    lines = "".join(
+        f"<li><strong>{text(n)}</strong>: {text(said)}.</li>" for n, said in remarks(fit, about.candidates).items()
+    )
     return f"<ul class='small'>{lines}</ul>" if lines else ""
 
 
@@ -118,7 +121,9 @@ def _correlation(fit: FitResult) -> str:
 
 
 def _one_by_one(fit: FitResult) -> str:
-    spread = {n for n, e in fit.estimates.items() if e.std is not None}  # a weak one has no value with a spread, here neither
+    spread = {
+        n for n, e in fit.estimates.items() if e.std is not None
+    }  # a weak one has no value with a spread, here neither
     lines = {n: d for n, d in fit.per_experiment.items() if d.get("std") is not None and n in spread}
     if not lines:
         return ""
@@ -136,7 +141,7 @@ def _one_by_one(fit: FitResult) -> str:
 
 def _weights(fit: FitResult) -> str:
     """Note on the origin of each output's standard deviation, which decides the intervals."""
-    misfit = [o for o, source in fit.noise_source.items() if "misfit" in source]
+    misfit = [o for o, source in fit.noise_source.items() if from_misfit(source)]
     given = [o for o in fit.noise_source if o not in misfit]
     parts = []
     if given:
@@ -145,10 +150,8 @@ def _weights(fit: FitResult) -> str:
         parts.append(
             f"Intervals rest on the noise given or estimated before the event for {text(', '.join(given))}{beside}."
         )
-    if misfit:
-        parts.append(
-            f"{text(', '.join(misfit))}: the noise is not known, so the standard deviation is that of the misfit."
-        )
+    if fit.noise_note:
+        parts.append(text(fit.noise_note))
     return f"<p class='small'>{' '.join(parts)}</p>" if parts else ""
 
 

@@ -157,7 +157,8 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     found = diagnosis_of(data)
     if found is None:
         return [str(data.get("message", ""))]
-    return [f"{found.verdict}: {found.text}", "", *screen(summarise({"discrepancy": data}), more=found.notes)]
+    summary = replace(summarise({"discrepancy": data}), noise_from_misfit=())  # the text says it
+    return [f"{found.verdict}: {found.text}", "", *screen(summary, more=found.notes)]
 
 
 def verdict(data: Mapping[str, Any]) -> str:

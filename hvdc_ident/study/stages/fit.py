@@ -122,11 +122,15 @@ def _searched(fit: FitResult, about: Context) -> list[str]:
 
 
 def verdict(data: Mapping[str, Any]) -> str:
-    """Return any doubt about the search, and the fit's status."""
+    """Return any doubt about the search, the fit's status, and that a noise is not known."""
     from hvdc_ident.summary.stage_results import fit_of
 
     fit = fit_of(data)
-    return "" if fit is None else "; ".join(part for part in (fit.search_doubt, fit.status) if part)
+    return (
+        ""
+        if fit is None
+        else "; ".join(part for part in (fit.search_doubt, fit.status, fit.noise_note.rstrip(".")) if part)
+    )
 
 
 STAGE = Stage(

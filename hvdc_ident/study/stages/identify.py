@@ -98,6 +98,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     from hvdc_ident.next_step import NextStep, next_sentence
     from hvdc_ident.summary import summarise
     from hvdc_ident.summary.stage_results import identified_of
+
     report = identified_of(data)
     width = max(map(len, report.parameters), default=0)
     lines = [*report.pilot.doubts]
@@ -115,7 +116,8 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
 
 
 def verdict(data: Mapping[str, Any]) -> str:
-    """Return the candidates by their verdicts."""
+    """Return any doubt about the search, the candidates by their verdicts, and that a noise is not known."""
+    from hvdc_ident.fit.noise import misfit_sentence
     from hvdc_ident.summary.stage_results import identified_of
 
     report = identified_of(data)
@@ -123,7 +125,8 @@ def verdict(data: Mapping[str, Any]) -> str:
     for name, v in report.parameters.items():
         groups.setdefault(v.verdict, []).append(name)
     found = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
-    return f"{report.pilot.search_doubt}; {found}" if report.pilot.search_doubt else found
+    unknown = misfit_sentence(report.pilot.outputs_of_misfit).rstrip(".")
+    return "; ".join(part for part in (report.pilot.search_doubt, found, unknown) if part)
 
 
 STAGE = Stage(
