@@ -48,6 +48,8 @@ def resolution(values: ArrayLike) -> float:
     if change.size < _CHANGES:
         return 0.0
     levels = distinct_levels(v)
+    if levels.size < 2:  # one value, but for the rounding of floats
+        return 0.0
     digit = _digit(levels)
     step = _recorder_step(levels, digit) or digit
     if step == 0.0:

@@ -151,3 +151,8 @@ def test_noise_is_seldom_taken_for_steps_of_the_level() -> None:
             rows = without_line(np.arange(60.0), record(60, seed, rho)[1][:60])[0]
             seen += not np.array_equal(without_steps(rows), rows)
         assert seen <= binom.ppf(0.999, 60, 0.03)
+
+
+def test_a_value_that_differs_by_the_rounding_of_floats_alone_has_no_step() -> None:
+    values = 200.0 + np.spacing(200.0) * (np.arange(60) % 3)
+    assert resolution(values) == 0.0
