@@ -22,6 +22,7 @@ from hvdc_ident.command import (
     Open,
     Out,
     PsseUnit,
+    Seed,
     StudyFile,
     WithinBudget,
     Work,
@@ -131,7 +132,7 @@ def check(
     build: Annotated[
         bool, typer.Option("--compile", help="Compile the C sources of an FMU into a new file beside it.")
     ] = False,
-    work: Work,
+    seed: Seed = 0,
     console: Console,
     access: Access,
     out: Out = None,
@@ -149,7 +150,7 @@ def check(
         raise InputError("--find, --all and --compile are about an FMU", where=str(study), expected="a path to an .fmu")
     from hvdc_ident.study.summary import Summary
 
-    found = Summary.of(access.study(study), work.seed)
+    found = Summary.of(access.study(study), seed)
     console.print_json(found.to_dict())
     console.say(*(pasteable(line, study, out, access) for line in str(found).splitlines()))
 
