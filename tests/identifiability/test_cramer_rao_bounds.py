@@ -104,7 +104,7 @@ def test_an_interrupt_leaves_the_first_answer_marked_as_such_and_never_instead_o
         assert (
             result.exit_code == 130
             and "First answer" in result.output
-            and "expected 95 % confidence interval ±" in result.output
+            and "determined there" in result.output
         )
         left = stands()
         assert left["status"] == "first-answer" and left["fingerprint"] == "" and "parameters" not in left
@@ -112,8 +112,8 @@ def test_an_interrupt_leaves_the_first_answer_marked_as_such_and_never_instead_o
         assert run("report").exit_code == 0
         assert "irst answer" in (tmp_path / "s-results" / "report.html").read_text()
         patch.setattr(identifiability, "identifiability", lambda *_, **__: signal.pause())
-        result = run("identify", "--budget", "1")
-        assert result.exit_code == 1 and "identify: ended by the budget of 1 s at: first answer" in result.output
+        result = run("identify", "--budget", "5")
+        assert result.exit_code == 1 and "identify: ended by the budget of 5 s at: first answer" in result.output
         ended = stands()
         assert ended["status"] == "unfinished" and ended["fingerprint"] == "" and ended["first"] == left["first"]
         assert "the profiles, on which the verdicts rest" in ended["not_tried"]
