@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,7 +43,13 @@ def resolution(values: ArrayLike) -> float:
     both count it is the root of the sum of their squares, for so their errors add up.
     """
     v = np.asarray(values, dtype=float)
-    v = v[np.isfinite(v)]
+    return _resolution(v[np.isfinite(v)].tobytes())
+
+
+# A fit and a diagnosis ask for the same few records again and again.
+@lru_cache(maxsize=256)
+def _resolution(finite: bytes) -> float:
+    v = np.frombuffer(finite)
     change = np.diff(v)
     change = change[change != 0]
     if change.size < _CHANGES:
