@@ -39,7 +39,9 @@ def apart(found: Array, want: Array) -> float:
     found, want = np.atleast_1d(found), np.atleast_1d(want)
     if found.size != want.size or not np.isfinite(found).all():
         return float("inf")
-    distance = np.abs(want[:, None] - found) / np.maximum(np.abs(want), 1e-3 * np.abs(want).max(initial=1e-300))[:, None]
+    distance = (
+        np.abs(want[:, None] - found) / np.maximum(np.abs(want), 1e-3 * np.abs(want).max(initial=1e-300))[:, None]
+    )
     return float(distance[linear_sum_assignment(distance)].max(initial=0.0))
 
 
@@ -54,7 +56,9 @@ def reduced_by_library(system: control.StateSpace) -> Array:
     return np.moveaxis(small(1j * W, squeeze=False), -1, 0)
 
 
-def questions(seed: int) -> list[tuple[str, Array, Callable[[LinearModel], Array], Callable[[control.StateSpace], Array]]]:
+def questions(
+    seed: int,
+) -> list[tuple[str, Array, Callable[[LinearModel], Array], Callable[[control.StateSpace], Array]]]:
     """Name, answer, and what computes it in the package and in the library."""
     good = random_system(seed)[0]
     values = hankel(*good[:3])[0]
@@ -101,10 +105,16 @@ def main() -> None:
         m = (rng.normal(size=(n, n)) + 1j * rng.normal(size=(n, n))) * 10 ** rng.uniform(-3, 3, (n, n))
         bound = slycot.ab13md(m, np.ones(n, dtype=int), 2 * np.ones(n, dtype=int))[0]
         own = structured_singular_value(m)
-        table.setdefault("structured singular value", []).append((max(own / bound - 1, 0.0), max(bound / own - 1, 0.0), np.nan))
+        table.setdefault("structured singular value", []).append(
+            (max(own / bound - 1, 0.0), max(bound / own - 1, 0.0), np.nan)
+        )
     print("off by more than 1e-6 (worst): package | python-control with Slycot | the same, scaled first")
     for name, rows in table.items():
-        parts = [f"{(column > 1e-6).sum():3d} ({np.nanmax(column):.1g})" for column in np.array(rows).T if not np.isnan(column).all()]
+        parts = [
+            f"{(column > 1e-6).sum():3d} ({np.nanmax(column):.1g})"
+            for column in np.array(rows).T
+            if not np.isnan(column).all()
+        ]
         print(f"{name:28s} of {len(rows):3d}: {' | '.join(parts)}")
 
 

@@ -21,7 +21,9 @@ ARGUMENTS: dict[str, dict[str, str]] = {
 
 def warn(old: str, new: str, above: int = 3) -> None:
     """Say that a name is another one now, at the line of the caller so many calls above."""
-    warnings.warn(f"{old} is {new} now; the old form goes with the next release", DeprecationWarning, stacklevel=above + 1)
+    warnings.warn(
+        f"{old} is {new} now; the old form goes with the next release", DeprecationWarning, stacklevel=above + 1
+    )
 
 
 def moved(name: str) -> str | None:

@@ -1,5 +1,4 @@
-"""Drawing of profiles and intervals of an identifiability report or a fit, on given axes.
-"""
+"""Drawing of profiles and intervals of an identifiability report or a fit, on given axes."""
 
 from __future__ import annotations
 
@@ -67,7 +66,9 @@ def draw_intervals(axes: Any, parameters: Mapping[str, Verdict] | Mapping[str, E
     ticks = _decades(smallest, reach)
     axes.set_xticks(ticks, [f"{t:g}" for t in ticks], minor=False)
     axes.set_xticks([], minor=True)
-    axes.set_yticks(range(len(names)), [f"{n}\n{getattr(p, 'verdict', '')}".rstrip() for n, p in parameters.items()], fontsize=7)
+    axes.set_yticks(
+        range(len(names)), [f"{n}\n{getattr(p, 'verdict', '')}".rstrip() for n, p in parameters.items()], fontsize=7
+    )
     axes.set_ylim(len(names) - 0.4, -0.6)
     axes.set_xlabel("95 % interval, % of the value (of the range where 0 is admissible); x: held", fontsize=8)
     _plain(axes)

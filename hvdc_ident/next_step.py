@@ -79,7 +79,11 @@ TO_DO: dict[str, dict[Door, str]] = {
         "python": "`print(hi.load_model({!r}).capabilities)`",
         "page": "`hvdc-ident check {} --find TEXT` in a shell",
     },
-    "check": {"shell": "`hvdc-ident check {}`", "python": "`hi.check({!r})`", "page": "`hvdc-ident check {}` in a shell"},
+    "check": {
+        "shell": "`hvdc-ident check {}`",
+        "python": "`hi.check({!r})`",
+        "page": "`hvdc-ident check {}` in a shell",
+    },
     "compile": {
         "shell": "`hvdc-ident check {} --compile`",
         "python": "`hvdc_ident.fmu.compile_fmu({!r})`",
@@ -141,13 +145,13 @@ def next_phrase(step: NextStep, door: Door = "shell") -> str:
     if step.kind == "raise-noise":
         return f"state noise = {{{step.text}}} if the instrument may be as noisy as that"
     if step.kind == "lower-noise":
-        return (
-            f"state noise = {{{step.text}}}, or leave it out to have it estimated: the intervals are too wide as they are"
-        )
+        return f"state noise = {{{step.text}}}, or leave it out to have it estimated: the intervals are too wide as they are"
     if step.kind == "option":
         return f"`{_option(step.text, door)}` {step.why}"
     told = shlex.quote(step.text) if door == "shell" else step.text
-    return f"{TO_DO[step.kind][door].format(told)} {VALUES[step.text] if step.kind == 'values' else PURPOSES[step.kind]}"
+    return (
+        f"{TO_DO[step.kind][door].format(told)} {VALUES[step.text] if step.kind == 'values' else PURPOSES[step.kind]}"
+    )
 
 
 def _option(text: str, door: Door) -> str:

@@ -312,7 +312,9 @@ def test_catalogues(kind: str) -> None:
     assert all(line.strip() for line in data[kind].values())
 
 
-def test_a_missing_core_is_told_as_an_incomplete_installation(study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_core_is_told_as_an_incomplete_installation(
+    study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(core, "FOLDER", tmp_path)
     core.library.cache_clear()
     done = call("simulate", study, "--out", tmp_path / "r")
@@ -327,7 +329,10 @@ def test_a_missing_package_is_told_as_an_incomplete_installation(study: Path, mo
 
     monkeypatch.setattr("hvdc_ident.study.checks.need_experiments", missing)
     done = call("simulate", study)
-    assert done.exit_code == 1 and "the installation is incomplete: ModuleNotFoundError: No module named 'h5py'" in done.output
+    assert (
+        done.exit_code == 1
+        and "the installation is incomplete: ModuleNotFoundError: No module named 'h5py'" in done.output
+    )
     assert "pip install" in done.output and "bug" not in done.output
 
 

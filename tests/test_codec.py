@@ -76,7 +76,11 @@ def test_every_kind_of_field_comes_back() -> None:
     assert (found.kind, found.number, found.known, found.pair, found.pole) == ("one", 0.1, None, (1, "a"), 1.0 - 2.0j)
     assert np.isnan(found.rows[0, 1]) and found.rows[1, 1] == 3.0, "what is not finite is null, which is nan"
     assert np.isnan(found.rows[1, 0]) and found.roots.tolist() == first.roots.tolist()
-    assert isinstance(found.parts, FrozenMap) and found.parts["x"][1].source == "u" and math.isnan(found.parts["x"][1].size)
+    assert (
+        isinstance(found.parts, FrozenMap)
+        and found.parts["x"][1].source == "u"
+        and math.isnan(found.parts["x"][1].size)
+    )
     assert found.path == Path("a/b.csv") and found.nested == Part(2.0) and found.either == (1.0, 2.0)
     assert found.scratch is None and found.to_dict() == first.to_dict()
 

@@ -69,7 +69,9 @@ def test_the_sdist_holds_the_sources_with_tests_and_guides(built: dict[str, Path
     assert held >= _package_files() | own | top
 
 
-def test_a_wheel_for_another_platform_asks_for_zig_and_an_unknown_one_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wheel_for_another_platform_asks_for_zig_and_an_unknown_one_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The requirements alone: zig is too large to fetch for a test."""
     monkeypatch.syspath_prepend(str(ROOT))
     import build_backend

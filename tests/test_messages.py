@@ -30,7 +30,9 @@ def strings(path: Path) -> Iterator[ast.Constant]:
     """The texts of a module that are no docstrings."""
     tree = ast.parse(path.read_text("utf-8"))
     alone = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
-    yield from (n for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str) and id(n) not in alone)
+    yield from (
+        n for n in ast.walk(tree) if isinstance(n, ast.Constant) and isinstance(n.value, str) and id(n) not in alone
+    )
 
 
 def test_no_message_of_the_library_speaks_of_a_command() -> None:

@@ -95,7 +95,10 @@ def test_python_is_told_calls_and_no_commands(tmp_path: Any) -> None:
         hi.export(tmp_path / "s.toml", tmp_path / "x.toml", values="fitted")
     assert "--values" not in str(caught.value)
     (tmp_path / "step.csv").write_text("time,u\n0,1\n1,2\n")
-    for name, words in (("none/s.toml", "write_starter"), ("step.csv", r"list_signals\('.*step.csv'\)` lists its signals")):
+    for name, words in (
+        ("none/s.toml", "write_starter"),
+        ("step.csv", r"list_signals\('.*step.csv'\)` lists its signals"),
+    ):
         with pytest.raises(InputError, match=words) as caught:
             hi.load_study(tmp_path / name)
         assert "hvdc-ident" not in str(caught.value)

@@ -33,10 +33,18 @@ PRODUCT = hi.Model(
     "product", parameters={"a": 1.0, "b": 2.0}, inputs={"u": 0.0}, states={"x": "a*b*u - x"}, outputs={"y": "x"}
 )
 TWO = hi.Model(
-    "two", parameters={"a": 2.0, "k": 3.0}, inputs={"u": 0.0, "w": 0.0}, states={"x": "u + k*w - a*x"}, outputs={"y": "x"}
+    "two",
+    parameters={"a": 2.0, "k": 3.0},
+    inputs={"u": 0.0, "w": 0.0},
+    states={"x": "u + k*w - a*x"},
+    outputs={"y": "x"},
 )
 UNSTABLE = hi.Model(  # Routh: 2 x 3 < 4 + 20
-    "third", inputs={"r": 0.0}, signals={"e": "r - x"}, states={"x": "v", "v": "b", "b": "20*e - 4*x - 3*v - 2*b"}, outputs={"y": "x"}
+    "third",
+    inputs={"r": 0.0},
+    signals={"e": "r - x"},
+    states={"x": "v", "v": "b", "b": "20*e - 4*x - 3*v - 2*b"},
+    outputs={"y": "x"},
 )
 TIME = np.linspace(0.0, 0.3, 61)
 MOVE = hi.step(1.0, 1.019, at=0.1)
@@ -193,8 +201,14 @@ def same(one: Any, two: Any, where: str = "") -> None:
 def test_margins_that_are_read_again_say_which_are_unlimited_and_which_none_are() -> None:
     """JSON has null for both: a stable loop's are infinite, and an unstable one has none."""
     stable, unstable = (Margins.from_dict(made(n).to_dict()) for n in ("margins", "margins-of-an-unstable-loop"))
-    assert str(stable) == str(made("margins")) and not np.isnan([m.value for m in (stable.gain_margin, stable.delay)]).any()
-    assert unstable.stable is False and np.isnan([unstable.gain_margin.value, unstable.disk.value, unstable.phase_margin.value]).all()
+    assert (
+        str(stable) == str(made("margins"))
+        and not np.isnan([m.value for m in (stable.gain_margin, stable.delay)]).any()
+    )
+    assert (
+        unstable.stable is False
+        and np.isnan([unstable.gain_margin.value, unstable.disk.value, unstable.phase_margin.value]).all()
+    )
     assert str(unstable) == str(made("margins-of-an-unstable-loop"))
 
 
@@ -215,7 +229,11 @@ def kinds() -> Iterator[type]:
     """Every class of the package that can be written as JSON."""
     for found in pkgutil.walk_packages(hi.__path__, "hvdc_ident."):
         module = importlib.import_module(found.name)
-        yield from (c for c in vars(module).values() if inspect.isclass(c) and c.__module__ == found.name and hasattr(c, "to_dict"))
+        yield from (
+            c
+            for c in vars(module).values()
+            if inspect.isclass(c) and c.__module__ == found.name and hasattr(c, "to_dict")
+        )
 
 
 NO_RESULTS = {

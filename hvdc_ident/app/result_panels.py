@@ -169,7 +169,9 @@ def _diagnosed(found: FoundResults, page: Page) -> None:
     if models:
         button = ui.button("Explore it with sliders", on_click=lambda: page.explore(models[0].name))
         button.props("outline dense").classes("q-px-sm self-start")
-        button.tooltip("Opens the model with what was found on the tab Explore; its rivals stand there under “model with”.")
+        button.tooltip(
+            "Opens the model with what was found on the tab Explore; its rivals stand there under “model with”."
+        )
     results = Results(found.folder)
     told = sizes.experiment if sizes is not None else next(iter(results.experiments), "")
     ui.label(f"Recorded less simulated in {told}, without and with what was found").classes("small q-mt-sm")

@@ -117,9 +117,7 @@ class ToldProgress:
             self._tell({"done": done, "total": total, "text": text})
 
 
-def work(
-    connection: Connection, _: memoryview[float], study_file: Path, folder: Path, what: str, trust: bool
-) -> None:
+def work(connection: Connection, _: memoryview[float], study_file: Path, folder: Path, what: str, trust: bool) -> None:
     """Do the work in a process of its own and tell what happens, at the end why it did not come to its end, "" where it did.
 
     what: a stage, `EVERYTHING` or `LETTER`.

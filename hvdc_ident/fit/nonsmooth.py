@@ -200,10 +200,15 @@ def _plateau(problem: Problem, theta: Array) -> Trend | None:
         return None
     middle = space.unscaled(x + ends.mean(axis=0))
     if threshold_of(problem, r) < 0.5 * float(np.sum(residual_at(problem, middle) ** 2) - r @ r):
-        ends, middle = np.abs(ends).max(axis=0) * np.array([[-1.0], [1.0]]), theta  # the middle of each is not that of all
+        ends, middle = (
+            np.abs(ends).max(axis=0) * np.array([[-1.0], [1.0]]),
+            theta,
+        )  # the middle of each is not that of all
     half = 0.5 * np.ptp(ends, axis=0) * space.slope(middle)
     scatter = np.diag(half**2) / (2.0 * TWO_SIDED)  # 1.96 standard deviations are half of it
-    unchanged = {n: (m - h, m + h) for n, m, h in zip(problem.names, middle.tolist(), half.tolist(), strict=True) if h > 0.0}
+    unchanged = {
+        n: (m - h, m + h) for n, m, h in zip(problem.names, middle.tolist(), half.tolist(), strict=True) if h > 0.0
+    }
     return Trend(middle, np.eye(x.size), scatter, jacobian.T @ jacobian, 0.0, unchanged=FrozenMap(unchanged))
 
 

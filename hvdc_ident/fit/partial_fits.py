@@ -119,7 +119,9 @@ def _together(whole: Problem, at: Mapping[str, float], parts: Sequence[FitResult
     message = "; ".join(f"{group}: {r.status}, {r.message}" for group, r in numbered)
     try:
         blocks = whole.blocks(theta, derivatives=False)
-        result = result_at(whole, LocalMinimum(theta, whole.cost(theta)), blocks, *samples_by_output(blocks, theta.size))
+        result = result_at(
+            whole, LocalMinimum(theta, whole.cost(theta)), blocks, *samples_by_output(blocks, theta.size)
+        )
     except SimulationError as error:
         point = OptimiserResult(theta, None, "failed", str(error), 1)
         return failed(whole, [theta], [point], f"{message}; all estimates together: {error}")

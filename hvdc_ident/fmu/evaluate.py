@@ -97,7 +97,9 @@ def _learned_notes(learned: Mapping[str, Any]) -> dict[str, str]:
         )
     if learned.get("own values"):
         listed = ", ".join(f"'{n}' = {v:.6g}" for n, v in learned["own values"].items())
-        texts["own values"] = f"the FMU's binary has values that its description does not: {listed}; runs that name none have these"
+        texts["own values"] = (
+            f"the FMU's binary has values that its description does not: {listed}; runs that name none have these"
+        )
     if learned.get("outputs held"):
         texts["internal steps"] = (
             f"the FMU takes steps of its own and its outputs at a row are those of the last one, up to "

@@ -342,7 +342,9 @@ class WorkerPool:
         message = worker.last_line
         end = self._end(worker)
         if end is None:
-            what = f"the process that watches the FMU's worker ended {when}, exit code {worker.process.guard.returncode}"
+            what = (
+                f"the process that watches the FMU's worker ended {when}, exit code {worker.process.guard.returncode}"
+            )
             raise self._error(what, message=message)
         if worker.runs > 1 and "Instantiate" in call_of(end):
             return {"again": 1}, {}  # some FMUs allow one instance a process, and crash at the second

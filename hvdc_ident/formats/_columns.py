@@ -103,7 +103,9 @@ def joined(parts: Sequence[Trajectory]) -> Trajectory:
     records = tuple(names[a:b] for a, b in pairwise([0, *ends]))
     told = ", ".join(f"{len(part)} rows of {record[0]}" for part, record in zip(parts, records, strict=True))
     note = f"records of several rates, each at its own instants: {told}"
-    origin = replace(first.origin, rows=0, dropped=sum(part.origin.dropped for part in parts), notes=(note,), records=records)
+    origin = replace(
+        first.origin, rows=0, dropped=sum(part.origin.dropped for part in parts), notes=(note,), records=records
+    )
     return Trajectory(time, values, names, units, origin)
 
 

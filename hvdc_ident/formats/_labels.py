@@ -62,8 +62,13 @@ def unit_in_name(name: str, names: Collection[str]) -> str:
     seconds and hours. Nor is A an ampere where `I_B` stands beside `I_A`. names: all of the file.
     """
     stem, _, unit = name.rpartition("_")
-    if not stem or not is_unit(unit) or not any(
-        conversion(unit, kind) is not None and re.match(letters, name, re.IGNORECASE) for kind, letters in _KINDS.items()
+    if (
+        not stem
+        or not is_unit(unit)
+        or not any(
+            conversion(unit, kind) is not None and re.match(letters, name, re.IGNORECASE)
+            for kind, letters in _KINDS.items()
+        )
     ):
         return ""
     phases = [other for letters in LETTERS if unit.lower() in letters for other in letters if other != unit.lower()]

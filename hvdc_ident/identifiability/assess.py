@@ -251,9 +251,7 @@ def _recommended(assessment: Assessment, whole: LocalAnalysis, *, misfit: bool) 
     ends = {n: v.profile.ci95 for n, v in assessment.verdicts.items() if v.profile is not None}
     told = {n: 0.5 * (high - low) for n, (low, high) in ends.items() if low is not None and high is not None}
     try:
-        return recommend(
-            whole, inputs, assessment.units, thresholds=assessment.thresholds, told=told, misfit=misfit
-        )
+        return recommend(whole, inputs, assessment.units, thresholds=assessment.thresholds, told=told, misfit=misfit)
     except SimulationError as error:
         return f"What to measure next cannot be told: {error.what}."
 

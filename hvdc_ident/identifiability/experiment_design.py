@@ -275,7 +275,11 @@ class Recommendation(Coded):
 
     def determinant_gain(self, r: RankedDesign) -> float | None:
         """Return by how much an experiment raises the logarithm of the determinant; None where it shows more directions."""
-        return r.criteria.log_determinant - self.now.log_determinant if r.criteria.directions == self.now.directions else None
+        return (
+            r.criteria.log_determinant - self.now.log_determinant
+            if r.criteria.directions == self.now.directions
+            else None
+        )
 
 
 def recommend(

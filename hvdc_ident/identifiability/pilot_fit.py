@@ -281,7 +281,9 @@ def cramer_rao_bounds(problem: Problem) -> CramerRaoBounds:
     Standard deviations that are not given are the misfit's there. Raises SimulationError where it cannot be made.
     """
     at, result = at_given_values(problem)
-    begun = time.perf_counter()  # only now: the first evaluation also compiles the model and factors the covariance of its noise
+    begun = (
+        time.perf_counter()
+    )  # only now: the first evaluation also compiles the model and factors the covariance of its noise
     columns = at.columns
     seconds = time.perf_counter() - begun
     names, k = at.names, len(at.names)

@@ -116,9 +116,7 @@ def _of_part(change: Change, places: Array, nx: int) -> Along:
     return change.matrix[np.ix_(places, places)], tuple(change.times[i - first] for i in places[nx:])
 
 
-def _slope(
-    part: Part, along: Along, root: complex, right: Array, left: Array, place: int, radius: float
-) -> complex:
+def _slope(part: Part, along: Along, root: complex, right: Array, left: Array, place: int, radius: float) -> complex:
     """Return the derivative of a root by a parameter; of roots that are one and not apart, the mean."""
     s = np.array([root])
     inner = left @ part.pencil_by_s(s)[0] @ right

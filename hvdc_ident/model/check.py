@@ -127,7 +127,9 @@ def _field(kind: type[Any], key: str, value: object, place: str) -> Any:
         return value
     if key == "settable":
         if not isinstance(value, bool):
-            raise ModelError(f"its {key} is neither true nor false", where=place, expected="true or false", got=_shown(value))
+            raise ModelError(
+                f"its {key} is neither true nor false", where=place, expected="true or false", got=_shown(value)
+            )
         return value
     if key in EXPRESSIONS or (key == "value" and kind not in (Parameter, Input)):
         return expression(value, place if key in ("value", "derivative", "equation", "of") else f"{place}, {key}")

@@ -131,7 +131,11 @@ class Child:
         """The last lines that it printed."""
         with contextlib.suppress(ValueError, OSError):
             size = os.fstat(self._printed.fileno()).st_size
-            return os.pread(self._printed.fileno(), LAST_WORDS, max(0, size - LAST_WORDS)).decode("utf-8", "replace").strip()
+            return (
+                os.pread(self._printed.fileno(), LAST_WORDS, max(0, size - LAST_WORDS))
+                .decode("utf-8", "replace")
+                .strip()
+            )
         return ""
 
     def end(self, *, trace: bool = False) -> Ending | None:

@@ -4,7 +4,11 @@ import atexit
 import importlib
 import os
 
-for _needed in ("pebble", "hvdc_ident.parallel.pool", "hvdc_ident.discrepancy"):  # the last imports what nearly any work needs
+for _needed in (
+    "pebble",
+    "hvdc_ident.parallel.pool",
+    "hvdc_ident.discrepancy",
+):  # the last imports what nearly any work needs
     importlib.import_module(_needed)
 # Who reads what a program prints waits for this process as well, and clearing its memory takes a second.
 atexit.register(os._exit, 0)

@@ -15,7 +15,6 @@ LOOKS = 20  # looks at the progress within a deadline: what has not moved over t
 STALL = 0.5  # s that a run at least stands still for: a busy computer lets a process wait for less
 
 
-
 def progress_file() -> IO[bytes]:
     """Return a file without a name that holds a child's progress."""
     file = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the child

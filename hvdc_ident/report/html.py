@@ -78,7 +78,9 @@ def table_of(found: Table) -> str:
 
     A column without anything in it is left out.
     """
-    plain = Table(found.header, tuple(tuple(_plain(c) if isinstance(c, Markup) else c for c in row) for row in found.rows))
+    plain = Table(
+        found.header, tuple(tuple(_plain(c) if isinstance(c, Markup) else c for c in row) for row in found.rows)
+    )
     kinds = ["" if not numbers else ' class="n"' for numbers in plain.numeric]
     rows = [[_cell(c) for c in row] for row in found.rows]
     kept = [k for k in range(len(found.header)) if not rows or any(row[k] for row in rows)]

@@ -85,7 +85,9 @@ class ScreeningResult(Coded, Shown):
         """Axes with a bar for every parameter and series: mu_star, or the total share of the variance."""
         axes = axes_of(ax)
         labels = [f"{o} in {e}" for o, e in self.series]
-        heights, errors = (dict(zip(labels, self.array(n), strict=True)) for n in (self.measure, f"{self.measure}_conf"))
+        heights, errors = (
+            dict(zip(labels, self.array(n), strict=True)) for n in (self.measure, f"{self.measure}_conf")
+        )
         bars(axes, self.parameters, heights, errors)
         axes.set_ylabel(f"{self.measure} of the RMSE")
         return axes

@@ -85,7 +85,9 @@ class SeriesBest:
         size = f"{self.smallest:.4g} {self.unit}".rstrip()
         at = ", ".join(f"{n} = {v:.6g}" for n, v in self.at.items())
         flat = f"{self.smallest:.3g}" == f"{self.largest:.3g}"
-        return f"{self.output} in {self.experiment}: " + (f"RMSE {size} at every point" if flat else f"smallest RMSE {size}, at {at}")
+        return f"{self.output} in {self.experiment}: " + (
+            f"RMSE {size} at every point" if flat else f"smallest RMSE {size}, at {at}"
+        )
 
 
 @dataclass(frozen=True)
@@ -470,4 +472,3 @@ def sweep(
 def _row(points: Points, index: int) -> Array:
     """Return the values of a point, (k,)."""
     return points.rows(index, index + 1)[0]
-

@@ -300,7 +300,9 @@ def study_of(
     if source is None and isinstance(data, Study):
         source, data = replace(data, model=model), None
     where = source.path.name if source else model.name
-    settings = source.settings if source else StudyFile.model_validate({"schema": 1, "model": ModelTable(source=model.name)})
+    settings = (
+        source.settings if source else StudyFile.model_validate({"schema": 1, "model": ModelTable(source=model.name)})
+    )
     changes: dict[str, Any] = {} if parameters is None else {"parameters": lines_of(parameters, model, where)}
     for name, keys in tables.items():
         if keys:

@@ -116,7 +116,9 @@ def with_estimates(study: Study, found: Diagnosis, fitted: Sequence[str]) -> Dia
     known = known.widened(adequacy(problem, blocks, sources, known.effective, known.rho).widening)
     estimates = estimates_of(problem, problem.start, blocks, known, known, systematic=found.beyond_noise)
     why = "it depends on which of the likely effects and places is the true one"
-    placed = {n: Estimate(math.nan, unit=estimates[n].unit, reason=why) for n in found.values_by_place if n in estimates}
+    placed = {
+        n: Estimate(math.nan, unit=estimates[n].unit, reason=why) for n in found.values_by_place if n in estimates
+    }
     return replace(
         found,
         estimates_after=FrozenMap({n: placed.get(n) or estimates[n] for n in fitted if n in estimates}),

@@ -176,7 +176,8 @@ class RunComparison(Coded, Shown):
     def page(self) -> str:
         """The comparison as an HTML page in one file."""
         heads = tuple(
-            (side, r.study, r.folder, r.model, r.software, str(r.seed)) for side, r in zip(SIDES, self.runs, strict=True)
+            (side, r.study, r.folder, r.model, r.software, str(r.seed))
+            for side, r in zip(SIDES, self.runs, strict=True)
         )
         verdicts = tuple((n, *(v or "has not run" for v in both)) for n, both in self.verdicts.items())
         parts = {

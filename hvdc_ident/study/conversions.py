@@ -31,11 +31,17 @@ COUNTED = (
 )  # fmt: skip
 """Ratios of two ways to count a voltage or current of three phases."""
 RATIOS: tuple[tuple[tuple[str, ...], str, float, float], ...] = (
-    *((("pu",), f"a factor of {n}", a, 0.0) for n, a in (("100", 100.0), ("1/100", 0.01), ("1000", 1e3), ("1/1000", 1e-3))),
+    *(
+        (("pu",), f"a factor of {n}", a, 0.0)
+        for n, a in (("100", 100.0), ("1/100", 0.01), ("1000", 1e3), ("1/1000", 1e-3))
+    ),
     (("pu",), "in degrees", 180.0 / pi, 0.0),
     *((("pu", "V", "A"), f"a factor of {n}: {why}", a, 0.0) for n, a, why in COUNTED),
-    *((("pu",), f"a factor of {k} {n}: {why}, and {with_k}", by * a, 0.0)
-      for n, a, why in COUNTED for k, by, with_k in (("1000", 1e3, "a k too few"), ("1/1000", 1e-3, "a k too many"))),
+    *(
+        (("pu",), f"a factor of {k} {n}: {why}, and {with_k}", by * a, 0.0)
+        for n, a, why in COUNTED
+        for k, by, with_k in (("1000", 1e3, "a k too few"), ("1/1000", 1e-3, "a k too many"))
+    ),
     (("pu", *POWERS), "a factor of 3/2: power of dq peak values", 1.5, 0.0),
     (("pu", *POWERS), "a factor of 2/3: power of dq peak values", 2.0 / 3.0, 0.0),
     (("pu", *POWERS), "a factor of 3: all phases for one", 3.0, 0.0),

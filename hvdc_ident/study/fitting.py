@@ -99,7 +99,9 @@ def estimated(
         settled = with_settings(study, open_set)
         return fitted(study, settled, report.pilot.ends_over, seed=seed, executor=executor, progress=progress)
 
-    return gated_fit(problem_of(study), report, fit_of, force=force, whole=as_reported(study), executor=executor, progress=progress)
+    return gated_fit(
+        problem_of(study), report, fit_of, force=force, whole=as_reported(study), executor=executor, progress=progress
+    )
 
 
 def fitted(

@@ -77,7 +77,9 @@ class InitialValues:
     def without(self, experiments: Iterable[str]) -> InitialValues:
         """Return the comparison without some experiments: those in which a mistake is known, from which the rest follows."""
         known = set(experiments)
-        remarks, failures = (tuple(t for t in texts if t.split(":")[0] not in known) for texts in (self.remarks, self.failures))
+        remarks, failures = (
+            tuple(t for t in texts if t.split(":")[0] not in known) for texts in (self.remarks, self.failures)
+        )
         return InitialValues(tuple(v for v in self.values if v.experiment not in known), remarks, failures)
 
     def _grouped(self) -> Iterator[tuple[InitialValue, str]]:
@@ -334,7 +336,11 @@ def _value(c: Comparison, conversion: Conversion | None, cause: Cause | None, qu
 def _reading(c: Comparison, conversion: Conversion) -> str:
     """Return the two levels in words, or the two movements where the levels do not tell."""
     output, recorded, model = c.record.output, c.evidence.recorded, c.model
-    tells = conversion is UNCHANGED or conversion.shift or abs(model or 0.0) > 3.0 * c.evidence.error / abs(conversion.factor)
+    tells = (
+        conversion is UNCHANGED
+        or conversion.shift
+        or abs(model or 0.0) > 3.0 * c.evidence.error / abs(conversion.factor)
+    )
     if recorded is None or model is None or not tells:
         return f"{output} moves {figures(c.evidence.slopes[0][0], 3)} times as far as the model does"
     return f"before the event {output} {_two_levels(recorded, model, c.record.unit)}"
@@ -355,7 +361,12 @@ def _signed(value: float, unit: str, digits: int = 4) -> str:
 
 
 def _common_cause(
-    simulator: ModelSimulator, e: Experiment, comparisons: Sequence[Comparison], gain: float, quantile: float, differs: bool
+    simulator: ModelSimulator,
+    e: Experiment,
+    comparisons: Sequence[Comparison],
+    gain: float,
+    quantile: float,
+    differs: bool,
 ) -> Cause | None:
     """Return a mistake in an input, a set-point or the time that explains more than what the outputs suggest, gain; None without one.
 
@@ -371,7 +382,11 @@ def _common_cause(
             continue
         if cause.channel == "time":  # the misfit of the movement decides
             after = [Comparison.of(c.record, run[c.record.output]).misfits for c in comparisons]
-            gains = [math.log(min(c.misfits) / m[0]) for c, m in zip(comparisons, after, strict=True) if m and m[0] and c.misfits]
+            gains = [
+                math.log(min(c.misfits) / m[0])
+                for c, m in zip(comparisons, after, strict=True)
+                if m and m[0] and c.misfits
+            ]
         else:
             gains = [g for c in comparisons if (g := c.gain_by(run[c.record.output])) is not None]
         if gains and odds + sum(gains) > most:
@@ -415,7 +430,9 @@ def _input_mistakes(model: AnyModel, e: Experiment) -> Iterator[Undone]:
         known = [c for c in conversions(model.inputs[name].unit, model.parameters) if c.factor > 0.0]
         tries = math.log(len(recorded) * (len(known) + 2))
         weighed = [(SIGN, -math.log(2.0 * len(recorded)))]
-        weighed += [(c, gain - tries) for c in known if expected and level and (gain := evidence.gain_of(c)) is not None]
+        weighed += [
+            (c, gain - tries) for c in known if expected and level and (gain := evidence.gain_of(c)) is not None
+        ]
         if expected * level > 0.0 and abs(math.log(level / expected)) > math.log(SMALLEST_FACTOR):
             weighed.append((Conversion("per unit, or on another base", level / expected), -tries))
         for c, odds in weighed:
@@ -445,7 +462,9 @@ def _other_set_points(simulator: ModelSimulator, e: Experiment, comparisons: Seq
     inputs = simulator.model.inputs
     known = [c for c in comparisons if c.evidence.recorded is not None]
     recorded = np.array([c.record.level for c in known])
-    error = np.array([math.hypot(c.evidence.error, FINEST * math.hypot(c.evidence.size, c.evidence.recorded or 1.0)) for c in known])
+    error = np.array(
+        [math.hypot(c.evidence.error, FINEST * math.hypot(c.evidence.size, c.evidence.recorded or 1.0)) for c in known]
+    )
 
     def run_at(name: str, value: float) -> list[Comparison]:
         run = outputs_of(simulator, e.with_(values=e.values | {name: value}))
@@ -466,11 +485,19 @@ def _other_set_points(simulator: ModelSimulator, e: Experiment, comparisons: Seq
             after = run_at(name, shown)
         except (ComputationError, ValueError):
             continue
-        levels = listed([f"{c.record.output} {_two_levels(c.evidence.recorded or 0.0, c.model or 0.0, c.record.unit)}" for c in known[:3]])
+        levels = listed(
+            [
+                f"{c.record.output} {_two_levels(c.evidence.recorded or 0.0, c.model or 0.0, c.record.unit)}"
+                for c in known[:3]
+            ]
+        )
         unit = f" {inputs[name].unit}" if inputs[name].unit else ""
         setting = f"values = {{{name} = {shown:g}}}"
         text = f"before the event {levels}; at {name} = {shown:g}{unit} and not {value:g} it rests there: {setting}?"
-        by_level = [math.log(c.evidence.level_mismatch() / a.evidence.level_mismatch()) for c, a in zip(known, after, strict=True)]
+        by_level = [
+            math.log(c.evidence.level_mismatch() / a.evidence.level_mismatch())
+            for c, a in zip(known, after, strict=True)
+        ]
         odds = -max(by_level) - math.log(len(free))
         yield e.with_(values=e.values | {name: shown}), odds, Cause(f"input {name}", setting, text)
 
@@ -586,7 +613,9 @@ def _with_candidate_runs(
     corners: dict[tuple[float, ...], dict[str, float]] = {}
     for output in dict.fromkeys(o for o, _, _ in ends):
         for pick in (min, max):
-            sides = {f.name: {v: level for (o, n, v), level in ends.items() if (o, n) == (output, f.name)} for f in free}
+            sides = {
+                f.name: {v: level for (o, n, v), level in ends.items() if (o, n) == (output, f.name)} for f in free
+            }
             corner = {n: pick(at, key=lambda v: at[v]) for n, at in sides.items() if len(set(at.values())) == 2}
             corners[tuple(corner.values())] = corner
     for corner in corners.values():

@@ -160,6 +160,8 @@ def _frequency(asked: UnitAsked, grid: InPowerFlow | None, recordings: Sequence[
             NextStep("option", "raw = FILE", "reads it from the power flow (BASFRQ)"),
         ),
     )
+
+
 def _terminals(grid: InPowerFlow | None, base: float, frequency: float) -> Terminals:
     """Return what the files state of the unit's terminals."""
     if grid is None:

@@ -31,9 +31,7 @@ def proposed_phases(record: Trajectory) -> tuple[schema.PhasesTable, ...]:
         taken |= set(gives)
         currents = list(current.names) if current is not None else None
         lines.append(
-            schema.PhasesTable(
-                voltage=list(voltage.names), current=currents, frequency=voltage.frequency, gives=gives
-            )
+            schema.PhasesTable(voltage=list(voltage.names), current=currents, frequency=voltage.frequency, gives=gives)
         )
     return tuple(lines)
 

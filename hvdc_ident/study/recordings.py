@@ -139,8 +139,12 @@ def with_noise(
         rows = recorded[_apart(e.time[recorded], means.get(o, 0.0))]
         time, values = e.time[rows], table[o][rows]
         told = o not in stated and int(before_event(time, values, event).sum()) >= FEWEST_QUIET
-        moves = values.size > 0 and float(np.ptp(values)) > 0.0  # a column that does not has no scatter to measure others by
-        found = noise_estimate(time, values, event) if told and moves else NoiseEstimate(source=ESTIMATED if told else "")
+        moves = (
+            values.size > 0 and float(np.ptp(values)) > 0.0
+        )  # a column that does not has no scatter to measure others by
+        found = (
+            noise_estimate(time, values, event) if told and moves else NoiseEstimate(source=ESTIMATED if told else "")
+        )
         notes[o] = _noise(stated.get(o), found, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
         if notes[o].source == "estimated":
             dof[o], told_by[o] = max(1.0, found.freedom), found.source

@@ -34,9 +34,7 @@ class DescribedResponse:
         noise = "not given" if share is None else f"{100 * share:.3g} % ({self.noise_source})"
         unit = f" in {self.unit}" if self.unit else ""
         low, high = self.band_hz
-        return (
-            f"{self.kind}{unit}, {', '.join(self.channels)}; {self.points} frequencies, {low:.4g} to {high:.4g} Hz; noise {noise}"
-        )
+        return f"{self.kind}{unit}, {', '.join(self.channels)}; {self.points} frequencies, {low:.4g} to {high:.4g} Hz; noise {noise}"
 
 
 @dataclass(frozen=True)

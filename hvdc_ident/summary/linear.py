@@ -152,7 +152,9 @@ class LinearResult(Coded):
     jacobian_error: float
     jacobian_check: str
     norms: Mapping[str, Any]
-    frequency_response: FrequencyResponse | None = field(default=None, metadata=stored_as("frequency_response", optional=True))
+    frequency_response: FrequencyResponse | None = field(
+        default=None, metadata=stored_as("frequency_response", optional=True)
+    )
     scale: Mapping[str, float] = field(default_factory=dict, metadata=stored_as("scale", optional=True))
     trim: Trim | None = field(default=None, metadata=stored_as("trim", optional=True))
     margins: StudyMargins | None = field(default=None, metadata=stored_as("margins", optional=True))
@@ -261,13 +263,19 @@ def other_lines(found: LinearResult) -> list[str]:
     if (c := found.comparison) is not None:
         fails = " (the winding condition fails: no controller of one need suit the other)" if c.nu_gap.winding else ""
         room = "" if c.attainable is None else f", attainable margin {c.attainable:.4g}"
-        gain = "" if c.difference is None else f"; the gains differ by up to {_at(Crossing(c.difference.omega, c.difference.value))}"
+        gain = (
+            ""
+            if c.difference is None
+            else f"; the gains differ by up to {_at(Crossing(c.difference.omega, c.difference.value))}"
+        )
         lines.append(f"against {c.second}: nu-gap {c.nu_gap.value:.4g}{fails}{room}{gain}")
     if (r := found.reduced) is not None:
         dc = ", dc gain matched" if r.found.match_dc else ""
         size = f"error {r.error.value:.4g}, bound {r.found.bound:.4g}{dc}"
         lines.append(f"reduced from {r.states_before} to {r.found.order} states: {size}")
-    lines += [f"{f.output} from {f.input}: {f.reason or f'({f.numerator}) / ({f.denominator})'}" for f in found.formulas]
+    lines += [
+        f"{f.output} from {f.input}: {f.reason or f'({f.numerator}) / ({f.denominator})'}" for f in found.formulas
+    ]
     return lines
 
 
@@ -300,7 +308,11 @@ def _mode_lines(found: LinearResult) -> Iterator[str]:
     if real:
         slowest = max(real, key=lambda m: m.eigenvalue.real)
         rate = slowest.eigenvalue.real
-        how = f"the slowest with a time constant of {quantity(-1.0 / rate, 's')}" if rate < 0 else f"one at {rate:.4g} 1/s"
+        how = (
+            f"the slowest with a time constant of {quantity(-1.0 / rate, 's')}"
+            if rate < 0
+            else f"one at {rate:.4g} 1/s"
+        )
         yield f"modes without oscillation: {len(real)}, {how}: {slowest.dominant}"
 
 
@@ -319,7 +331,8 @@ def locus_lines(locus: RootLocus | None) -> list[str]:
     unit = f" {locus.unit}" if locus.unit else ""
     span = f"{locus.parameter} from {locus.values[0]:g} to {locus.values[-1]:g}{unit}"
     lines = [
-        f"along {span} stability is {x.direction} at {x.value:.6g}{unit}, {_hertz(abs(x.eigenvalue.imag))}" for x in locus.limits
+        f"along {span} stability is {x.direction} at {x.value:.6g}{unit}, {_hertz(abs(x.eigenvalue.imag))}"
+        for x in locus.limits
     ]
     return lines or [f"along {span} stability is neither lost nor won"]
 

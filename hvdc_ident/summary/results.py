@@ -41,9 +41,7 @@ class Results:
     def stages(self) -> dict[str, dict[str, Any]]:
         """The JSON files that have the heading of a result. Raises InputError for a broken one, or none at all."""
         if not self.folder.is_dir():
-            raise InputError(
-                "no folder of results", where=str(self.folder), next=(NextStep("run"),)
-            )
+            raise InputError("no folder of results", where=str(self.folder), next=(NextStep("run"),))
         found = {}
         for path in sorted(self.folder.glob("*.json")):
             try:
@@ -54,9 +52,7 @@ class Results:
             if isinstance(data, dict) and {"schema", "study", "model", "software"} <= set(data):
                 found[path.stem] = data
         if not found:
-            raise InputError(
-                "no results in the folder", where=str(self.folder), next=(NextStep("run"),)
-            )
+            raise InputError("no results in the folder", where=str(self.folder), next=(NextStep("run"),))
         return found
 
     def get(self, stage: str) -> dict[str, Any]:

@@ -76,7 +76,9 @@ def judged(plant: Plant, diagnosis: dict[str, Any]) -> dict[str, Any]:
     """
     findings = diagnosis["findings"]
     effects = [f for f in findings if f["effect"] != "parameter"]
-    told = [(n, p) for f in effects for n in f["same_as"] or [f["effect"]] for place in f["places"] for p in place["at"]]
+    told = [
+        (n, p) for f in effects for n in f["same_as"] or [f["effect"]] for place in f["places"] for p in place["at"]
+    ]
     others = [(r["effect"], p) for group in diagnosis["ambiguity"] for r in group for p in r["at"]]
     first = [(f["effect"], p) for f in effects for p in f["places"][0]["at"]]
     size = _value(plant, diagnosis, effects)
@@ -137,13 +139,25 @@ def table(results: list[dict[str, Any]]) -> str:
     ]
     for r in results:
         if "failed" in r:
-            rows.append(f"| {r['unit']} | {PLANTS[r['unit']].hidden.told} | failed: {r['failed']} | | | | | | | {r['cpu_seconds']:.0f} |")
+            rows.append(
+                f"| {r['unit']} | {PLANTS[r['unit']].hidden.told} | failed: {r['failed']} | | | | | | | {r['cpu_seconds']:.0f} |"
+            )
             continue
         told = ", ".join(r["told"]) or r["verdict"]
         also = f" (or {len(r['also'])} more)" if r["also"] else ""
         ends = "" if not r["ci95"] or None in r["ci95"] else f" ({r['ci95'][0]:.4g} to {r['ci95'][1]:.4g})"
         value = "" if r["value"] is None else f"{r['value']:.4g}{ends}"
-        cells = (r["unit"], r["hidden"], told + also, r["wrong"], f"{r['said']:g}", f"{r['truth']:g}", value, r["effect"], r["parameter"])
+        cells = (
+            r["unit"],
+            r["hidden"],
+            told + also,
+            r["wrong"],
+            f"{r['said']:g}",
+            f"{r['truth']:g}",
+            value,
+            r["effect"],
+            r["parameter"],
+        )
         rows.append(f"| {' | '.join(cells)} | {r['cpu_seconds']:.0f} |")
     return "\n".join(rows) + "\n"
 
@@ -159,8 +173,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("names", nargs="*", metavar="UNIT", help=f"of {', '.join(PLANTS)}; default: all")
     parser.add_argument("--workers", type=int, default=1, help="units at a time")
-    parser.add_argument("--folder", type=Path, default=HERE / "studies-results", help="where the studies are written to")
-    parser.add_argument("--judge-only", action="store_true", help="compare the results that are there with the truth anew")
+    parser.add_argument(
+        "--folder", type=Path, default=HERE / "studies-results", help="where the studies are written to"
+    )
+    parser.add_argument(
+        "--judge-only", action="store_true", help="compare the results that are there with the truth anew"
+    )
     parser.add_argument("--one", action="store_true", help=argparse.SUPPRESS)
     asked = parser.parse_args(arguments)
     RESULTS.mkdir(exist_ok=True)

@@ -19,7 +19,28 @@ IEEEG1 = (0, 0, 20.0, 0.0, 0.0, 0.1, 99.0, -99.0, 1.2, 0.0, 0.3, 0.3, 0.0, 8.0, 
 HYGOV = (0.05, 0.4, 2.5, 0.05, 0.5, 9.0, 1.2, 0.0, 1.3, 1.2, 0.2, 0.08)
 IEEET1 = (0.0, 50.0, 0.05, 9.0, -9.0, 1.0, 0.5, 0.08, 1.0, 0.0, 3.0, 0.05, 4.0, 0.3)
 EXST1 = (0.02, 9.0, -9.0, 1.0, 10.0, 200.0, 0.02, 99.0, -99.0, 0.0, 0.0, 1.0)
-ESST1A = (1.0, 1.0, 0.01, 99.0, -99.0, 1.0, 8.0, 0.0, 0.0, 200.0, 0.02, 99.0, -99.0, 99.0, -99.0, 0.0, 0.0, 1.0, 0.0, 5.0)
+ESST1A = (
+    1.0,
+    1.0,
+    0.01,
+    99.0,
+    -99.0,
+    1.0,
+    8.0,
+    0.0,
+    0.0,
+    200.0,
+    0.02,
+    99.0,
+    -99.0,
+    99.0,
+    -99.0,
+    0.0,
+    0.0,
+    1.0,
+    0.0,
+    5.0,
+)
 IEEEST = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2, 0.05, 0.25, 0.04, 5.0, 5.0, 5.0, 0.2, -0.2, 0.0, 0.0)
 REGCA1 = (0, 0.02, 10.0, 0.9, 0.4, 1.22, 1.2, 0.8, 0.4, -1.3, 0.02, 0.7, 99.0, -99.0, 0.7)
 REECA1 = (
@@ -190,7 +211,11 @@ PLANTS = {
     ),
     "park_measurement": Plant(
         {"REGCA1": REGCA1, "REECB1": REECB1, "REPCA1": REPCA1},
-        Hidden("measurement of the plant controller, 0.3 s", LAG, ("plant.Vt", "plant.Vmeas", "plant.Vcontrol", "plant.err")),
+        Hidden(
+            "measurement of the plant controller, 0.3 s",
+            LAG,
+            ("plant.Vt", "plant.Vmeas", "plant.Vcontrol", "plant.err"),
+        ),
         "plant.Kp",
         {"REPCA1.Kp": 3.0, "REPCA1.Tfltr": 0.3},
         {"REPCA1.Kp": 2.0, "REPCA1.Tfltr": 0.02},
@@ -225,7 +250,11 @@ PLANTS = {
     ),
     "park_frequency_dead_band": Plant(
         {"REGCA1": REGCA1, "REECB1": REECB1, "REPCA1": REPCA1},
-        Hidden("dead band of the plant controller's frequency, ±36 mHz", DEADBAND, ("plant.dwn", "plant.ferr", "plant.ferr_in")),
+        Hidden(
+            "dead band of the plant controller's frequency, ±36 mHz",
+            DEADBAND,
+            ("plant.dwn", "plant.ferr", "plant.ferr_in"),
+        ),
         "plant.Kp",
         {"REPCA1.Fflag": 1.0, "REPCA1.Kp": 1.5, "REPCA1.fdbd1": -0.0006, "REPCA1.fdbd2": 0.0006},
         {"REPCA1.Kp": 2.0, "REPCA1.fdbd1": 0.0, "REPCA1.fdbd2": 0.0},

@@ -142,7 +142,9 @@ def use_all(page: Any) -> set[str]:
             control = page.locator(f'[data-control="{name}"]').first
             if (control.count() and control.is_visible()) or tries[name] > 3:
                 raise AssertionError(f"control {name!r} cannot be used: {error}") from None
-            done.discard(name)  # it was taken away or built anew meanwhile: where it is in sight again, it is listed again
+            done.discard(
+                name
+            )  # it was taken away or built anew meanwhile: where it is in sight again, it is listed again
         page.wait_for_timeout(REST)
         told = [t for t in page.locator(".q-notification").all_inner_texts() if FAILED in t]
         assert not told, f"after {name!r}: {told}"

@@ -254,8 +254,9 @@ def three_phases(path: Path) -> Path:
     voltage = np.where(time >= 0.3, 0.8, 1.0) * 400.0 * np.sqrt(2.0 / 3.0)
     power = np.where(time >= 0.3, 0.8 + 0.2 * np.exp(-(time - 0.3) / 0.05), 1.0) * 1e5
     waves = [np.cos(2 * np.pi * 50 * time - 2 * np.pi * k / 3) for k in range(3)]
-    sizes = ((f"U{p} [kV]", voltage * w) for p, w in zip("ABC", waves, strict=True)), (
-        (f"I{p} [A]", power / (1.5 * voltage) * w) for p, w in zip("ABC", waves, strict=True)
+    sizes = (
+        ((f"U{p} [kV]", voltage * w) for p, w in zip("ABC", waves, strict=True)),
+        ((f"I{p} [A]", power / (1.5 * voltage) * w) for p, w in zip("ABC", waves, strict=True)),
     )
     columns = {"time [s]": time, **dict(sizes[0]), **dict(sizes[1])}
     np.savetxt(path, np.column_stack([*columns.values()]), delimiter=",", header=",".join(columns), comments="")
@@ -281,7 +282,9 @@ def test_three_phases_are_proposed_as_a_new_study_proposes_them(tmp_path: Path) 
     model, record = hi.load_model(tmp_path / "c.toml"), hi.read_waveforms(data)
     mapping, matching = proposed(record, model, "r", "r.csv")
     by_new = hi.new_study(tmp_path / "new", data, tmp_path / "c.toml").to_dict()["experiments"]["r"]
-    assert mapping.kept["phases"] == by_new["phases"] and {line.signal: line.column for line in mapping.lines} == {"P": "p"}
+    assert mapping.kept["phases"] == by_new["phases"] and {line.signal: line.column for line in mapping.lines} == {
+        "P": "p"
+    }
     assert {"v", "v-rms"} <= {m.column.name for m in matching.proposed} == {p["column"] for p in by_new["proposed"]}
     mapping = mapping.assigned("v-rms", "V", "input")
     shown = columns_with_derived(mapping, record, "study.toml")

@@ -79,7 +79,10 @@ def test_the_first_experiment_is_the_one_that_is_recommended(study: hi.Study) ->
     best = suppositions(study, diagnosis_of(told(study, "discrepancy")), study.folder)[0].model
     random = np.random.default_rng(7)
     noisy = [
-        e.with_(measured=trajectory(e.time, {"y": e.measured["y"] + 0.2 * random.standard_normal(e.time.size)}), noise={"y": 0.2})
+        e.with_(
+            measured=trajectory(e.time, {"y": e.measured["y"] + 0.2 * random.standard_normal(e.time.size)}),
+            noise={"y": 0.2},
+        )
         for e in study.experiments
         if e.measured is not None
     ]
@@ -96,11 +99,23 @@ def test_the_first_experiment_is_the_one_that_is_recommended(study: hi.Study) ->
 
 def test_where_none_is_recommended_every_move_of_a_settable_input_can_be_looked_at(study: hi.Study) -> None:
     identified = told(study, "identifiability")
-    assert identified["recommended_experiment"] is None and "by which a width is uncertain" in identified["not_recommended"]
+    assert (
+        identified["recommended_experiment"] is None
+        and "by which a width is uncertain" in identified["not_recommended"]
+    )
     found = planned_experiments(study, identified_of(identified))
-    assert {p.design.inputs for p in found} == {("u",)} and {p.design.kind for p in found} == {"step", "ramp", "multisine"}
+    assert {p.design.inputs for p in found} == {("u",)} and {p.design.kind for p in found} == {
+        "step",
+        "ramp",
+        "multisine",
+    }
     grid = {n: replace(i, settable=False) for n, i in study.model.inputs.items()}
-    assert planned_experiments(replace(study, model=replace(study.model, inputs=FrozenMap(grid))), identified_of(identified)) == ()
+    assert (
+        planned_experiments(
+            replace(study, model=replace(study.model, inputs=FrozenMap(grid))), identified_of(identified)
+        )
+        == ()
+    )
 
 
 def test_a_profile_passes_its_level_at_the_ends_of_the_interval(study: hi.Study) -> None:

@@ -37,7 +37,9 @@ def test_the_margins_are_those_of_the_opened_loop() -> None:
     setting = Setting.of(LINK)
     assert setting.margins(setting.point()) == ""
     opened_at = replace(setting, opened="Irorder1")
-    assert opened_at.margins(setting.point()) == str(hi.linear.margins(hi.linear.loop(LINK, "Irorder1", setting.point())))
+    assert opened_at.margins(setting.point()) == str(
+        hi.linear.margins(hi.linear.loop(LINK, "Irorder1", setting.point()))
+    )
 
 
 def test_an_impedance_is_seen_at_a_port() -> None:
@@ -75,7 +77,9 @@ def test_one_of_two_effects_is_taken_out_and_the_other_keeps_its_size() -> None:
     uses = [{"effect": "lag", "at": place, "parameters": {"T": 0.002}} for place in ("Ir1", "Ir2")]
     both = with_effects(Setting.of(LINK), uses).with_value("lag_Ir1_T", 0.01).with_value("lag_Ir2_T", 0.03)
     second = with_effects(both, both.effects[1:])
-    assert set(second.model.parameters) - set(LINK.parameters) == {"lag_Ir2_T"} and dict(second.values) == {"lag_Ir2_T": 0.03}
+    assert set(second.model.parameters) - set(LINK.parameters) == {"lag_Ir2_T"} and dict(second.values) == {
+        "lag_Ir2_T": 0.03
+    }
     alone = with_effects(Setting.of(LINK), [uses[1]]).with_value("lag_Ir2_T", 0.03)
     np.testing.assert_array_equal(second.run()["Irorder1"], alone.run()["Irorder1"])
 
@@ -116,7 +120,9 @@ def test_the_response_is_of_what_the_experiment_moves_and_records() -> None:
     expected = hi.find_operating_point(LINK, levels)
     assert setting.point().outputs["Q1"] == pytest.approx(expected.outputs["Q1"], abs=1e-9)
     point = hi.find_operating_point(LINK, levels, values={"KIP": 60.0})
-    changed = hi.bode(hi.linearize(LINK, point, values={"KIP": 60.0}, inputs="Pref2", outputs="P2"), np.array([30.0])).values
+    changed = hi.bode(
+        hi.linearize(LINK, point, values={"KIP": 60.0}, inputs="Pref2", outputs="P2"), np.array([30.0])
+    ).values
     faster = setting.with_value("KIP", 60.0)
     np.testing.assert_allclose(faster.response(faster.point(), np.array([30.0])).values, changed, rtol=1e-9)
     assert abs(changed - setting.response(setting.point(), np.array([30.0])).values).max() > 0.01
@@ -125,7 +131,9 @@ def test_the_response_is_of_what_the_experiment_moves_and_records() -> None:
 
 def test_sizes_of_effects_are_called_by_what_they_are_of() -> None:
     setting = with_effects(Setting.of(LINK), [{"effect": "lag", "at": ["Ir1", "Ir2"], "parameters": {"T": 0.002}}])
-    assert dict(setting.titles) == dict.fromkeys(set(setting.model.parameters) - set(LINK.parameters), "T of the lag at Ir1 and Ir2")
+    assert dict(setting.titles) == dict.fromkeys(
+        set(setting.model.parameters) - set(LINK.parameters), "T of the lag at Ir1 and Ir2"
+    )
 
 
 def test_a_card_a_study_and_a_shipped_model_are_opened(tmp_path: Path) -> None:

@@ -68,4 +68,6 @@ def test_values_of_a_model_that_is_not_the_studys_are_left_out_and_said(small_st
     setting = Setting.of(found, small_study.experiments[0]).with_value("k", 5.0).with_value("lag_u_T", 0.03)
     asked = slider_values(small_study, setting, {"k"}, {})
     assert asked.elsewhere == ("lag_u_T",) and not asked.effects and asked.parameters == {"k": {"start": 5.0}}
-    assert "not written, for the study's model does not have them: lag_u_T" in write_slider_values(small_study.path, asked)
+    assert "not written, for the study's model does not have them: lag_u_T" in write_slider_values(
+        small_study.path, asked
+    )

@@ -230,7 +230,12 @@ def test_values_bounds_and_effects_are_written_and_the_rest_stays_letter_for_let
     new = with_parameters(STUDY, candidates, {"KPQ": 0.5}, [lag], "study.toml")
     left, right = STUDY.splitlines(), new.splitlines()
     assert [line for line in left if line not in right] == ["KIVDC = {start = 700} # a comment # with two signs"]
-    assert new.index("[[model.effect]]") < new.index("# what may be estimated") < new.index("KIP =") < new.index("# first recording")
+    assert (
+        new.index("[[model.effect]]")
+        < new.index("# what may be estimated")
+        < new.index("KIP =")
+        < new.index("# first recording")
+    )
     found = tomllib.loads(new)
     assert found["parameters"] == candidates and found["model"] == {
         "source": "vsc-hvdc-link",

@@ -24,7 +24,9 @@ def waves(f: float, amplitude: np.ndarray, seed: int = 0, noise: float = 2e-3, t
     random, lag = np.random.default_rng(seed), 2.0 * np.pi / 3.0
     angle = 2.0 * np.pi * f * TIME + 0.7
     shape = [
-        np.cos(angle - turn * k * lag) + 0.01 * np.cos(angle + turn * k * lag) + 0.02 * np.cos(5 * angle + turn * k * lag)
+        np.cos(angle - turn * k * lag)
+        + 0.01 * np.cos(angle + turn * k * lag)
+        + 0.02 * np.cos(5 * angle + turn * k * lag)
         for k in range(3)
     ]
     return [amplitude * (x + 1e-3) + noise * amplitude[0] * random.standard_normal(TIME.size) for x in shape]
@@ -38,7 +40,16 @@ ONE = np.ones(TIME.size)
 
 
 @pytest.mark.parametrize(
-    "names", ["UA UB UC", "u1 u2 u3", "V_L1 V_L2 V_L3", "VR VS VT", "Ua_bus7 Ub_bus7 Uc_bus7", "A相电压 B相电压 C相电压", "UU UV UW"]
+    "names",
+    [
+        "UA UB UC",
+        "u1 u2 u3",
+        "V_L1 V_L2 V_L3",
+        "VR VS VT",
+        "Ua_bus7 Ub_bus7 Uc_bus7",
+        "A相电压 B相电压 C相电压",
+        "UU UV UW",
+    ],
 )
 @pytest.mark.parametrize("frequency", [50.0, 60.0])
 def test_phases_are_found_by_their_names_and_their_turning(names: str, frequency: float) -> None:
@@ -80,7 +91,9 @@ def test_the_event_is_found_where_the_means_leave_their_level(quantity: str, see
     columns |= dict(zip(("ia", "ib", "ic"), waves(50.0, 10.0 * size, seed + 100), strict=True))
     if quantity == "f":  # 0.5 Hz faster after the event
         turned = 2.0 * np.pi * 0.5 * np.maximum(TIME - EVENT, 0.0)
-        columns |= {f"v{p}": 325.0 * np.cos(2 * np.pi * 50 * TIME + turned - 2 * np.pi * k / 3) for k, p in enumerate("abc")}
+        columns |= {
+            f"v{p}": 325.0 * np.cos(2 * np.pi * 50 * TIME + turned - 2 * np.pi * k / 3) for k, p in enumerate("abc")
+        }
     names = ["va", "vb", "vc"], ["ia", "ib", "ic"]
     made = phase_quantities(record(columns), *names, [quantity], frequency=50.0, smoothing=PhaseFilter("mean", 0.02))
     signal = InputSignal(TIME, made[quantity], np.empty(0))
@@ -132,7 +145,9 @@ def test_the_noise_of_a_record_of_phases_is_that_before_its_event(tmp_path: Path
 
     def phases(voltage: np.ndarray, power: np.ndarray, seed: int) -> Trajectory:
         columns = dict(zip(("UA", "UB", "UC"), waves(50.0, 326.6 * voltage, seed), strict=True))
-        columns |= dict(zip(("IA", "IB", "IC"), waves(50.0, power / voltage * 1e5 / (1.5 * 326.6), seed + 1), strict=True))
+        columns |= dict(
+            zip(("IA", "IB", "IC"), waves(50.0, power / voltage * 1e5 / (1.5 * 326.6), seed + 1), strict=True)
+        )
         return Trajectory(TIME, np.column_stack(list(columns.values())), tuple(columns), ("kV",) * 3 + ("A",) * 3)
 
     write_csv(phases(voltage, power, 1), tmp_path / "r.csv", units=True)

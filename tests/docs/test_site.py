@@ -137,7 +137,11 @@ def test_every_command_is_on_its_page(site: Path) -> None:
 def test_every_public_name_has_an_entry_with_an_example(site: Path) -> None:
     anchors = _Page(_text(site, "reference/python")).anchors
     special = {n for n in hvdc_ident.linear.__all__ if n not in (*hvdc_ident.__all__, "FrequencyResponse")}
-    wanted = {*hvdc_ident.__all__} - {"linear"} | {f"linear.{n}" for n in special} | {"sensitivity.morris", "sensitivity.sobol"}
+    wanted = (
+        {*hvdc_ident.__all__} - {"linear"}
+        | {f"linear.{n}" for n in special}
+        | {"sensitivity.morris", "sensitivity.sobol"}
+    )
     assert anchors >= wanted
     assert sorted(reference.examples()) == sorted(wanted)
     assert sorted(n for names in reference.KINDS.values() for n in names.split()) == sorted(wanted)

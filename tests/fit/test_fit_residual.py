@@ -144,7 +144,9 @@ def test_a_problem_whose_parts_do_not_fit_is_refused(change, message):
 
 
 def test_bounds_that_do_not_hold_the_start_are_refused():
-    with pytest.raises(StudyError, match=r"search for 'a' begins outside its bounds; expected a finite start in \[0, 1\], got 5"):
+    with pytest.raises(
+        StudyError, match=r"search for 'a' begins outside its bounds; expected a finite start in \[0, 1\], got 5"
+    ):
         FitParameter("a", 5.0, 0.0, 1.0)
     with pytest.raises(StudyError, match="the noise of 'y' is wrong"):
         fit(Problem(DECAY, (recorded("e", T, {"y": -1.0}, y=T),), FREE))

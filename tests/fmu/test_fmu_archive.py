@@ -384,7 +384,9 @@ def test_attributes_of_a_declared_type_count_where_a_variable_has_none(tmp_path)
 
 def test_a_parameter_that_is_constant_stays_as_it_is(tmp_path):
     """The standard knows none, but tools write it."""
-    text = description(PLAIN, 2).replace('causality="parameter" variability="tunable"', 'causality="parameter" variability="constant"')
+    text = description(PLAIN, 2).replace(
+        'causality="parameter" variability="tunable"', 'causality="parameter" variability="constant"'
+    )
     assert not read_description(written(tmp_path / "a.fmu", text)).parameters
 
 

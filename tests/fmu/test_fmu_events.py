@@ -240,7 +240,8 @@ def test_the_step_that_an_event_ends_is_completed_too(fmu, tmp_path, version):
 # The spring whose input changes at events alone, and which refuses what belongs into another mode.
 BY_MODE = replace(
     spring("modes", own=False),
-    code="#define STRICT\n#define AT_SET(r, v, x) if (v == 8 && m->mode == CONTINUOUS_TIME_MODE) return 3\n" + spring().code,
+    code="#define STRICT\n#define AT_SET(r, v, x) if (v == 8 && m->mode == CONTINUOUS_TIME_MODE) return 3\n"
+    + spring().code,
     variables=tuple(replace(v, variability="discrete") if v.name == "u" else v for v in spring().variables),
 )
 

@@ -42,6 +42,8 @@ def test_a_derivative_at_the_described_value_is_taken_there(fmu):
     model = fmu(OTHERWISE, interface="model-exchange")
     found = simulate(model, AT_REST, {"d": DESCRIBED}, ["d"])
     np.testing.assert_allclose(found.gradient("y")[:, 0], by_damping(DESCRIBED), atol=2e-4)
-    found = simulate(model, AT_REST, sensitivities=["d"])  # one that is varied is set: it stands where its derivative is taken
+    found = simulate(
+        model, AT_REST, sensitivities=["d"]
+    )  # one that is varied is set: it stands where its derivative is taken
     np.testing.assert_allclose(found["y"], let_go(DESCRIBED), atol=1e-5)
     np.testing.assert_allclose(found.gradient("y")[:, 0], by_damping(DESCRIBED), atol=2e-4)

@@ -80,7 +80,9 @@ def test_units_behind_an_underscore(tmp_path: Path) -> None:
         "P_W": "W", "f_Hz": "Hz", "Q_Mvar": "Mvar", "Vdc_kV": "kV", "id_A": "A", "n_rpm": "rpm", "theta_deg": "deg", "y_pu": "pu",
         "I_A": "", "I_B": "", "I_C": "", "V_s": "", "I_h": "", "P_m": "", "P_g": "", "T_m": "", "U_U": "", "U_V": "", "U_W": "", "P_N": "",
     }  # fmt: skip
-    path = write(tmp_path, ",".join(["time_ms", *units]) + "\n" + "\n".join(["0" + ",1" * len(units), "5" + ",1" * len(units)]))
+    path = write(
+        tmp_path, ",".join(["time_ms", *units]) + "\n" + "\n".join(["0" + ",1" * len(units), "5" + ",1" * len(units)])
+    )
     assert dict(list_signals(path)) == units
     found = read_waveforms(path)
     assert dict(zip(found.names, found.units, strict=True)) == units

@@ -31,7 +31,12 @@ def test_the_code_page_of_a_header_is_found(encoding: str, text: str) -> None:
 
 @pytest.mark.parametrize(
     ("encoding", "voltage", "current"),
-    [("cp1251", "Напряжение", "Ток"), ("gb18030", "电压", "电流"), ("cp932", "電圧", "電流"), ("cp1252", "Größe", "Öl")],
+    [
+        ("cp1251", "Напряжение", "Ток"),
+        ("gb18030", "电压", "电流"),
+        ("cp932", "電圧", "電流"),
+        ("cp1252", "Größe", "Öl"),
+    ],
 )
 def test_names_in_every_code_page_can_be_asked_for(tmp_path: Path, encoding: str, voltage: str, current: str) -> None:
     (tmp_path / "x.csv").write_bytes(f"t [s];{voltage} [kV];{current}\n0;1,5;2\n1;2,5;3\n".encode(encoding))

@@ -139,7 +139,10 @@ ALL = ("a.parquet", "a.inf", "a.h5", "a.mat")
     [
         *(([0.0], "too few rows; expected at least 2, got 1", n) for n in ("a.parquet", "a.h5")),
         *(([0.0, np.nan, 0.2], "the time in row 2 is not finite; expected a time in s, got nan", n) for n in ALL),
-        *(([0.0, 0.2, 0.1], "the time goes back in row 3, from 0.2 s to 0.1 s; expected increasing times", n) for n in ALL),
+        *(
+            ([0.0, 0.2, 0.1], "the time goes back in row 3, from 0.2 s to 0.1 s; expected increasing times", n)
+            for n in ALL
+        ),
     ],
 )
 def test_times_that_are_none_are_refused_alike(tmp_path: Path, times: list[float], what: str, name: str) -> None:

@@ -114,7 +114,25 @@ def test_dates_with_the_month_as_a_word(tmp_path: Path, form: str, months: tuple
     assert found.gaps("V") == 1 and found.gaps("F") == 1 and found.origin.time_unit == "date"
 
 
-LANGUAGES = ["en", "de", "de_AT", "fr", "es", "es_MX", "it", "pt", "pt_BR", "nl", "pl", "sv", "da", "nb", "nn", "fi", "ru"]
+LANGUAGES = [
+    "en",
+    "de",
+    "de_AT",
+    "fr",
+    "es",
+    "es_MX",
+    "it",
+    "pt",
+    "pt_BR",
+    "nl",
+    "pl",
+    "sv",
+    "da",
+    "nb",
+    "nn",
+    "fi",
+    "ru",
+]
 
 
 @pytest.mark.parametrize("language", LANGUAGES)
@@ -210,7 +228,9 @@ def serial(at: datetime.datetime) -> str:
 def test_dates_as_a_spreadsheet_counts_them(tmp_path: Path, label: str) -> None:
     cells = [serial(FIRST + step) for step in STEPS]
     found = read_waveforms(put(tmp_path, f"{label};u\n" + "".join(f"{c};1\n" for c in cells)))
-    np.testing.assert_allclose(found.time, [step.total_seconds() for step in STEPS], atol=1e-6)  # a double of a day has 0.6 us
+    np.testing.assert_allclose(
+        found.time, [step.total_seconds() for step in STEPS], atol=1e-6
+    )  # a double of a day has 0.6 us
     assert found.origin.time_unit == "date" and "as a spreadsheet counts them" in found.origin.notes[0]
     stated = read_waveforms(put(tmp_path, "time [d];u\n" + "".join(f"{c.replace('.', ',')};1\n" for c in cells)))
     np.testing.assert_allclose(stated.time, found.time, rtol=1e-12)

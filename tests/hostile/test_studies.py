@@ -143,9 +143,12 @@ CASES = {
         ("parameters.KPQ", "expected a table: {start = ..., min = ..., max = ...}", "Try: {min = 0.5, max = 5}"),
         _replace("[[exp", "KPQ = [0.5, 5]\n[[exp"),
     ),
-    "a number in place of a table": Case(("parameters.KPQ", "got 2.0. Try: {start = 2.0}"), _replace("[[exp", "KPQ = 2.0\n[[exp")),
+    "a number in place of a table": Case(
+        ("parameters.KPQ", "got 2.0. Try: {start = 2.0}"), _replace("[[exp", "KPQ = 2.0\n[[exp")
+    ),
     "an input that nobody knows": Case(
-        ("inputs.settable", "no input 'Pref9'", "'Pref2'"), _replace("[parameters]", '[inputs]\nsettable = "Pref9"\n[parameters]')
+        ("inputs.settable", "no input 'Pref9'", "'Pref2'"),
+        _replace("[parameters]", '[inputs]\nsettable = "Pref9"\n[parameters]'),
     ),
     "a date without quotes": Case(('Try: text in quotes: "25.11.2026"',), _append("[letter]\ndate = 25.11.2026\n")),
     "a time of day for a number": Case(

@@ -101,11 +101,7 @@ def test_an_interrupt_leaves_the_first_answer_marked_as_such_and_never_instead_o
     with monkeypatch.context() as patch:
         patch.setattr(identifiability, "identifiability", interrupted)
         result = run("identify")
-        assert (
-            result.exit_code == 130
-            and "First answer" in result.output
-            and "determined there" in result.output
-        )
+        assert result.exit_code == 130 and "First answer" in result.output and "determined there" in result.output
         left = stands()
         assert left["status"] == "first-answer" and left["fingerprint"] == "" and "parameters" not in left
         assert left["first"]["parameters"]["T"]["value"] == 0.3 and left["first"]["parameters"]["T"]["std"] > 0.0

@@ -86,4 +86,6 @@ def test_what_the_optimum_leaves_is_said_before_any_verdict() -> None:
     assert str(wave).startswith("The residual of y is") and "earlier rows do not foretell" in wave.pilot.doubts[0]
     straight = identifiability(plant, [measured(plant, {}, 0.1, t=t)], free, starts=1)
     told = [n for n, v in straight.parameters.items() if v.verdict == "identifiable"]
-    assert str(straight).startswith(f"Identifiable: {', '.join(told)} (of 2 asked about).") and straight.pilot.doubts == ()
+    assert (
+        str(straight).startswith(f"Identifiable: {', '.join(told)} (of 2 asked about).") and straight.pilot.doubts == ()
+    )

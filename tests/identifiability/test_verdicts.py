@@ -84,7 +84,12 @@ def test_structurally_unidentifiable_on_a_loop(outputs) -> None:
 
 def test_what_the_equations_tell_apart_a_short_record_may_not() -> None:
     """x' = k (a - x) from 0 shows a and k, but up to 1e-7 s only the slope a k: x'' has not yet come into it."""
-    model = Model("early", parameters={"a": 2.0, "k": 3.0}, states={"x": {"derivative": "k*(a - x)", "start": 0}}, outputs={"x": "x"})
+    model = Model(
+        "early",
+        parameters={"a": 2.0, "k": 3.0},
+        states={"x": {"derivative": "k*(a - x)", "start": 0}},
+        outputs={"x": "x"},
+    )
     free = [FitParameter("a", 1.0, 0.1, 20, given=2.5), FitParameter("k", 1.0, 0.1, 20, given=3.0)]
     report = identifiability(model, [on_model(model, "e", {}, ["x"], 1e-10, end=1e-7)], free, starts=2)
     assert report.structure.status == "decided" and not report.structure.combinations
@@ -92,7 +97,9 @@ def test_what_the_equations_tell_apart_a_short_record_may_not() -> None:
     assert (found.kind, found.members, found.seen, found.held) == ("practical", ("a", "k"), ("a*k",), ("k",))
     assert report.identifiable == ("a",) and report.held["k"].value == 3.0
     for v in report.parameters.values():
-        assert v.verdict == "practically-unidentifiable" and v.reason.startswith("In these experiments only a*k is seen.")
+        assert v.verdict == "practically-unidentifiable" and v.reason.startswith(
+            "In these experiments only a*k is seen."
+        )
     assert report.parameters["a"].value == pytest.approx(2.0, rel=1e-3)  # a k is 6
     assert report.parameters["a"].conditional_on == ("k",)
 

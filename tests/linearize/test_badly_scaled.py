@@ -49,7 +49,9 @@ def largest_gain(model, w):
                          options={"xatol": 1e-12}).fun
         for k in tops
     ]  # fmt: skip
-    return max(*peaks, found.max(), np.linalg.svd(model.response([0.0])[0], compute_uv=False)[0], np.linalg.norm(model.D, 2))
+    return max(
+        *peaks, found.max(), np.linalg.svd(model.response([0.0])[0], compute_uv=False)[0], np.linalg.norm(model.D, 2)
+    )
 
 
 @pytest.mark.parametrize("block", range(10))
@@ -60,7 +62,9 @@ def test_badly_scaled_systems_have_what_well_scaled_ones_have(block):
         if good[1].shape[1] == good[2].shape[0]:
             want, found = zeros_of_the_pencil(*good), zeros(*bad)
             assert found.size == want.size, seed
-            apart = np.abs(want[:, None] - found) / np.maximum(np.abs(want), 1e-3 * np.abs(want).max(initial=0.0))[:, None]
+            apart = (
+                np.abs(want[:, None] - found) / np.maximum(np.abs(want), 1e-3 * np.abs(want).max(initial=0.0))[:, None]
+            )
             assert apart[linear_sum_assignment(apart)].max(initial=0.0) < 1e-6, seed
         if not good[3].any():
             gramian = scipy.linalg.solve_continuous_lyapunov(good[0], -good[1] @ good[1].T)

@@ -47,7 +47,10 @@ def of_mat(path):
 def of_script(path):
     """As Octave runs it: rows parted by semicolons, quotes doubled."""
     found = dict(re.findall(r"^(\w+) = (.*);$", path.read_text(), flags=re.MULTILINE))
-    numbers = {k: [[float(v) for v in r.split()] for r in found[k].strip("[]").split(";")] for k in (*"ABCDE", "x0", "u0", "y0")}
+    numbers = {
+        k: [[float(v) for v in r.split()] for r in found[k].strip("[]").split(";")]
+        for k in (*"ABCDE", "x0", "u0", "y0")
+    }
     names = {k: tuple(n.replace("''", "'") for n in re.findall(r"'((?:[^']|'')*)'", found[k])) for k in NAMES}
     levels = {k: tuple(v[0] for v in numbers[k]) for k in ("x0", "u0", "y0")}
     return LinearModel(**{k: np.array(numbers[k]) for k in "ABCDE"}, **names, **levels, name=found["name"].strip("'"))
@@ -56,7 +59,9 @@ def of_script(path):
 def of_modelica(path):
     """As Modelica declares it: arrays in braces."""
     text = path.read_text()
-    found = dict(re.findall(r"^  (?:parameter Real|constant String) (\w+)\[[^]]*\] = \{(.*)\};$", text, flags=re.MULTILINE))
+    found = dict(
+        re.findall(r"^  (?:parameter Real|constant String) (\w+)\[[^]]*\] = \{(.*)\};$", text, flags=re.MULTILINE)
+    )
     numbers = {k: [[float(v) for v in r.split(",")] for r in re.findall(r"\{([^{}]+)\}", found[k])] for k in "ABCD"}
     names = {k: tuple(re.findall(r'"([^"]*)"', found[k])) for k in NAMES}
     levels = {k: tuple(float(v) for v in found[k].split(",")) for k in ("x0", "u0", "y0")}
@@ -93,7 +98,9 @@ def test_the_frequency_response_as_csv(known, tmp_path):
     np.testing.assert_array_equal(table["omega"], own.omega)
     for i, o in enumerate(own.output_names):
         for j, u in enumerate(own.input_names):
-            np.testing.assert_array_equal(table[f"re_{o}_from_{u}"] + 1j * table[f"im_{o}_from_{u}"], own.values[:, i, j])
+            np.testing.assert_array_equal(
+                table[f"re_{o}_from_{u}"] + 1j * table[f"im_{o}_from_{u}"], own.values[:, i, j]
+            )
     assert "# method: symbolic" in path.read_text()
 
 

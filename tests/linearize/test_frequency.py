@@ -346,7 +346,9 @@ def test_default_frequencies_of_models_without_poles_or_damping():
 @pytest.mark.parametrize("points", [2, 7, 300])
 def test_the_phase_of_a_lag_and_a_delay_on_coarse_grids(time, points):
     """-atan(w) - w T: up to 100 000 turns, of which a step passes hundreds."""
-    late = linearize(apply_effects(LAG, [{"effect": "delay", "at": ["y"], "parameters": {"T": time}}]), inputs="u", outputs="y")
+    late = linearize(
+        apply_effects(LAG, [{"effect": "delay", "at": ["y"], "parameters": {"T": time}}]), inputs="u", outputs="y"
+    )
     w = 2 * np.pi * np.geomspace(0.1, 2e5, points)
     found = late.bode(w)
     want = -np.degrees(np.arctan(w) + w * time)

@@ -273,7 +273,9 @@ def test_a_diagnosis_that_its_budget_ended_is_told_as_unfinished(like_the_demo: 
 
 
 def test_a_study_without_recordings_shows_its_sections_open(tmp_path: Path) -> None:
-    (tmp_path / "s.toml").write_text('schema = 1\n[model]\nsource = "vsc-hvdc-link"\n[linearize]\ninputs = ["Vdcref1"]\n', "utf-8")
+    (tmp_path / "s.toml").write_text(
+        'schema = 1\n[model]\nsource = "vsc-hvdc-link"\n[linearize]\ninputs = ["Vdcref1"]\n', "utf-8"
+    )
     run_stage(load_study(tmp_path / "s.toml"), "linearize", tmp_path / "r", StageOptions())
     text = page(tmp_path / "r")
     assert "data-tile" not in text and text.count("<details class='section' open>") == text.count(

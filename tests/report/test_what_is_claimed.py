@@ -338,7 +338,15 @@ def test_the_screen_of_a_run_says_what_its_values_rest_on(tmp_path: Path) -> Non
 
 def test_values_are_conditional_by_what_remains_where_it_remains(tmp_path: Path) -> None:
     """Noise remains of the fitted recordings, and more of the held-out one: "more than the noise" of all would contradict the diagnosis."""
-    left = {"share": 0.0, "p": 0.2, "held_out": 0.06, "record": "dip", "record_units": 1.2, "at": "Ut", "below_tolerance": False}
+    left = {
+        "share": 0.0,
+        "p": 0.2,
+        "held_out": 0.06,
+        "record": "dip",
+        "record_units": 1.2,
+        "at": "Ut",
+        "below_tolerance": False,
+    }
     lines = lines_of(hydro(tmp_path, discrepancy=lagging(**(MORE | {"remainder": left}))).summary)
     said = "hold only if nothing else is missing: in the held-out recording dip more than the noise remains."
     assert any(line.endswith(said) for line in lines)

@@ -99,7 +99,9 @@ def test_a_delayed_signal_is_exact_where_it_moves_faster_than_the_states(method)
         outputs={"d": "d"},
     )
     time = np.linspace(0.0, 1.4, 1401)
-    run = simulate(model, experiment("ramp", time, {"u": InputSignal.ramp(0.1, -1.0, 0.9, 1.0)}), {}, ["T"], method=method)
+    run = simulate(
+        model, experiment("ramp", time, {"u": InputSignal.ramp(0.1, -1.0, 0.9, 1.0)}), {}, ["T"], method=method
+    )
     u = np.clip((time - 0.3) / 0.8, 0.0, 1.0) * 2 - 1
     np.testing.assert_allclose(run["d"], 1 / (1 + 25 * u**2), rtol=0, atol=2 * RTOL)
     inside = (time > 0.301) & (time < 1.099)
@@ -137,7 +139,9 @@ def test_a_sample_that_a_delay_brings_back_moves_with_the_sampling_period(method
         outputs={"x": "x"},
     )
     time = np.linspace(0.0, 0.99, 34)
-    run = simulate(model, experiment("ramp", time, {"u": InputSignal.ramp(0.0, 0.0, 1.0, slope)}), {}, ["T"], method=method)
+    run = simulate(
+        model, experiment("ramp", time, {"u": InputSignal.ramp(0.0, 0.0, 1.0, slope)}), {}, ["T"], method=method
+    )
     np.testing.assert_allclose(run["x"], x(time, T), rtol=0, atol=RTOL)
     slopes = (x(time, T + 1e-6) - x(time, T - 1e-6)) / 2e-6
     away = np.abs((time - lag) / T - np.round((time - lag) / T)) > 1e-4

@@ -51,7 +51,9 @@ def test_the_vendors_file_differs_where_the_unit_says(name) -> None:
 @pytest.mark.parametrize("name", RUN.PLANTS)
 def test_the_record_is_finite_and_moves(name) -> None:
     table = np.loadtxt(RUN.HERE / "recordings" / name / "event.csv", delimiter=",", skiprows=1)
-    assert np.isfinite(table).all() and (np.diff(table[:, 0]) > 0.0).all() and (np.ptp(table[:, 1:], axis=0) > 0.01).all()
+    assert (
+        np.isfinite(table).all() and (np.diff(table[:, 0]) > 0.0).all() and (np.ptp(table[:, 1:], axis=0) > 0.01).all()
+    )
 
 
 @pytest.mark.parametrize("name", ["gas_load_limit", "steam_regulator_limit", "park_frequency_dead_band"])

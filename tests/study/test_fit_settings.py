@@ -161,7 +161,10 @@ def test_a_frequency_residual_and_a_named_optimiser(folder):
         ((GAIN, GAIN + "\nKIQ = {tie = 'KIQ2'}\nKIQ2 = {tie = 'KIQ'}"), "which is tied itself"),
         ((GAIN, GAIN + "\nKIQ = {tie = 'KIQ2', start = 3}"), "neither start, bounds nor prior"),
         ((GAIN, GAIN + "\nKIQ = {prior = {mean = 30, std = 0}}"), r"parameters.KIQ.prior.std"),
-        ((GAIN, GAIN + "\nKIQ = {start = -3, per-experiment = true}"), "the search for 'KIQ' begins outside its bounds"),
+        (
+            (GAIN, GAIN + "\nKIQ = {start = -3, per-experiment = true}"),
+            "the search for 'KIQ' begins outside its bounds",
+        ),
         ((OUTPUT, OUTPUT + '\nnuisance = ["Pref3"]'), r"no nuisance 'Pref3'.*did you mean 'Pref2'"),
     ],
 )

@@ -181,7 +181,9 @@ def test_rows_that_are_not_recorded_are_left_out(tmp_path: Path) -> None:
     e = record(-1.0)
     assert e.measured is not None
     y = np.where(np.arange(TIME.size) % 3 == 0, np.nan, e.measured["y"])
-    assert "sign?" in only(compare_initial_values(card(tmp_path), [e.with_(measured=trajectory(TIME, {"y": y}))], CANDIDATES))
+    assert "sign?" in only(
+        compare_initial_values(card(tmp_path), [e.with_(measured=trajectory(TIME, {"y": y}))], CANDIDATES)
+    )
     nothing = e.with_(measured=trajectory(TIME, {"y": np.full(TIME.size, np.nan)}))
     assert compare_initial_values(card(tmp_path), [nothing], CANDIDATES).lines == []
 
@@ -207,7 +209,9 @@ def test_coloured_noise_alone_is_no_difference(tmp_path: Path) -> None:
         e = record(noise=0.0)
         y = response(1.02, 1.1) + noise
         told += len(
-            compare_initial_values(model, [e.with_(measured=trajectory(TIME, {"y": y}), noise=FrozenMap({"y": 1e-3}))]).lines
+            compare_initial_values(
+                model, [e.with_(measured=trajectory(TIME, {"y": y}), noise=FrozenMap({"y": 1e-3}))]
+            ).lines
         )
     assert told == 0
 

@@ -161,7 +161,10 @@ def test_a_shared_file_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         ('[linearize]\nplant = {inputs = "x1", outputs = "I9"}', r"linearize\.plant\.inputs: no signal 'x1'"),
         ("[linearize]\nscale = {Vdcref9 = 0.1}", r"linearize\.scale: no input or output of \[linearize\] 'Vdcref9'"),
         ('[linearize]\nformula = ["KIVD"]', r"linearize\.formula: no parameter 'KIVD'.*did you mean 'KIVDC'"),
-        ('[linearize]\nlocus = {parameter = "KI", min = 1, max = 2}', r"linearize\.locus\.parameter: no input or parameter"),
+        (
+            '[linearize]\nlocus = {parameter = "KI", min = 1, max = 2}',
+            r"linearize\.locus\.parameter: no input or parameter",
+        ),
         ("[linearize]\ntrim = {outputs={P9 = 1.0}}", r"linearize\.trim\.outputs: no output 'P9'"),
         (
             '[[linearize.port]]\nname = "dc"\nsource = "I9"\nvoltage = "Vdc1"\ncurrent = "Vdc1"',

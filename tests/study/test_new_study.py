@@ -278,8 +278,12 @@ def three_phases(path: Path, unit: str = "kV") -> Path:
 
 def test_phases_are_proposed_and_what_they_give_is_mapped(tmp_path: Path) -> None:
     """A model in V, line to line rms: the two magnitudes of the phases are told apart by their levels."""
-    (tmp_path / "c.toml").write_text(THREE.replace("UNIT", "kV").replace("SIZE", "400").replace("1.0, unit", "400, unit"))
-    shown = call("new", tmp_path / "st", "--from", three_phases(tmp_path / "r.csv"), "--model", tmp_path / "c.toml", "--json")
+    (tmp_path / "c.toml").write_text(
+        THREE.replace("UNIT", "kV").replace("SIZE", "400").replace("1.0, unit", "400, unit")
+    )
+    shown = call(
+        "new", tmp_path / "st", "--from", three_phases(tmp_path / "r.csv"), "--model", tmp_path / "c.toml", "--json"
+    )
     assert shown.exit_code == 0, shown.output
     told = json.loads(shown.stdout)["experiments"]["r"]
     assert told["mapped"]["P"]["column"] == "p" and "V" not in told["mapped"] and told["unused"] == []
@@ -303,7 +307,15 @@ def test_phases_are_proposed_and_what_they_give_is_mapped(tmp_path: Path) -> Non
 @pytest.mark.parametrize("unit", ["kV", "V"])
 def test_the_base_of_a_peak_is_told_from_the_rated_voltage(tmp_path: Path, unit: str) -> None:
     (tmp_path / "c.toml").write_text(THREE.replace("UNIT", "pu").replace("SIZE", "1"))
-    shown = call("new", tmp_path / "st", "--from", three_phases(tmp_path / "r.csv", unit), "--model", tmp_path / "c.toml", "--json")
+    shown = call(
+        "new",
+        tmp_path / "st",
+        "--from",
+        three_phases(tmp_path / "r.csv", unit),
+        "--model",
+        tmp_path / "c.toml",
+        "--json",
+    )
     told = json.loads(shown.stdout)["experiments"]["r"]["proposed"]
     (voltage,) = (p for p in told if p["signal"] == "V" and p["column"] == "v")
     base = 400.0 * np.sqrt(2.0 / 3.0) * (1e3 if unit == "V" else 1.0)
@@ -313,7 +325,10 @@ def test_the_base_of_a_peak_is_told_from_the_rated_voltage(tmp_path: Path, unit:
 
 def test_units_in_names_count_as_those_in_headers(motor: Path, tmp_path: Path) -> None:
     r = recorded()
-    data = write_csv(tmp_path / "a.csv", {"time_ms": 1e3 * r["time"], "v_kV": 1e-3 * r["v"], "w_rpm": r["w"] * 30 / np.pi, "i_a": r["i"]})
+    data = write_csv(
+        tmp_path / "a.csv",
+        {"time_ms": 1e3 * r["time"], "v_kV": 1e-3 * r["v"], "w_rpm": r["w"] * 30 / np.pi, "i_a": r["i"]},
+    )
     found = hi.new_study(tmp_path / "st", data, motor)
     assert {m.target.name: (m.column.name, m.column.unit) for m in found.recordings[0].columns.mapped} == {
         "v": ("v_kV", "kV"), "w": ("w_rpm", "rpm"), "i_a": ("i_a", ""),

@@ -118,7 +118,8 @@ def test_without_a_power_flow_the_shelf_values_are_named(folder: Path) -> None:
     code, said = new(folder, "--base", 250, "--frequency", 50, dyr="101 'GENCLS' 1 3.0 1.5 /\n")
     assert (
         code == 0
-        and "no power flow (a .raw file) is given, which has these: gen.Xpd = 0.3 pu (ZX) and gen.Ra = 0 pu (ZR)" in said
+        and "no power flow (a .raw file) is given, which has these: gen.Xpd = 0.3 pu (ZX) and gen.Ra = 0 pu (ZR)"
+        in said
     )
 
 

@@ -11,7 +11,9 @@ import hvdc_ident as hi
 from hvdc_ident.errors import StudyError
 
 TIME = np.linspace(0.0, 1.0, 21)
-PLANT = hi.Model("p", parameters={"k": 2.0, "T": 0.2}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+PLANT = hi.Model(
+    "p", parameters={"k": 2.0, "T": 0.2}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"}
+)
 RECORD = hi.Experiment(TIME, "e", inputs={"u": hi.step(0.0, 1.0, at=0.2)}, outputs={"y": np.zeros(TIME.size)})
 
 

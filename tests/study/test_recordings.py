@@ -130,7 +130,11 @@ def of_three_rates(folder: Path, gap: int = 0) -> Path:
     study.write_text(text.replace('["w", "i"]', '{w = "speed/w", i = "arm/i"}'))
     random = np.random.default_rng(3)
     with h5py.File(folder / "d.h5", "w") as file:
-        for name, step, first, column in (("in/v", 5e-3, 0.0, 0), ("speed/w", 2e-3, 0.0, 1), ("arm/i", 1.5e-2, 0.05, 2)):
+        for name, step, first, column in (
+            ("in/v", 5e-3, 0.0, 0),
+            ("speed/w", 2e-3, 0.0, 1),
+            ("arm/i", 1.5e-2, 0.05, 2),
+        ):
             time = first + step * np.arange(round((1.2 - first) / step))
             values = exact(time)[column] + (1e-3 * random.standard_normal(time.size) if column else 0.0)
             if gap and column == 0:

@@ -339,7 +339,9 @@ def test_a_model_without_states_has_a_response_too(tmp_path):
 def test_phases_of_a_response_through_a_delay_count_their_turns(motor, tmp_path):
     """Measured at 6 frequencies with up to 20 turns between them: the dots lie on the model's curve, not some turns above it."""
     (tmp_path / "motor.toml").write_text(
-        MOTOR.replace("[outputs]", '[delays]\nlate = {of = "w", time = "0.4"}\n[outputs]').replace('w = "w"', 'w = "late"')
+        MOTOR.replace("[outputs]", '[delays]\nlate = {of = "w", time = "0.4"}\n[outputs]').replace(
+            'w = "w"', 'w = "late"'
+        )
     )
     f = np.geomspace(0.05, 50, 6)
     g = 0.5 / (0.01 * 2j * np.pi * f + 0.1 + 0.25) * np.exp(-0.8j * np.pi * f)

@@ -16,11 +16,15 @@ PLANT = hi.Model("plant", inputs={"u": 0.0}, states={"x": "4*(u - x)"}, outputs=
 
 
 def experiment(name: str, role: str = "fit") -> hi.Experiment:
-    return hi.Experiment(TIME, name, inputs={"u": STEP}, outputs={"y": np.zeros(TIME.size)}, noise={"y": 0.01}, role=role)
+    return hi.Experiment(
+        TIME, name, inputs={"u": STEP}, outputs={"y": np.zeros(TIME.size)}, noise={"y": 0.01}, role=role
+    )
 
 
 def diagnosis(effect: str, size: dict[str, float], gap: Gap, at: str = "u") -> Diagnosis:
-    found = FoundEffect(effect, (at,), FrozenMap({n: EffectSize(v, unit="s" if n == "T" else "") for n, v in size.items()}))
+    found = FoundEffect(
+        effect, (at,), FrozenMap({n: EffectSize(v, unit="s" if n == "T" else "") for n, v in size.items()})
+    )
     return Diagnosis("named", effects=(found,), gap=gap, augmented=PLANT)
 
 

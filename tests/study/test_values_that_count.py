@@ -186,7 +186,9 @@ def test_the_linear_model_is_that_of_the_servo_behind_the_lag(
     assert (results["linearization"]["set"], fitted["set"], fitted["values"]) == ("given", "effect", "fitted")
     assert "with lag at" in results["linearization"]["fitted_note"]
     slowest = np.linalg.eigvals(np.array(fitted["A"])).real.max()
-    assert verdict(results["linearization"]).startswith(f"with the effect: stable, rightmost eigenvalue {slowest:.4g} 1/s")
+    assert verdict(results["linearization"]).startswith(
+        f"with the effect: stable, rightmost eigenvalue {slowest:.4g} 1/s"
+    )
 
 
 @pytest.mark.parametrize(("name", "poles"), [("effect", 3), ("fit", 2), ("fitted", 3), ("given", 2)])

@@ -381,7 +381,11 @@ def test_the_parts_that_were_told_wrongly(study_of: Callable[[str], Told]) -> No
     assert right.verdict == "pass" and not right.findings and not right.moved and not right.counting.kind
     turbine = study_of("turbine").summary
     water = next(p for p in turbine.parameters if p.name == "Tw")
-    assert turbine.counting.name == "effect" and water.interval[0] < TW < water.interval[1] and abs(water.fitted - TW) > 0.03
+    assert (
+        turbine.counting.name == "effect"
+        and water.interval[0] < TW < water.interval[1]
+        and abs(water.fitted - TW) > 0.03
+    )
     machine = study_of("machine").summary
     assert machine.verdict == "pass" and not machine.counting.kind and [p.name for p in machine.moved] == ["D"]
     assert machine.moved[0].value == pytest.approx(12.0, rel=0.03)

@@ -135,7 +135,9 @@ class Mapper:
         with ui.element("div").classes("line q-mt-xs"):
             self._write = ui.button("Write the study", on_click=lambda: self._in_background(self._save))
             self._write.props("dense unelevated").classes("q-px-md")
-            self._reopen = ui.button("Open the study", on_click=ui.navigate.reload).props("outline dense").classes("q-px-md")
+            self._reopen = (
+                ui.button("Open the study", on_click=ui.navigate.reload).props("outline dense").classes("q-px-md")
+            )
             self._reopen.tooltip("Loads the page anew, with the recording under the curves and the stages to run")
             self._reopen.visible = False
             self._status = ui.label("").classes("small").style("overflow-wrap: anywhere")

@@ -147,9 +147,7 @@ def _next(advice: Recommendation | None) -> str:
         "<p class='small'>Best first, the best of each kind and input. To first order, with noise as in the recordings; of a "
         "signal not recorded so far, as on others of its unit.</p>"
     )
-    about = (
-        f"How far each experiment narrows the interval of {text(advice.aim)}, and how much it tells of all parameters together."
-    )
+    about = f"How far each experiment narrows the interval of {text(advice.aim)}, and how much it tells of all parameters together."
     return lead + folded("Experiments compared", rows_of(header, rows) + note, about)
 
 

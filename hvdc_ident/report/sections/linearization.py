@@ -214,7 +214,9 @@ def _locus(found: RootLocus | None) -> str:
     for scale in (axes.set_xscale, axes.set_yscale):
         scale("symlog", linthresh=near)
     unit = f" {text(found.unit)}" if found.unit else ""
-    span = f"{text(found.parameter)} from {number(found.values[0])} (dots) to {number(found.values[-1])}{unit} (squares)"
+    span = (
+        f"{text(found.parameter)} from {number(found.values[0])} (dots) to {number(found.values[-1])}{unit} (squares)"
+    )
     picture = captioned(svg(fig, f"Eigenvalues along {found.parameter}"), f"Eigenvalues along {span}.")
     return f"<h3>Eigenvalues along a parameter</h3>{picture}{_said(locus_lines(found))}"
 

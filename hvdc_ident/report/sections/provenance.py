@@ -21,7 +21,9 @@ def _render(results: Results) -> str:
     heading = results.heading
     rows = [(name, Markup(text(heading.get(name, "")))) for name in ("study", "model", "software", "seed")]
     sources = heading.get("sources") or {}
-    rows += [("source", Markup(f"{text(name)}<br><code>sha256 {text(value)}</code>")) for name, value in sources.items()]
+    rows += [
+        ("source", Markup(f"{text(name)}<br><code>sha256 {text(value)}</code>")) for name, value in sources.items()
+    ]
     return rows_of(["what", "which"], rows) + _numbers(results)
 
 

@@ -28,7 +28,9 @@ def _response(r: ComparedResponse) -> str:
         f"{', the full ones the fitted values' if 'fitted' in r.models else ''}.</p>"
     )
     reasons = "".join(
-        f"<p>With the {text(n)} values there is no response: {text(m.reason)}</p>" for n, m in r.models.items() if m.reason
+        f"<p>With the {text(n)} values there is no response: {text(m.reason)}</p>"
+        for n, m in r.models.items()
+        if m.reason
     )
     return head + _bode(r) + _errors(r) + reasons + _remarks(r)
 

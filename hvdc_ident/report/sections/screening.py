@@ -18,11 +18,7 @@ def _render(results: Results) -> str:
         return ""
     found = ScreeningResult.from_dict(data)
     columns = COLUMNS[found.method]
-    rows = [
-        (o, e, p, *(shown(m[n], 3) for n in columns))
-        for o, e in found.series
-        for p, m in found.of(o, e).items()
-    ]
+    rows = [(o, e, p, *(shown(m[n], 3) for n in columns)) for o, e in found.series for p, m in found.of(o, e).items()]
     method = "Morris' elementary effects" if found.method == "morris" else "Sobol's indices"
     against = "the recordings" if data["against"] == "data" else "the model's own run"
     head = (

@@ -31,7 +31,9 @@ def _render(results: Results) -> str:
         return ""
     found = SweepResult.from_dict(data)
     names = ", ".join(map(text, found.parameters))
-    against = {"data": "the recordings", "base": "the run at the base values"}.get(found.against, f"model {found.against}")
+    against = {"data": "the recordings", "base": "the run at the base values"}.get(
+        found.against, f"model {found.against}"
+    )
     lines = [f"<p>{len(found)} points of {names} against {text(against)}.</p>"]
     if found.failed:
         reasons = list(dict.fromkeys(found.failed.values()))[:3]
@@ -148,9 +150,7 @@ def sweep_poles(parameter: str, values: Array, poles: np.ndarray) -> Figure:
     return fig
 
 
-def sweep_bode(
-    parameter: str, values: Array, omega: Array, response: np.ndarray, phase: Array, channel: str
-) -> Figure:
+def sweep_bode(parameter: str, values: Array, omega: Array, response: np.ndarray, phase: Array, channel: str) -> Figure:
     """Gain and phase of one channel, a curve a row, (rows, frequencies) complex and degrees, colored by the parameter."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable

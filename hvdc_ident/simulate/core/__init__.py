@@ -28,7 +28,9 @@ FOLDER = Path(__file__).parent
 BUILDS = {"avx2": ("avx2", "fma"), "baseline": ()}
 """The builds of the library, best first, with the features of the processor that each needs."""
 LIBRARY = "core-{build}.so.1"
-REBUILD = "`pip install --force-reinstall hvdc_ident`; in a checkout `python build_backend.py`, which needs a C compiler"
+REBUILD = (
+    "`pip install --force-reinstall hvdc_ident`; in a checkout `python build_backend.py`, which needs a C compiler"
+)
 Record = NDArray[np.int64]
 
 
@@ -85,7 +87,9 @@ def library() -> ctypes.CDLL:
             found.hvdc_ident_room.restype = found.hvdc_ident_fields.restype = ctypes.c_int64
             if found.hvdc_ident_fields() != len(RUN_FIELDS):
                 raise InstallationError(
-                    "the installation is incomplete: the compiled core is of another version", where=str(path), hint=REBUILD
+                    "the installation is incomplete: the compiled core is of another version",
+                    where=str(path),
+                    hint=REBUILD,
                 )
             found.hvdc_ident_judge.restype = found.hvdc_ident_repeat.restype = None
             return found

@@ -141,7 +141,12 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     return [*lines, "Next: `hvdc-ident export STUDY --to FILE.mat` (.json, .csv, .m) writes A, B, C and D."]
 
 
-_AT = {"given": "at the given values", "start": "at the start values", "fit": "at the fitted values", "effect": "with the effect"}
+_AT = {
+    "given": "at the given values",
+    "start": "at the start values",
+    "fit": "at the fitted values",
+    "effect": "with the effect",
+}
 
 
 def verdict(data: Mapping[str, Any]) -> str:
@@ -150,7 +155,9 @@ def verdict(data: Mapping[str, Any]) -> str:
 
     both = Linearisation.from_dict(data)
     found = both.at_fitted or both.given
-    least = next((f"; least damped mode {m.mode.frequency_hz:.4g} Hz, {100 * m.mode.damping:.3g} %" for m in found.swinging), "")
+    least = next(
+        (f"; least damped mode {m.mode.frequency_hz:.4g} Hz, {100 * m.mode.damping:.3g} %" for m in found.swinging), ""
+    )
     return f"{_AT[found.set]}: {found.verdict or 'no states'}{least}"
 
 

@@ -75,7 +75,10 @@ def verdict(data: Mapping[str, Any]) -> str:
     from hvdc_ident.sensitivity import ScreeningResult
 
     found = ScreeningResult.from_dict(data)
-    total = {o: {p: sum(m[p][found.measure] for m in line.values()) for p in found.parameters} for o, line in found.measures.items()}
+    total = {
+        o: {p: sum(m[p][found.measure] for m in line.values()) for p in found.parameters}
+        for o, line in found.measures.items()
+    }
     return ", ".join(f"{max(each, key=lambda p: each[p])} moves {o} most" for o, each in total.items())
 
 
