@@ -45,7 +45,10 @@ _DATED = re.compile(r":|[^\W\d_]{3}.*\d|\d[-/ ]\w+[-/ ]\d|\d{1,2}\.\d{1,2}\.\d{2
 _SERIAL_UNIT, _SERIAL = 86400.0, ((20_000.0, 80_000.0), (700_000.0, 780_000.0))
 """s in a day, and the days between 1954 and 2119 as spreadsheets count them, since 1899-12-30, and MATLAB, since the year 0."""
 _SERIAL_NOTE = "the time is taken for dates as a spreadsheet counts them, in days"
-_MAYBE_SERIAL = 'the time may be dates as a spreadsheet counts them, in days, and is taken as s: name the column "date", or its unit "d", if it is'
+_MAYBE_SERIAL = (
+    "the time may be dates as a spreadsheet counts them, in days, and is taken as s: "
+    'name the column "date", or its unit "d", if it is'
+)
 _SHORT_STEP = 1e-3  # d, 86 s: dates of a spreadsheet lie closer, and a clock of seconds seldom begins at half a day
 _DATES = "as in 2026-11-21 10:15:00.020, 21/11/2026 10:15:00 or 21-Nov-2026 10:15:00"
 _MISSING = {
