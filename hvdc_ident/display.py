@@ -95,7 +95,8 @@ class Shown:
         return found[:-1]
 
     def __repr__(self) -> str:
-        headline, kind = str(next(iter(self._screen()), "")).splitlines()[0], type(self).__name__
+        first = next((text for text in map(str, self._screen()) if text), "")
+        headline, kind = first.partition("\n")[0], type(self).__name__
         return f"<{headline}>" if headline.startswith(kind) else f"<{kind}: {headline}>"
 
     def _repr_html_(self) -> str:
