@@ -18,7 +18,6 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
-import click
 import typer
 
 from hvdc_ident.budget import Budget, BudgetSpent
@@ -88,15 +87,12 @@ Open = Annotated[bool, typer.Option("--open", help="Open the page in the browser
 
 
 OWN_PROCESS = "own process"
-"""Object of the context of a command line that has a process for itself (click's `obj`)."""
+"""Object of the context of a command line that has a process for itself."""
 
 
 def _budget(text: Any) -> Budget:
-    """Return a budget that began with the process, where that is the command's own, else now."""
-    seconds = _number("--budget", "seconds, at least 0.001", "600", 0.001)(text)
-    context = click.get_current_context(silent=True)
-    alone = context is not None and context.find_root().obj == OWN_PROCESS
-    return Budget.of_process(seconds) if alone else Budget.of(seconds)
+    """Return a budget that begins now."""
+    return Budget.of(_number("--budget", "seconds, at least 0.001", "600", 0.001)(text))
 
 
 WithinBudget = Annotated[
@@ -292,8 +288,12 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
             for f in fields(kind)
         ]
 
+    parameters.append(inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context))
+
     @functools.wraps(function)
-    def run(**given: Any) -> None:
+    def run(context: typer.Context, **given: Any) -> None:
+        if given.get("budget") is not None and context.find_root().obj == OWN_PROCESS:
+            given["budget"] = Budget.of_process(given["budget"].seconds)
         made = {n: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for n, kind in groups.items()}
         given |= made
 
