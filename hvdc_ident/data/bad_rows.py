@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data.noise import ENOUGH, FEWEST_QUIET, noise_estimate, row_scatter
-from hvdc_ident.data.signals import HOLD_SHARE, off_line, robust_std
+from hvdc_ident.data.signals import HOLD_SHARE, row_noise
 from hvdc_ident.data.trajectory import Array
 
 ALARMS = 1e-6
@@ -184,7 +184,7 @@ def _noise(time: Array, values: Array, same: NDArray[np.bool_], event: float | N
     if not noise_estimate(t, v, ends).std:
         return 0.0
     before = t < ends
-    return robust_std(off_line(t[before], v[before])) / math.sqrt(1.5)
+    return row_noise(t[before], v[before])
 
 
 def _stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:

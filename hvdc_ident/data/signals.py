@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -361,6 +362,11 @@ def off_line(t: Array, v: Array) -> Array:
     width = t[2:] - t[:-2]
     share = (t[1:-1] - t[:-2]) / np.where(width > 0, width, 1.0)
     return np.where(width > 0, v[1:-1] - v[:-2] - share * (v[2:] - v[:-2]), 0.0)
+
+
+def row_noise(t: Array, v: Array) -> float:
+    """Return the standard deviation of a row's white noise, from how far rows lie off the line through their neighbours."""
+    return robust_std(off_line(t, v)) / math.sqrt(1.5)
 
 
 def _simplified(t: Array, v: Array, kept: NDArray[np.bool_], tolerance: float, most: int) -> NDArray[np.bool_]:

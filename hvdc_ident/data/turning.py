@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hvdc_ident.data.signals import distinct, off_line, robust_std
+from hvdc_ident.data.signals import distinct, row_noise
 from hvdc_ident.data.three_phase import unwrapped
 from hvdc_ident.data.units import Array
 
@@ -30,7 +30,7 @@ def scatter(time: Array, values: Array) -> float:
     t, v = distinct(time, values)
     steps = np.abs(np.diff(v))
     digit = float(steps[steps > 0.0].min()) if (steps > 0.0).any() else 0.0
-    return max(robust_std(off_line(t, v)) / math.sqrt(1.5), digit / math.sqrt(12.0))
+    return max(row_noise(t, v), digit / math.sqrt(12.0))
 
 
 def whole_turns(angle: Array) -> int:
@@ -73,8 +73,9 @@ def agreement(time: Array, angle: Array, frequency: Array, nominal: float) -> Ag
         return Agreement(None, 0.0, 0.0)
     own, other = beyond_line(theta), beyond_line(turn)
     moves, rms = float(np.sqrt(np.mean(other**2))), float(np.sqrt(np.mean((own - other) ** 2)))
-    wander = 2.0 * np.pi * scatter(t, frequency[known]) * math.sqrt(float(np.median(np.diff(t))) * float(np.ptp(t)))
-    if moves <= MOVES * max(wander, 1e-12) or float(np.sqrt(np.mean(own**2))) <= MOVES * scatter(t, theta):
+    if moves <= MOVES * max(_wander(t, frequency[known]), 1e-12) or float(np.sqrt(np.mean(own**2))) <= MOVES * scatter(
+        t, theta
+    ):
         return Agreement(None, rms, moves)
     return Agreement(float(own @ other / (other @ other)), rms, moves)
 
@@ -83,5 +84,9 @@ def finer_is_angle(time: Array, angle: Array, frequency: Array) -> bool:
     """Return whether a recorded angle in rad tells the turn better than a recorded frequency in Hz, whose noise adds up over the record."""
     known = np.isfinite(angle) & np.isfinite(frequency)
     t = time[known]
-    wander = 2.0 * np.pi * scatter(t, frequency[known]) * math.sqrt(float(np.median(np.diff(t))) * float(np.ptp(t)))
-    return scatter(t, unwrapped(angle[known])) <= wander
+    return scatter(t, unwrapped(angle[known])) <= _wander(t, frequency[known])
+
+
+def _wander(time: Array, frequency: Array) -> float:
+    """Return by how much, rad, the noise of a frequency in Hz makes its turn wander over the record."""
+    return 2.0 * np.pi * scatter(time, frequency) * math.sqrt(float(np.median(np.diff(time))) * float(np.ptp(time)))

@@ -197,6 +197,17 @@ def toml_string(text: str) -> str:
     return '"' + "".join(_ESCAPES.get(c) or (c if _is_plain(c) else f"\\u{ord(c):04x}") for c in text) + '"'
 
 
+def toml_table(values: Mapping[str, Any]) -> str:
+    """Return an inline table of texts, numbers and such tables."""
+
+    def shown(value: Any) -> str:
+        if isinstance(value, Mapping):
+            return toml_table(value)
+        return toml_string(value) if isinstance(value, str) else repr(value)
+
+    return f"{{{', '.join(f'{toml_key(n)} = {shown(v)}' for n, v in values.items())}}}"
+
+
 def _is_plain(character: str) -> bool:
     if "\ud800" <= character <= "\udfff":
         raise ModelError("a text of the model is no valid unicode", got=f"the surrogate U+{ord(character):04X}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,7 +21,7 @@ from hvdc_ident.data import Array, Contradiction, Experiment, InputSignal, Traje
 from hvdc_ident.data.quantities import read_columns
 from hvdc_ident.data.turning import Agreement, agreement, scatter
 from hvdc_ident.formats import read_waveforms
-from hvdc_ident.model.card import toml_key, toml_string
+from hvdc_ident.model.card import toml_table
 from hvdc_ident.plants import LEVELS
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study import schema
@@ -37,6 +38,7 @@ from hvdc_ident.study.terminal_columns import (
     agreement_words,
     fastest,
     frequency_way,
+    rounded,
     terminals_of,
 )
 from hvdc_ident.text import quantity
@@ -155,9 +157,8 @@ class _Case:
         ]
         if len(moving) == 2:
             inputs = {n: c for n, c in self.table.inputs.items() if n != "f"}
-            write = ", ".join(f"{toml_key(n)} = {toml_string(c)}" for n, c in inputs.items())
             what = "theta and f are both recorded and both played in, so that the voltage turns twice"
-            yield self._finding("turns twice", ("theta", "f"), what, f"inputs = {{{write}}}")
+            yield self._finding("turns twice", ("theta", "f"), what, f"inputs = {toml_table(inputs)}")
 
     def power(self) -> Iterator[Contradiction]:
         """Yield a power beyond what the machine delivers."""
@@ -266,7 +267,7 @@ class _Case:
         if len(powers) == 2:
             one, other = powers
             named = self.table.outputs | {one: self._column(other), other: self._column(one)}
-            write = f"outputs = {{{', '.join(f'{toml_key(o)} = {toml_string(c)}' for o, c in named.items())}}}"
+            write = f"outputs = {toml_table(named)}"
             yield _Mistake(
                 "exchanged",
                 f"{one} and {other} are exchanged",
@@ -281,6 +282,11 @@ class _Case:
             yield _Mistake("clock", words, dict.fromkeys(powers, 1.0), late=late, write=write)
 
     # --- levels and movements ---
+
+    @cached_property
+    def _file(self) -> Trajectory:
+        """The recording as its file has it."""
+        return read_waveforms(self.study.path.parent / self.table.data)
 
     @property
     def _when(self) -> str:
@@ -302,7 +308,7 @@ class _Case:
     def _beside_frequency(self) -> Agreement | None:
         """Return how the angle agrees with the only other column of the file that is a frequency; None where there is none."""
         column = self._column("theta")
-        data: Trajectory = read_waveforms(self.study.path.parent / self.table.data)
+        data = self._file
         if column not in data or self.table.phases or self.table.phasors:
             return None
         readings = dict(zip(data.names, read_columns(data.names, data.units), strict=True))
@@ -328,7 +334,7 @@ class _Case:
         e, outputs = self.experiment, list(LEVELS.values())
         if "V" not in e.inputs or not set(outputs) <= set(e.outputs) or self.table.phases or self.table.phasors:
             return None
-        data: Trajectory = read_waveforms(self.study.path.parent / self.table.data)
+        data = self._file
         column = self._column("V")
         readings = dict(zip(data.names, read_columns(data.names, data.units), strict=True))
         currents = [n for n, r in readings.items() if r.measured == "current"]
@@ -425,19 +431,15 @@ class _Case:
             line = {k: v for k, v in was.items() if k in ("name", "unit", "turn")}
             scale, offset = self._now(name)
             if "base" in was:
-                line |= {"base": float(f"{was['base'] / way.scale:.9g}")}
+                line |= {"base": rounded(was["base"] / way.scale)}
             elif name == "theta" and way.scale == DEGREE and scale == 1.0:
                 line |= {"unit": "deg"}
             else:
-                line |= {"scale": float(f"{way.scale * scale:.9g}")}
+                line |= {"scale": rounded(way.scale * scale)}
             if moved := way.scale * offset + way.offset:
-                line |= {"offset": float(f"{moved:.9g}")}
+                line |= {"offset": rounded(moved)}
             lines[name] = line
-        shown = ", ".join(
-            f"{toml_key(n)} = {{{', '.join(f'{k} = {toml_string(v) if isinstance(v, str) else repr(v)}' for k, v in line.items())}}}"
-            for n, line in lines.items()
-        )
-        return f"columns = {{{shown}}}"
+        return f"columns = {toml_table(lines)}"
 
     def _now(self, signal: str) -> tuple[float, float]:
         """Return scale and offset with which the experiment was read."""
@@ -445,8 +447,7 @@ class _Case:
         offset = line.offset or 0.0
         if line.scale is not None or line.base is not None:
             return (line.scale if line.scale is not None else 1.0 / (line.base or 1.0)), offset
-        data = read_waveforms(self.study.path.parent / self.table.data)
-        model = self.study.model
+        data, model = self._file, self.study.model
         recorded = line.unit or (data.unit(self._column(signal)) if self._column(signal) in data else "")
         wanted = model.inputs[signal].unit if signal in model.inputs else model.outputs[signal].unit
         by = conversion(recorded, wanted) if recorded else None

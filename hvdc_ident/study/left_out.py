@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, BadRows, Contradiction, bad_rows, gaps
 from hvdc_ident.data.signals import HOLD_SHARE
-from hvdc_ident.model.card import toml_key, toml_string
+from hvdc_ident.model.card import toml_key, toml_table
 from hvdc_ident.study import schema
 
 CUT = ("angle step", "gap")
@@ -130,4 +130,4 @@ def _without_column(b: BadRows, table: schema.ExperimentTable) -> str:
     left = {o: c for o, c in table.outputs.items() if o not in b.columns}
     if b.columns[0] not in table.outputs or not left:
         return ""
-    return f"outputs = {{{', '.join(f'{toml_key(o)} = {toml_string(c)}' for o, c in left.items())}}}"
+    return f"outputs = {toml_table(left)}"

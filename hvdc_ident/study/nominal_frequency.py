@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -10,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from hvdc_ident.data import Trajectory
+from hvdc_ident.data.quantities import read_columns
 from hvdc_ident.data.units import conversion
 from hvdc_ident.formats import read_waveforms
 from hvdc_ident.study.phase_columns import proposed_phases
@@ -18,7 +18,6 @@ NOMINAL: Final = (50.0, 60.0)
 """Hz, of public networks."""
 OFF_NOMINAL: Final = 3.0
 """Hz: networks run within 47 to 52 or 57 to 62 Hz, beyond which plants are allowed to trip; the two ranges lie 5 Hz apart."""
-_NAMED = re.compile(r"(?i)(?:^|[^a-z])f(?:req(?:uency)?)?(?:[^a-z]|$)")
 
 
 class RecordedFrequency(NamedTuple):
@@ -44,10 +43,11 @@ def recorded_frequencies(files: Sequence[Path]) -> tuple[RecordedFrequency, ...]
 
 def _levels(record: Trajectory) -> Iterator[tuple[float, str]]:
     """Yield the frequencies of a recording in Hz, with the words for what has them."""
-    for name, unit in zip(record.names, record.units, strict=True):
-        scale = conversion(unit, "Hz") if unit else (1.0, 0.0) if _NAMED.search(name) else None
+    for name, stated, reading in zip(record.names, record.units, read_columns(record.names, record.units), strict=True):
+        unit = stated or reading.unit
+        scale = conversion(unit, "Hz") if unit else (1.0, 0.0)
         values = record[name][np.isfinite(record[name])]
-        if scale is not None and values.size:
+        if reading.measured == "frequency" and scale is not None and values.size:
             yield float(np.median(values)) * scale[0] + scale[1], f"column {name}"
     for line in proposed_phases(record):
         yield line.frequency, f"the three phases {', '.join(line.voltage)}"

@@ -94,7 +94,7 @@ def voltage_ways(unit: str, stated: bool, about: Terminals) -> Iterator[Way]:
         if size is None or about.base_kv is None:
             continue
         for root, words in ((1.0, ""), (math.sqrt(3.0), ", phase to ground")):
-            base = _round(about.base_kv / size[0] / root)
+            base = rounded(about.base_kv / size[0] / root)
             line = ColumnLine(None if stated and unit else volts, base=base)
             yield Way(1.0 / base, 0.0, line, f"by the {about.base_kv:g} kV of the bus{words}")
 
@@ -246,7 +246,7 @@ def settled(record: Trajectory, named: Mapping[str, Match], event: float | None,
             compared = (columns[dropped],)
         if "theta" in matches and (turn := _turn_before(record.time, angle, event)):
             matches["theta"] = replace(matches["theta"], line=replace(matches["theta"].line, turn=turn))
-            values["f"] = float(f"{about.frequency + turn:.9g}")
+            values["f"] = rounded(about.frequency + turn)
             at = f"the frame turns with it, at f = {values['f']:g} Hz"
             notes.append(f"{named['theta'].column.name} turns by {turn:g} Hz before the event: {at}")
     return Settled(matches, lost, values, compared, tuple(notes))
@@ -321,7 +321,7 @@ def _left_open(match: Match, about: Terminals) -> Match:
     if match.target.name == "V" and about.base_kv is None and unit and conversion(unit, "kV") is not None:
         why = "the base of the voltage is not known, which a power flow (a .raw file) states"
     elif match.target.name == "V" and unit and (by := conversion(unit, "kV")) is not None and about.base_kv is not None:
-        base = _round(about.base_kv / by[0])
+        base = rounded(about.base_kv / by[0])
         why = f"that is not where a bus of {about.base_kv:g} kV rests"
     line = _unit_line(unit, stated or not unit)
     return replace(match, reason=f"{match.reason}; {level}, and {why}", base=base, line=line, is_open=True)
@@ -361,5 +361,6 @@ def _unit_line(unit: str, stated: bool) -> ColumnLine:
     return ColumnLine() if stated else ColumnLine(unit)
 
 
-def _round(value: float) -> float:
+def rounded(value: float) -> float:
+    """Return a value with the digits that a study is written with."""
     return float(f"{value:.9g}")
