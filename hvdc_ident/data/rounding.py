@@ -184,8 +184,7 @@ def rounded_noise(records: Sequence[Array], step: float, flicker: float, worth: 
         told = np.exp(-0.5 * ((logs - math.log(flicker)) / (FLICKER / math.sqrt(len(records) or 1))) ** 2)
         prior = prior + told / (told.sum() or 1.0)
     likely = np.log(prior)
-    for r in records:
-        likely += worth * _rounded_likelihood(r / step)
+    likely += worth * _likelihood([r / step for r in records])
     weight = np.exp(likely - likely.max())
     weight /= weight.sum()
     mean = float(weight @ logs)
@@ -194,6 +193,29 @@ def rounded_noise(records: Sequence[Array], step: float, flicker: float, worth: 
     level = float(weight @ total)
     spread = float(weight @ (total - level) ** 2) + (total[1] - total[0]) ** 2 / 12.0
     return RoundedNoise(step * math.exp(mean), error, step * math.exp(level), float(0.5 / spread))
+
+
+def _likelihood(records: Sequence[Array]) -> Array:
+    """Return the log-likelihood of each noise of `_BELOW` of records, in steps less their lines.
+
+    Records of one plant may rest at one level or each at its own; beforehand both are as likely. Where all flicker between the same two
+    levels, one level near the edge says little of the noise, and so many at the edge by chance would say that it is large.
+    """
+    each = np.sum([_rounded_likelihood(r) for r in records], axis=0)
+    known = [x for r in records if (x := _levels(r)) is not None]
+    if len(known) < len(records) or len(known) < 2:
+        return np.asarray(each)
+    one = np.concatenate([x - np.round(x.mean() - known[0].mean()) for x in known])
+    return np.asarray(np.logaddexp(each, _rounded_likelihood(one - np.round(one.mean()))))
+
+
+def _levels(rows: Array) -> Array | None:
+    """Return the levels, in whole steps, of rows in steps less a line; None where the line spans a step and more.
+
+    A line that spans less is what a few flickers make of a still level: how far each row lies from the next level tells it.
+    """
+    line = np.unwrap(2.0 * np.pi * rows) / (2.0 * np.pi)
+    return np.round(rows - line) if np.ptp(line) < 1.0 else None
 
 
 def _rounded_likelihood(rows: Array) -> Array:

@@ -65,11 +65,10 @@ def test_rounding_alone_rewards_no_offset(seed: int) -> None:
     chi2, gain = _both(found.problem)
     rows = sum(b.residual.size for b in found.blocks)
     assert gain < 10.0  # two parameters of chi2: the chance of more is 0.7 %
-    # of noise of an eighth of a step below the quantiser few rows flicker, and it is found too large
-    assert chi2 == pytest.approx(rows, rel=0.25)
+    assert chi2 == pytest.approx(rows, rel=0.2)  # the noise below the quantiser is a guess
 
 
 def test_taken_for_white_noise_it_rewards_them_more() -> None:
     problems = [_start(seed).problem for seed in (0, 1, 2)]
     plain = sum(_both(replace(p, quantised_noise=FrozenMap()))[1] for p in problems)
-    assert plain > 1.8 * sum(_both(p)[1] for p in problems)
+    assert plain > 2.0 * sum(_both(p)[1] for p in problems)
