@@ -36,7 +36,7 @@ HEAD = "share of records within 20 %"
 
 @dataclass(frozen=True)
 class Kind:
-    """What is recorded. decimals: of the file, or float32; noise: in steps; rho: its lag-1 coefficient; rows: before the event."""
+    """A way to record. decimals: of the file, or float32; noise: in steps; rho: its lag-1 coefficient; rows: before the event."""
 
     bits: int
     decimals: int | str
@@ -47,7 +47,7 @@ class Kind:
 
     @property
     def step(self) -> float:
-        """What the recorder and its file round to, together."""
+        """The step that recorder and file round to, together."""
         printed = float(np.spacing(np.float32(LEVEL))) if self.decimals == FLOAT else 10.0 ** -float(self.decimals)
         return float(np.hypot(RANGE / 2**self.bits, printed))
 

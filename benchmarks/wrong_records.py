@@ -553,7 +553,7 @@ def sound() -> list[Record]:
 
 @dataclass(frozen=True)
 class Answer:
-    """What the user reads. good: nothing is refused and `check` says so."""
+    """The sentences that the user reads. good: nothing is refused and `check` says so."""
 
     text: str
     good: bool

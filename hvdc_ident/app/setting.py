@@ -167,7 +167,7 @@ class Setting:
 
     @property
     def response_text(self) -> str:
-        """What the frequency response is of, where, and what 0 dB is of it."""
+        """The signals from and to which the frequency response is, its operating point, and the size of 0 dB."""
         where = f"at the start of {self.record.name}" if self.record else "at the levels of the inputs"
         if self.port is not None:
             return f"Impedance at the source {self.port.source}, {where}."

@@ -164,7 +164,7 @@ def read_columns(names: Sequence[str], units: Sequence[str]) -> tuple[Reading, .
 
 @dataclass(frozen=True)
 class _Tie:
-    """What a word says that means two things: the phase a, or an angle; sequence 1, phase a, or the first of several."""
+    """The meanings of a word that has two: the phase a, or an angle; sequence 1, phase a, or the first of several."""
 
     kind: Literal["", "va", "number"] = ""
     of: str = ""

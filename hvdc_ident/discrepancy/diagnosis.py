@@ -125,9 +125,10 @@ def diagnose(
     elif judgement.verdict == "unnameable" and chosen.fallback and inside:
         other = _outside(search, outcome.rounds[0])
     best = outcome.refit if other is None or other.refit is None else other.refit
-    sure = without_names(search, first, best, judgement)
+    noise = noise_with(best)
+    sure = without_names(search, first, best, noise, judgement)
     if sure is not judgement:
-        judgement, other, best = sure, None, first
+        judgement, other, noise = sure, None, noise_with(first)
     if not inside:
         notes = (*notes, CLOSED)
     if left := 0 if chosen.thorough else _left_out(first, outcome.rounds[0]):
@@ -136,7 +137,7 @@ def diagnose(
         notes = (*notes, f"The budget ended before {left} candidates were looked at: their status is {NOT_BEGUN!r}.")
     if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.rounds for t in r.failed):
         notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
-    return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes), noise_with(best))
+    return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes), noise)
 
 
 def unfinished(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclusion:

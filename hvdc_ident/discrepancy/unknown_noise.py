@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.options import TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.verdict import Conclusion, tests_of
@@ -19,28 +21,32 @@ NO_NAME = "Something is missing, but no effect is named"
 
 
 def noise_with(last: Refit) -> FrozenMap[OutputNoise]:
-    """Return the noise by output, with the source `AT_FLOOR` for a misfit that is none: `last` meets such a record to its last digits."""
+    """Return the noise by output, with the source `AT_FLOOR` for a misfit that is none: `last` meets such a record to its last digits,
+    1e-6 of its range."""
     unknown = of_misfit({o: n.source for o, n in last.noise.items()})
-    exact = {o for o in unknown if _is_met(last, o)}
+    if not unknown:
+        return FrozenMap(last.noise)
+    blocks = last.problem.blocks(last.theta, derivatives=False)
+    misfits = {o: [b.misfit for b in blocks if b.output == o] for o in unknown}
+    exact = {o for o, parts in misfits.items() if parts and _is_met(last, o, np.concatenate(parts))}
     return FrozenMap({o: replace(n, source=AT_FLOOR) if o in exact else n for o, n in last.noise.items()})
 
 
-def _is_met(last: Refit, output: str) -> bool:
-    """Return whether a model meets an output to 1e-6 of its range."""
-    parts = [b.misfit for b in last.problem.blocks(last.theta, derivatives=False) if b.output == output]
-    if not parts:
-        return False
-    rms = float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
-    return rms <= floor_of(last.problem.fitted_experiments, output) * (1.0 + 1e-6)
+def _is_met(last: Refit, output: str, misfit: Array) -> bool:
+    floor = floor_of(last.problem.fitted_experiments, output)
+    return float(np.sqrt(np.mean(misfit**2))) <= floor * (1.0 + 1e-6)
 
 
-def without_names(search: SearchContext, first: Refit, last: Refit, found: Conclusion) -> Conclusion:
+def without_names(
+    search: SearchContext, first: Refit, last: Refit, noise: Mapping[str, OutputNoise], found: Conclusion
+) -> Conclusion:
     """Return the conclusion, without any name that rests on the misfit of `first`, the refitted model, as noise.
 
-    last: the model with what was put into it. A name stands where outputs of unknown noise have next to no part in what is explained,
-    or are met to their last digits. Without it something is missing where an output whose noise is known shows a gap.
+    last: the model with what was put into it; noise: `noise_with` it. A name stands where outputs of unknown noise have next to no
+    part in what is explained, or are met to their last digits. Without it something is missing where an output whose noise is known
+    shows a gap.
     """
-    unknown = of_misfit({o: n.source for o, n in noise_with(last).items()})
+    unknown = of_misfit({o: n.source for o, n in noise.items()})
     if found.verdict not in ("named", "ambiguous", "unnameable") or not unknown:
         return found
     before, after = _chi2(first), _chi2(last)

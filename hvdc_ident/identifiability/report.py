@@ -71,8 +71,8 @@ class Pilot:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What is to be said before any verdict, a sentence each: that the optimum may not be the best, or leaves structure, or
-        that no noise is known."""
+        """Sentences to be said before any verdict: that the optimum may not be the best, or leaves structure, or that no noise
+        is known."""
         own = (self.search_doubt, self.structure_left)
         told = [f"{capital(d)}." for d in own if d]
         told += filter(None, [misfit_sentence(of_misfit(self.noise_source))])

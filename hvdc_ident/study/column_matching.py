@@ -97,7 +97,7 @@ class ColumnLine:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """What is stated, by key."""
+        """The keys that are stated, with their values."""
         return {k: v for k, v in vars(self).items() if v is not None}
 
 

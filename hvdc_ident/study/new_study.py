@@ -93,7 +93,10 @@ class Mapped:
 
 @dataclass(frozen=True)
 class Proposal:
-    """What a recording may be of a model. levels: why the model's are not known, "" where they are. Others as those of `Mapped`."""
+    """A proposal of the signals of a model that a recording has.
+
+    levels: why the model's are not known, "" where they are. Others as those of `Mapped`.
+    """
 
     columns: Matching
     levels: str = ""

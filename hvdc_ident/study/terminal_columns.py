@@ -108,8 +108,8 @@ def frequency_ways(unit: str, stated: bool, about: Terminals) -> Iterator[Way]:
         if by is not None:
             yield Way(by[0], 0.0, _unit_line(unit, stated))
             yield Way(by[0], f0, replace(_unit_line(unit, stated), offset=f0), deviation)
-        elif conversion(unit, "rad/s") is not None:
-            scale = conversion(unit, "rad/s")[0] / (2.0 * math.pi)  # type: ignore[index]
+        elif (angular := conversion(unit, "rad/s")) is not None:
+            scale = angular[0] / (2.0 * math.pi)
             yield Way(scale, 0.0, ColumnLine(scale=scale), "the angular frequency")
         return
     if not unit:
