@@ -107,8 +107,9 @@ def _recorder_step(levels: Array, digit: float) -> float:
     least = float(np.diff(levels).min())
     if least < 2.0 * slack * (1.0 - 1e-6):
         return 0.0
-    first, last = _densest(levels, _FARTHEST * least)
-    at = levels[first:last] - levels[first]
+    at = _densest(levels, _FARTHEST * least)
+    if at.size < 3:
+        return 0.0
     count = int(16.0 * at[-1] / least) + 2
     low, high = max(digit, least - 2.0 * slack), least + 2.0 * slack
     width = (high - low) / count
@@ -134,12 +135,13 @@ def _spread(at: Array, steps: Array) -> Array:
     return np.concatenate([np.ptp(at - np.round(at / s[:, None]) * s[:, None], axis=1) for s in parts])
 
 
-def _densest(levels: Array, span: float) -> tuple[int, int]:
-    """Return the ends of the levels that stand closest together: so many as count, within a span."""
-    count = min(_WINDOW, levels.size)
-    first = int(np.argmin(levels[count - 1 :] - levels[: levels.size - count + 1]))
-    last = int(np.searchsorted(levels[: first + count], levels[first] + span, side="right"))
-    return first, max(last, min(first + 3, levels.size))
+def _densest(levels: Array, span: float) -> Array:
+    """Return the most levels that stand within a span, so many as count, the closest together of several such, less the first."""
+    begins = np.arange(levels.size)
+    ends = np.minimum(np.searchsorted(levels, levels + span, side="right"), begins + _WINDOW)
+    most = np.flatnonzero(ends - begins == (ends - begins).max())
+    first = most[np.argmin(levels[ends[most] - 1] - levels[most])]
+    return np.asarray(levels[first : ends[first]] - levels[first])
 
 
 def flicker_of(records: Sequence[Array], step: float) -> float:

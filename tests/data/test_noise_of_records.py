@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -156,3 +158,22 @@ def test_noise_is_seldom_taken_for_steps_of_the_level() -> None:
 def test_a_value_that_differs_by_the_rounding_of_floats_alone_has_no_step() -> None:
     values = 200.0 + np.spacing(200.0) * (np.arange(60) % 3)
     assert resolution(values) == 0.0
+
+
+def test_levels_far_apart_but_for_two_have_no_step_and_take_no_memory() -> None:
+    """Two levels that are a millionth of the others' distance apart would ask for millions of steps to be tried."""
+    values = np.random.default_rng(5).standard_normal(40)
+    values[7] = values[3] + 1e-6
+    tracemalloc.start()
+    assert resolution(values) == 0.0
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10e6
+
+
+def test_a_step_is_seen_beside_a_level_far_off() -> None:
+    random = np.random.default_rng(6)
+    step = 750.0 / 4096.0
+    values = np.round((200.0 + 2.0 * random.standard_normal(300)) / step) * step
+    values[100:104] = np.round(-6e3 / step) * step
+    assert resolution(np.round(values, 2)) == pytest.approx(np.hypot(step, 0.01), rel=1e-2)
