@@ -34,15 +34,18 @@ def job(before: Refit, effect: str, at: str, size: float, begins: int = 1) -> Re
     return replace(one, begins=one.begins * begins)
 
 
-def test_where_none_is_better_than_nothing_yet_all_come_to_their_ends(
+def test_where_none_is_better_than_nothing_yet_all_come_to_the_ends_that_they_would_have_come_to_alone(
     before: Refit,
 ) -> None:
     jobs = [job(before, "lag", "wm", 0.2), job(before, "lag", "drag", 0.2)]
     alone = [refitted(j) for j in jobs]
     for found, expected in zip(Race(laps=(4,)).run(SEARCH, before, jobs, ["a", "b"]), alone, strict=True):
-        assert found.ended
-        assert found.chi2 == pytest.approx(expected.chi2, rel=1e-4), "a walk ends where a step gains a millionth"
-        assert found.theta == pytest.approx(expected.theta, rel=1e-2)
+        assert found.ended == expected.ended, "one creeps along a valley until its evaluations are spent"
+        assert found.chi2 == pytest.approx(expected.chi2, rel=1e-3)
+        if expected.ended:
+            assert found.chi2 == pytest.approx(expected.chi2, rel=1e-4), "a walk ends where a step gains a millionth"
+            assert found.theta == pytest.approx(expected.theta, rel=1e-2)
+    assert alone[0].ended
 
 
 def test_nothing_goes_on_that_is_out_of_reach_of_what_is_known(before: Refit) -> None:
