@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hvdc_ident.data.bad_rows import BadRows, bad_rows, gaps
+from hvdc_ident.data.bad_rows import BadRows, bad_rows, gaps, without_bad_rows
 from hvdc_ident.data.contradiction import Contradiction
 from hvdc_ident.data.experiment import Experiment, SignalLike, experiment, recording_lines
 from hvdc_ident.data.noise import (
@@ -77,5 +77,6 @@ __all__ = [
     "segments",
     "step",
     "trajectory",
+    "without_bad_rows",
     "without_line",
 ]

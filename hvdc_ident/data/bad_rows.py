@@ -9,15 +9,15 @@ none, as a simulation, a reference or a coarse meter does, is told nothing of by
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data.noise import ENOUGH, FEWEST_QUIET, noise_estimate, row_scatter
 from hvdc_ident.data.signals import HOLD_SHARE, row_noise
-from hvdc_ident.data.trajectory import Array
+from hvdc_ident.data.trajectory import Array, Trajectory
 
 ALARMS = 1e-6
 """Records in which noise alone makes a bad row; the noise's shape is only known about, so that it is far below one in a thousand."""
@@ -43,7 +43,8 @@ _FEWEST_REPEATED = 3  # steps in a row that are equal, from which a stretch is l
 @dataclass(frozen=True)
 class BadRows:
     """A stretch of rows that cannot be right. kind: "mark", "zeros", "stuck", "saturated", "filled", "repeated", "spike", "angle step",
-    "gap" or "constant". columns: those it is about. first, last: indices of rows. what: a sentence without rows and full stop.
+    "gap", "constant" or, of an input, "not recorded". columns: those it is about. first, last: indices of rows. what: a sentence
+    without rows and full stop.
     """
 
     kind: str
@@ -51,6 +52,16 @@ class BadRows:
     first: int
     last: int
     what: str
+
+    @property
+    def cuts(self) -> bool:
+        """True where nothing that follows the rows belongs to what was before."""
+        return self.kind in ("angle step", "gap")
+
+    @property
+    def can_be_left_out(self) -> bool:
+        """True where the rows alone are wrong: the others are right without them."""
+        return not self.cuts and self.kind != "constant"
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +132,18 @@ def bad_rows(
     return tuple(sorted(found, key=lambda b: (b.first, b.last, b.kind)))
 
 
+def without_bad_rows(record: Trajectory, judged: Iterable[str]) -> Trajectory:
+    """Return a record with NaN in place of the rows that cannot be right, as far as the others are right without them.
+
+    judged: names of the columns that were recorded; what is computed has no digits and no noise of its own to be judged by.
+    """
+    values = record.values.copy()
+    for b in bad_rows(record.time, {n: record[n] for n in judged}):
+        for name in b.columns if b.can_be_left_out else ():
+            values[b.first : b.last + 1, record.names.index(name)] = np.nan
+    return replace(record, values=values)
+
+
 def gaps(time: Array) -> tuple[BadRows, ...]:
     """Return the steps of time that are longer than any about them by far: rows are missing, or the clock jumped."""
     steps = np.diff(time)
@@ -169,7 +192,7 @@ def _still(column: _Column, values: Array) -> _Column:
 def _noise(time: Array, values: Array, same: NDArray[np.bool_], event: float | None) -> float:
     """Return the standard deviation of the noise from row to row, of rows that do not stand still; 0 where none is seen."""
     standing = np.zeros(values.size, dtype=bool)
-    for first, last in _stretches(same):
+    for first, last in stretches(same):
         if last - first >= _FEWEST_REPEATED:
             standing[first : last + 2] = True
     rows = np.flatnonzero(np.isfinite(values) & ~standing)[:_NOISE_ROWS]
@@ -187,7 +210,7 @@ def _noise(time: Array, values: Array, same: NDArray[np.bool_], event: float | N
     return row_noise(t[before], v[before])
 
 
-def _stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+def stretches(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return the first and the last index of each run in which a mask holds."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
@@ -206,7 +229,7 @@ def _marks(values: Mapping[str, Array]) -> Iterator[BadRows]:
         others = finite[~np.isin(finite, marks)]
         for m in marks:
             if others.size and float(np.abs(others - m).min()) > float(np.ptp(others)):
-                for first, last in _stretches(np.equal(v, m)):
+                for first, last in stretches(np.equal(v, m)):
                     yield BadRows("mark", (name,), first, last, f"{name} is {m:.10g}, a mark of what was not recorded")
 
 
@@ -234,7 +257,7 @@ def _zeros(columns: Sequence[_Column], rows: int) -> Iterator[BadRows]:
     some = np.zeros(rows, dtype=bool)
     for z in zero:
         some |= z
-    for first, last in _stretches(some):
+    for first, last in stretches(some):
         evidence = {
             c.name: -math.log(c.chance) * float(z[first : last + 1].sum()) for c, z in zip(columns, zero, strict=True)
         }
@@ -252,7 +275,7 @@ def _stuck(columns: Sequence[_Column], rows: int) -> Iterator[BadRows]:
     for group in (*groups, *([c] for c in columns)):
         weight = sum(-math.log(c.chance) for c in group)
         same = np.logical_and.reduce([c.same for c in group]) & ~taken
-        for first, last in _stretches(same):
+        for first, last in stretches(same):
             if not _enough(weight * (last - first + 1), rows):
                 continue
             names = tuple(c.name for c in group)
@@ -303,7 +326,7 @@ def _repeated(columns: Sequence[_Column], rows: int) -> Iterator[BadRows]:
     weight = sum(-math.log(c.chance) for c in columns)
     names = tuple(c.name for c in columns)
     for distance in np.unique(back[back > 1]).tolist():
-        for first, last in _stretches(back == distance):
+        for first, last in stretches(back == distance):
             if _enough(weight * (last - first + 1), rows * rows):
                 what = f"these rows are rows {first - distance + 1} to {last - distance + 1} again, to the last digit"
                 yield BadRows("repeated", names, first, last, what)
@@ -315,7 +338,7 @@ def _filled(columns: Sequence[_Column], rows: int) -> Iterator[BadRows]:
         off = np.abs(np.diff(c.values, 2))
         chance = min(1.0, 3.0 * c.chance)  # of the three steps about the line
         straight = np.concatenate([[False], off <= 1.01 * c.step, [False]])
-        for first, last in _stretches(straight) if chance < 1.0 else ():
+        for first, last in stretches(straight) if chance < 1.0 else ():
             if _enough(-math.log(chance) * (last - first + 1), rows):
                 yield BadRows(
                     "filled",

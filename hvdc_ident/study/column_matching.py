@@ -57,7 +57,7 @@ class Target:
 class Column:
     """A column of a recording: its unit, its level before the event and the noise about it, in that unit.
 
-    gaps: rows in which it is not recorded. quiet: whether the level is a mean of rows before an event, not the first row. counted: in
+    quiet: whether the level is a mean of rows before an event, not the first row. counted: in
     which of several ways it is counted, as a peak or rms, in words; "" where there is only one. reading: as its name and unit say it.
     """
 
@@ -65,7 +65,6 @@ class Column:
     unit: str
     level: float | None
     noise: float
-    gaps: int
     quiet: bool = True
     counted: str = ""
     reading: Reading = field(default_factory=Reading)
@@ -147,7 +146,7 @@ def columns_of(record: Trajectory, event: float | None, counted: Mapping[str, st
         values = record[name]
         if not np.isnan(values).all():
             level, noise, quiet = _rest(record.time, values, event)
-            found.append(Column(name, unit, level, noise, record.gaps(name), quiet, counted.get(name, ""), reading))
+            found.append(Column(name, unit, level, noise, quiet, counted.get(name, ""), reading))
     return tuple(found)
 
 
@@ -161,7 +160,7 @@ def match_names(columns: Sequence[Column], targets: Sequence[Target], place: str
     """Return by signal the column of its name, exactly, else but for case and punctuation where only one has it, else the only one whose
     name says the same quantity. place: where the signals are, which tells columns of several places apart.
 
-    Where the units need a base, or an input has gaps, there is a match too: `usable` tells.
+    Where the units need a base there is a match too: `usable` tells.
     """
     found: dict[str, Match] = {}
     by_name = {c.name: c for c in columns}
@@ -221,8 +220,8 @@ def matching(
 
 
 def usable(match: Match) -> bool:
-    """Return whether a column can be used as it is: its unit converts to the signal's, and an input has no gaps."""
-    return match.by is not None and not match.is_open and not (match.target.kind == "input" and match.column.gaps)
+    """Return whether a column can be used as it is: its unit converts to the signal's."""
+    return match.by is not None and not match.is_open
 
 
 def is_ambiguous(match: Match) -> bool:
@@ -250,7 +249,7 @@ def _rest(time: Array, values: Array, event: float | None) -> tuple[float | None
 def _candidate(target: Target, column: Column) -> Match | None:
     """A column that may be a signal: of a unit that converts to the signal's, or of no stated unit and at the signal's level."""
     by = column.converted(target.unit)
-    if by is None or (target.kind == "input" and column.gaps) or target.name in LEVELS:
+    if by is None or target.name in LEVELS:
         return None
     if not compatible(target.reading.quantity, column.reading.quantity):
         return None
@@ -328,9 +327,6 @@ def _with_base(match: Match, parameters: Mapping[str, Parameter]) -> Match:
     column, target = match.column, match.target
     if match.is_open:
         return match
-    if column.converted(target.unit) is not None:
-        rows = f"{column.gaps} row{'s' if column.gaps > 1 else ''}"
-        return replace(match, reason=f"{match.reason}, but not recorded in {rows}, and an input is needed all along")
     reason = f"{match.reason}, but in {column.unit}, which converts to {target.unit} only with a rated base"
     if column.level is None or not target.level or column.level * target.level <= 0.0:
         return replace(match, reason=reason)

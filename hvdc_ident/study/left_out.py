@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, BadRows, Contradiction, bad_rows, gaps
+from hvdc_ident.data.bad_rows import stretches
 from hvdc_ident.data.signals import HOLD_SHARE
 from hvdc_ident.model.card import toml_key, toml_table
 from hvdc_ident.study import schema
-
-CUT = ("angle step", "gap")
-"""Kinds after which nothing that follows belongs to what was before: no row can be left out for them."""
 
 
 class RowsLeftOut:
@@ -23,9 +21,17 @@ class RowsLeftOut:
     """
 
     def __init__(
-        self, table: schema.ExperimentTable, time: Array, columns: Mapping[str, Array], angles: Mapping[str, float]
+        self,
+        table: schema.ExperimentTable,
+        time: Array,
+        columns: Mapping[str, Array],
+        angles: Mapping[str, float],
+        own: Mapping[str, NDArray[np.bool_]],
+        unrecorded: Mapping[str, NDArray[np.bool_]],
     ) -> None:
-        """Find the rows. columns: (n,) by signal, as recorded. angles: a whole turn in the units of those that are angles."""
+        """Find the rows. columns: (n,) by signal, as recorded. angles: a whole turn in the units of those that are angles. own: (n,) by
+        input, the rows of its record; unrecorded: (n,) those among them in which it has no number, where there are some.
+        """
         stated = table.leave_out
         self.rows = {s: _inside(time, (stated or {}).get(s, ())) for s in columns}
         compared = _inside(time, [table.window] if table.window is not None else [[-np.inf, np.inf]])
@@ -35,6 +41,12 @@ class RowsLeftOut:
             for s, v in columns.items()
         }
         bad = list(bad_rows(time, asked, table.event, angles))
+        for signal, rows in unrecorded.items():
+            bad += [
+                BadRows("not recorded", (signal,), first, last, f"{signal} is not recorded")
+                for first, last in stretches(rows & ~self.rows[signal] & needed)
+            ]
+            self.rows[signal] = self.rows[signal] | rows  # stated or not: there is no number to use
         inputs = [asked[s] for s in (*table.inputs, *table.drive)]
         if any(
             np.mean(v[1:] == v[:-1]) < HOLD_SHARE for v in inputs if v.size > 1
@@ -43,15 +55,14 @@ class RowsLeftOut:
         found = (_contradiction(b, bad, table, time, applied=stated is None) for b in bad)
         self.contradictions = (*found, *_stated(table, time, columns))
         if stated is None:
-            for b in (b for b in bad if b.kind not in (*CUT, "constant")):
+            for b in (b for b in bad if b.can_be_left_out):
                 for s in b.columns:
                     self.rows[s][b.first : b.last + 1] = True
         # Where an input is not known, what the model answers to it is not either.
-        unknown = np.logical_or.reduce(
-            [self.rows[s] for s in (*table.inputs, *table.drive)] or [np.zeros(time.size, dtype=bool)]
-        )
-        for o in table.outputs:
-            self.rows[o] = self.rows[o] | unknown
+        for s, rows in own.items():
+            unknown = _between_kept(self.rows[s], rows & ~self.rows[s])
+            for o in table.outputs:
+                self.rows[o] = self.rows[o] | unknown
 
     def without(self, signal: str, time: Array, values: Array, *, bridged: bool) -> Array:
         """Return the values without the rows that are left out: NaN, or bridged by the line between the rows beside them."""
@@ -71,6 +82,16 @@ def _inside(time: Array, spans: Iterable[Sequence[float]]) -> NDArray[np.bool_]:
     return found
 
 
+def _between_kept(out: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return (n,) the rows between two that are kept, or beyond the last, among which some are left out: rows of other records too."""
+    stands = np.concatenate([[-1], np.flatnonzero(kept), [kept.size]])
+    lost = np.unique(np.searchsorted(stands, np.flatnonzero(out)))  # a line from one row that stands to the next
+    found = np.zeros(kept.size, dtype=bool)
+    for k in lost.tolist():
+        found[stands[k - 1] + 1 : stands[k]] = True
+    return found
+
+
 def _contradiction(
     b: BadRows, bad: Sequence[BadRows], table: schema.ExperimentTable, time: Array, *, applied: bool
 ) -> Contradiction:
@@ -79,9 +100,9 @@ def _contradiction(
     if b.kind == "constant":
         return Contradiction(b.kind, table.name, b.what, b.columns, write=_without_column(b, table))
     what = f"{_where(b.first, b.last, time)}: {b.what}"
-    if b.kind not in CUT and applied:
+    if b.kind == "not recorded" or (b.can_be_left_out and applied):
         what += "; left out here, though the study does not say so"
-    write = _window(b, table, time) if b.kind in CUT else _spans(bad, table, time)
+    write = _window(b, table, time) if b.cuts else _spans(bad, table, time)
     return Contradiction(b.kind, table.name, what, b.columns, (b.first + 1, b.last + 1), (first, last), write)
 
 
@@ -112,7 +133,7 @@ def _spans(bad: Sequence[BadRows], table: schema.ExperimentTable, time: Array) -
         s: [(v[0], v[1]) for v in spans] for s, spans in (table.leave_out or {}).items()
     }
     for b in bad:
-        if b.kind not in (*CUT, "constant"):
+        if b.can_be_left_out:
             for s in b.columns:
                 spans.setdefault(s, []).append((float(time[b.first]), float(time[b.last])))
     lines = (f"{toml_key(s)} = [{', '.join(f'[{a:.12g}, {b:.12g}]' for a, b in found)}]" for s, found in spans.items())

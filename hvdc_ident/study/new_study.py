@@ -12,7 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory, event_time, input_signal, scaled
+from hvdc_ident.data import (
+    Array,
+    Experiment,
+    InputSignal,
+    Trajectory,
+    event_time,
+    input_signal,
+    scaled,
+    without_bad_rows,
+)
 from hvdc_ident.data.three_phase import PHASE_QUANTITIES
 from hvdc_ident.display import Shown
 from hvdc_ident.errors import ComputationError, InputError, in_python, located
@@ -212,6 +221,7 @@ def proposal(record: Trajectory, model: AnyModel, name: str, about: Terminals | 
     """
     phases = proposed_phases(record)
     made = without_phases(with_derived(phases, (), record, name), phases)
+    made = without_bad_rows(made, [n for n in made.names if n in record])
     found = _matched(made, model, phases, about or terminals_of(model))
     phases = of_use(phases, [m.column.name for m in (*found.columns.mapped, *found.columns.proposed)])
     unused = tuple(c for c in found.columns.unused if c in record)
@@ -225,7 +235,7 @@ def _matched(
     ways = ways_to_count(phases)
     targets = targets_of(model, {})
     named = match_names(columns_of(record, None, ways), targets, about.bus if about else "")
-    moved = [m for m in named.values() if m.target.kind == "input" and not m.column.gaps]  # in whatever unit
+    moved = [m for m in named.values() if m.target.kind == "input"]  # in whatever unit
     event = _event(record, moved, smoothed(phases), played=about is not None)
     columns = columns_of(record, event, ways)
     if about is not None:

@@ -219,12 +219,14 @@ def _experiment(
     mapped |= {s: _in_frame(table, s, time, mapped[s], place) for s in columns if same_unit(_unit(model, s), "rad")}
     # What is computed from phases has no digits of its own, and repeats itself where they are periodic: it is not judged.
     raw = {s: data[c] if c in recorded else np.full(time.size, np.nan) for s, c in columns.items()}
-    out = RowsLeftOut(table, time, raw, _turns(model, mappings))
+    played = (*table.inputs, *table.drive)
+    own = {s: data.own_rows(columns[s]) for s in played}
+    unrecorded = {s: rows for s in played if 0 < (rows := own[s] & np.isnan(mapped[s])).sum() < own[s].sum()}
+    out = RowsLeftOut(table, time, raw, _turns(model, mappings), own, unrecorded)
     mapped = {s: out.without(s, time, v, bridged=s not in table.outputs) for s, v in mapped.items()}
     inputs = {}
-    for s in (*table.inputs, *table.drive):
-        rows = data.own_rows(columns[s])
-        inputs[s] = _input(table, s, columns[s], time[rows], mapped[s][rows], place)
+    for s in played:
+        inputs[s] = _input(table, s, columns[s], time[own[s]], mapped[s][own[s]], place)
     outputs = tuple(table.outputs)
     if empty := [o for o in outputs if np.isnan(mapped[o]).all()]:
         raise StudyError(
@@ -425,13 +427,12 @@ def _input(
 ) -> InputSignal:
     kind = table.interpolation
     interpolation = kind.get(signal) if isinstance(kind, dict) else kind
-    missing = np.flatnonzero(np.isnan(values))
-    if missing.size:
+    if np.isnan(values).all():
         raise StudyError(
-            f"column '{column}' is not recorded in {missing.size} of {values.size} rows, the first at {time[missing[0]]:g} s",
+            f"column '{column}' of input '{signal}' is not recorded in any row",
             where=f"{place}, {table.data}",
-            expected=f"a number in every row: the model needs its '{signal}' all along",
-            hint="fill the gaps, or cut the record; only outputs may have them",
+            expected="numbers",
+            hint="take it out of inputs",
         )
     with located(f"{place}, signal '{signal}'"):
         return input_signal(time, values, interpolation)

@@ -172,15 +172,15 @@ A, B1, B2 = (Target(n, "output", u, v) for n, u, v in (("a", "A", 2.0), ("b1", "
 @pytest.mark.parametrize(
     ("columns", "mapped", "proposed"),
     [
-        ([Column("x", "kA", 0.0021, 0.0, 0)], {"a": "x"}, []),  # the only one of its unit, at its level
-        ([Column("x", "kA", 0.0042, 0.0, 0)], {}, [("a", "x")]),  # at another level
-        ([Column("x", "A", 2.0, 0.0, 0), Column("y", "A", 2.1, 0.0, 0)], {}, [("a", "x"), ("a", "y")]),
-        ([Column("x", "V", 5.0, 0.0, 0)], {}, [("b1", "x"), ("b2", "x")]),
-        ([Column("x", "", 2.0, 0.0, 0)], {}, [("a", "x")]),  # no unit: the level is all there is
-        ([Column("x", "", 900.0, 0.0, 0)], {}, []),
-        ([Column("A.", "kA", 900.0, 0.0, 0)], {"a": "A."}, []),  # a name counts whatever the level
-        ([Column("a", "V", 2.0, 0.0, 0)], {}, [("a", "a")]),
-        ([Column("A", "A", 2.0, 0.0, 0), Column("a_", "A", 2.0, 0.0, 0)], {}, [("a", "A"), ("a", "a_")]),
+        ([Column("x", "kA", 0.0021, 0.0)], {"a": "x"}, []),  # the only one of its unit, at its level
+        ([Column("x", "kA", 0.0042, 0.0)], {}, [("a", "x")]),  # at another level
+        ([Column("x", "A", 2.0, 0.0), Column("y", "A", 2.1, 0.0)], {}, [("a", "x"), ("a", "y")]),
+        ([Column("x", "V", 5.0, 0.0)], {}, [("b1", "x"), ("b2", "x")]),
+        ([Column("x", "", 2.0, 0.0)], {}, [("a", "x")]),  # no unit: the level is all there is
+        ([Column("x", "", 900.0, 0.0)], {}, []),
+        ([Column("A.", "kA", 900.0, 0.0)], {"a": "A."}, []),  # a name counts whatever the level
+        ([Column("a", "V", 2.0, 0.0)], {}, [("a", "a")]),
+        ([Column("A", "A", 2.0, 0.0), Column("a_", "A", 2.0, 0.0)], {}, [("a", "A"), ("a", "a_")]),
     ],
 )
 def test_what_maps_and_what_is_proposed(columns: list[Column], mapped: Any, proposed: Any) -> None:
@@ -189,16 +189,24 @@ def test_what_maps_and_what_is_proposed(columns: list[Column], mapped: Any, prop
     assert [(m.target.name, m.column.name) for m in found.proposed] == proposed
 
 
-def test_an_input_with_gaps_is_not_mapped(motor: Path, tmp_path: Path) -> None:
+def test_an_input_with_gaps_is_mapped_and_its_gaps_are_left_out(motor: Path, tmp_path: Path) -> None:
     r = recorded()
     v = r["v"].astype(object)
     v[7] = ""
     rows = "\n".join(f"{t},{a},{b}" for t, a, b in zip(r["time"], v, r["w"], strict=True))
     (tmp_path / "a.csv").write_text(f"time [s],v,w\n{rows}\n")
     found = hi.new_study(tmp_path / "st", tmp_path / "a.csv", motor)
-    (p,) = found.recordings[0].columns.proposed
-    assert p.target.name == "v" and "not recorded in 1 row," in p.reason
-    assert hi.load_study(found.path).experiments[0].outputs == ("w",)
+    assert not found.recordings[0].columns.proposed
+    (experiment,) = hi.load_study(found.path).experiments
+    line = np.interp(r["time"][7], r["time"][[6, 8]], r["v"][[6, 8]])
+    assert experiment.inputs["v"](r["time"][7]) == pytest.approx(line) and np.isnan(experiment.measured["w"][7])
+    (said,) = experiment.measured.origin.contradictions
+    assert said.rows == (8, 8) and "v is not recorded" in said.what
+    at = f"{r['time'][7]:.12g}"
+    assert said.write == f"leave_out = {{v = [[{at}, {at}]]}}"
+    found.path.write_text(found.path.read_text().replace("[[experiment]]", f"[[experiment]]\n{said.write}"))
+    (mended,) = hi.load_study(found.path).experiments
+    assert all(c.done for c in mended.measured.origin.contradictions)
 
 
 @pytest.mark.parametrize(
