@@ -85,7 +85,7 @@ class Mapped:
 
     levels: why the model's levels are not known; empty where they are. experiment: None where no output is mapped. phases: what
     columns made of three phases are made of. values: inputs constant at other than the model's value. notes: what was decided between
-    columns.
+    columns. measured: inputs that move from row to row, as nobody sets them.
     """
 
     name: str
@@ -98,6 +98,7 @@ class Mapped:
     phases: tuple[schema.PhasesTable, ...] = ()
     values: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    measured: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -288,8 +289,13 @@ def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Termina
         values=dict(found.values),
         phases=list(found.phases),
     )
-    (experiment,), notes = read_experiments([table], model, Recordings(file.parent), str(file))
-    return Mapped(name, file, data, found.columns, found.levels, experiment, notes[name], *rest)
+    recordings = Recordings(file.parent)
+    (experiment,), notes = read_experiments([table], model, recordings, str(file))
+    measured = _measured_inputs(experiment, model, played=about is not None)
+    if measured:
+        table = table.model_copy(update={"interpolation": dict.fromkeys(measured, "linear")})
+        (experiment,), notes = read_experiments([table], model, recordings, str(file))
+    return Mapped(name, file, data, found.columns, found.levels, experiment, notes[name], *rest, measured)
 
 
 def _values(record: Trajectory, match: Match) -> tuple[Array, Array]:
@@ -431,7 +437,7 @@ def _study_text(
         names = ", ".join(map(toml_string, settable))
         yield from ("", "# [inputs]", f"# settable = [{names}]   # those that a person can move for a recording")
     for r in recordings:
-        yield from ("", *_experiment_text(r, _measured_inputs(r, model, played=dyr is not None)))
+        yield from ("", *_experiment_text(r))
     yield ""
     yield "# The stages. A stage runs if its table is in this file; `simulate` always runs."
     mark = "" if asked and any(r.experiment is not None for r in recordings) else "# "
@@ -441,16 +447,13 @@ def _study_text(
         yield f"{mark}places = [{', '.join(map(toml_string, dyr.places))}]   # the controls, and what they act on"
 
 
-def _measured_inputs(r: Mapped, model: AnyModel, *, played: bool) -> list[str]:
+def _measured_inputs(experiment: Experiment, model: AnyModel, *, played: bool) -> tuple[str, ...]:
     """Return the inputs that are recorded as they were measured: nobody sets them, and they move from row to row.
 
     played: whether they are a unit's terminals, which no record holds from row to row, however still it is most of the time.
     """
-    if r.experiment is None:
-        return []
-    mapped = {m.target.name: m for m in r.columns.mapped if m.target.kind == "input"}
-    moving = {n: r.experiment.inputs[n] for n in mapped if not model.inputs[n].settable}
-    return [n for n, s in moving.items() if played or not (s.is_constant or _is_staircase(s))]
+    moving = {n: s for n, s in experiment.inputs.items() if not model.inputs[n].settable}
+    return tuple(n for n, s in moving.items() if played or not (s.is_constant or _is_staircase(s)))
 
 
 def _is_staircase(signal: InputSignal) -> bool:
@@ -459,20 +462,17 @@ def _is_staircase(signal: InputSignal) -> bool:
     return bool((np.diff(signal.times)[changes] == 0.0).all())
 
 
-def _experiment_text(r: Mapped, measured: Sequence[str]) -> Iterator[str]:
-    """The lines of one experiment; all of them comments where no output is mapped, as none may be without.
-
-    measured: its inputs that are, which have no jumps.
-    """
+def _experiment_text(r: Mapped) -> Iterator[str]:
+    """The lines of one experiment; all of them comments where no output is mapped, as none may be without."""
     mark = "" if r.experiment is not None else "# "
     yield f"# {_comment(_found(r))}"
     yield f"{mark}[[experiment]]"
     yield f"{mark}name = {toml_string(r.name)}"
     yield f"{mark}data = {toml_string(r.data)}"
     inputs = [m.target.name for m in r.columns.mapped if m.target.kind == "input"]
-    if measured:
-        by_input = ", ".join(f'{toml_key(n)} = "linear"' for n in measured)
-        how = '"linear"' if set(measured) == set(inputs) else f"{{{by_input}}}"
+    if r.measured:
+        by_input = ", ".join(f'{toml_key(n)} = "linear"' for n in r.measured)
+        how = '"linear"' if set(r.measured) == set(inputs) else f"{{{by_input}}}"
         yield f"{mark}interpolation = {how}   # what is measured moves from row to row, and does not jump at the later one"
     yield '# role = "holdout"   # not fitted: validates the estimates'
     if r.experiment is not None and r.experiment.event is not None:
