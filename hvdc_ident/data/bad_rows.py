@@ -120,7 +120,7 @@ def bad_rows(
     take(_marks(values))
     known = [_Column.of(n, time, v, event) for n, v in values.items() if np.isfinite(v).any()]
     found += _constant(known, time.size)
-    if not _has_clock(time):  # a simulation of variable steps may repeat a row as often as it likes
+    if not has_clock(time):  # a simulation of variable steps may repeat a row as often as it likes
         return tuple(found)
     noisy = [c for c in known if c.shows_noise]
     for kind in (_zeros, _stuck, _repeated, _filled):
@@ -156,7 +156,7 @@ def gaps(time: Array) -> tuple[BadRows, ...]:
     return tuple(found)
 
 
-def _has_clock(time: Array) -> bool:
+def has_clock(time: Array) -> bool:
     """Return whether rows come at the even steps of a recorder, of which it may miss some: nine of ten are the median's to a tenth."""
     steps = np.diff(time)
     return bool(np.mean(np.abs(steps - np.median(steps)) <= 0.1 * np.median(steps)) > 0.9)

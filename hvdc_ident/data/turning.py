@@ -39,14 +39,21 @@ def whole_turns(angle: Array) -> int:
     return int(np.count_nonzero(np.abs(np.diff(known)) > np.pi))
 
 
+def unwrapped_words(jumps: int) -> str:
+    """Return in words that an angle with so many jumps by a whole turn was unwrapped."""
+    return f"unwrapped: {jumps} {'jump' if jumps == 1 else 'jumps'} by a whole turn {'is' if jumps == 1 else 'are'} taken out"
+
+
 @dataclass(frozen=True)
 class Agreement:
-    """A recorded angle against the turn of a recorded frequency. factor: by which the angle turns more; None where neither turns enough
-    to tell. rms: of what is left between them once offset, slope and nothing else are fitted, rad; moves: rms of the turn, rad."""
+    """A recorded angle against the turn of a recorded frequency, both less a line. factor: by which the angle turns more; None where not
+    both turn enough to tell. rms: of what is left between them, rad; moves: rms of the turn, rad. unseen: rms, rad, of a turn that the
+    noise of the two would hide."""
 
     factor: float | None
     rms: float
     moves: float
+    unseen: float = math.inf
 
     @property
     def turns_alike(self) -> bool:
@@ -55,8 +62,10 @@ class Agreement:
 
     @property
     def holds(self) -> bool:
-        """True where nothing contradicts: both turn alike, or neither turns enough to tell."""
-        return self.factor is None or (self.turns_alike and self.rms <= AGREES * self.moves)
+        """True where nothing contradicts: both turn alike, or neither turns so that the other would have to show it."""
+        if self.factor is None:
+            return self.rms <= 2.0 * self.unseen
+        return self.turns_alike and self.rms <= AGREES * self.moves
 
 
 def agreement(time: Array, angle: Array, frequency: Array, nominal: float) -> Agreement:
@@ -73,11 +82,11 @@ def agreement(time: Array, angle: Array, frequency: Array, nominal: float) -> Ag
         return Agreement(None, 0.0, 0.0)
     own, other = beyond_line(theta), beyond_line(turn)
     moves, rms = float(np.sqrt(np.mean(other**2))), float(np.sqrt(np.mean((own - other) ** 2)))
-    if moves <= MOVES * max(_wander(t, frequency[known]), 1e-12) or float(np.sqrt(np.mean(own**2))) <= MOVES * scatter(
-        t, theta
-    ):
-        return Agreement(None, rms, moves)
-    return Agreement(float(own @ other / (other @ other)), rms, moves)
+    wander, noise = MOVES * max(_wander(t, frequency[known]), 1e-12), MOVES * scatter(t, theta)
+    if moves <= wander or float(np.sqrt(np.mean(own**2))) <= noise:
+        still = np.ptp(frequency[known]) == 0.0  # a frequency that never changes has unknown digits
+        return Agreement(None, rms, moves, math.inf if still else max(wander, noise))
+    return Agreement(float(own @ other / (other @ other)), rms, moves, max(wander, noise))
 
 
 def finer_is_angle(time: Array, angle: Array, frequency: Array) -> bool:

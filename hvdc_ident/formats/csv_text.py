@@ -21,7 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hvdc_ident.data import Array, Origin, Trajectory, scaled, seconds_of
+from hvdc_ident.data import Array, Origin, Trajectory, gaps, scaled, seconds_of
+from hvdc_ident.data.bad_rows import FEWEST, has_clock
 from hvdc_ident.errors import WaveformError
 from hvdc_ident.formats import LONGEST, TOP, event_rows, pick, unit_since_1970
 from hvdc_ident.formats._clock import Clock, is_clock, is_date
@@ -125,11 +126,17 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         table = _careful(layout, columns, clock)
     if len(table) < 2:
         raise WaveformError("too few rows", where=str(path), expected="at least 2 rows of numbers", got=f"{len(table)}")
+    table, ordered = _in_order(table)
     _check_times(layout, table[:, 0])
     names = tuple(signals) if signals is not None else tuple(layout.names[i] for i in known)
     dated = layout.absolute or layout.since is not None
     unit = "date" if dated else layout.units[layout.time]
-    notes = (*layout.notes, *clock.notes, *([_MAYBE_SERIAL] if not unit and _may_be_serial(table[:, 0]) else []))
+    notes = (
+        *layout.notes,
+        *clock.notes,
+        *ordered,
+        *([_MAYBE_SERIAL] if not unit and _may_be_serial(table[:, 0]) else []),
+    )
     origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "", notes=notes)
     time = table[:, 0] - table[0, 0] if dated else table[:, 0]
     time = scaled(time, layout.scale)
@@ -534,6 +541,33 @@ def _number(cell: str, layout: _Layout, line: int, column: int) -> float:
         if "," in cell and "." in cell
         else "take out the row, or the column if it is not needed",
     )
+
+
+def _in_order(table: Array) -> tuple[Array, tuple[str, ...]]:
+    """Return rows in the order of their instants, those that stand twice to the last digit once, and what was done in words.
+
+    table: (n, k), instants first. They are left as they are where that does not make one record of even steps of them, as where a
+    clock was set back: too few rows to tell, two different rows of one instant that stand apart, rows that come between others or
+    leave a gap.
+    """
+    time = table[:, 0]
+    if not (np.diff(time) < 0).any():
+        return table, ()
+    order = np.argsort(time, kind="stable")
+    ranked = table[order]
+    again = (np.append(False, np.diff(order) != 1)) & (np.append(False, np.diff(ranked[:, 0]) == 0))
+    twice = again & np.append(
+        False, ((ranked[1:] == ranked[:-1]) | (np.isnan(ranked[1:]) & np.isnan(ranked[:-1]))).all(axis=1)
+    )
+    kept = ranked[~twice]
+    if (again & ~twice).any() or len(kept) < FEWEST or not has_clock(kept[:, 0]) or gaps(kept[:, 0]):
+        return table, ()
+    done = ["the rows do not stand in the order of their instants: they are sorted"]
+    if number := int(twice.sum()):
+        done.append(
+            f"{number} row{'s' if number > 1 else ''} that stand{'' if number > 1 else 's'} twice, to the last digit, taken once"
+        )
+    return kept, ("; ".join(done),)
 
 
 def _check_times(layout: _Layout, time: Array) -> None:

@@ -203,13 +203,14 @@ class _Case:
             return
         signal = self.experiment.inputs["theta"]
         found = self._beside_frequency()
-        if found is not None and not found.holds and found.factor is not None:
+        if found is not None and not found.holds:
             factors = [
                 (-1.0, "its sign is the other one"),
                 (DEGREE, "it is in degrees"),
                 (-DEGREE, "it is in degrees, with the other sign"),
             ]
-            fits = [(k, words) for k, words in factors if replace(found, factor=k * found.factor).turns_alike]
+            times = found.factor or 0.0
+            fits = [(k, words) for k, words in factors if replace(found, factor=k * times).turns_alike]
             words = f": {fits[0][1]}" if fits else ""
             write = self._columns({"theta": Way(fits[0][0])}) if fits else ""
             yield self._finding(

@@ -52,7 +52,7 @@ class RowsLeftOut:
             np.mean(v[1:] == v[:-1]) < HOLD_SHARE for v in inputs if v.size > 1
         ):  # one that is held is known in a gap too
             bad += [b for b in gaps(time) if needed[b.last]]
-        found = (_contradiction(b, bad, table, time, applied=stated is None) for b in bad)
+        found = (_contradiction(b, bad, table, time, asked, applied=stated is None) for b in bad)
         self.contradictions = (*found, *_stated(table, time, columns))
         if stated is None:
             for b in (b for b in bad if b.can_be_left_out):
@@ -93,16 +93,27 @@ def _between_kept(out: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np
 
 
 def _contradiction(
-    b: BadRows, bad: Sequence[BadRows], table: schema.ExperimentTable, time: Array, *, applied: bool
+    b: BadRows,
+    bad: Sequence[BadRows],
+    table: schema.ExperimentTable,
+    time: Array,
+    columns: Mapping[str, Array],
+    *,
+    applied: bool,
 ) -> Contradiction:
-    """Return what is said of a stretch. applied: whether its rows are left out already, without the study saying so."""
+    """Return what is said of a stretch. columns: (n,) by signal; applied: whether its rows are left out already, without the study
+    saying so.
+    """
     first, last = float(time[b.first]), float(time[b.last])
     if b.kind == "constant":
         return Contradiction(b.kind, table.name, b.what, b.columns, write=_without_column(b, table))
     what = f"{_where(b.first, b.last, time)}: {b.what}"
+    if b.kind == "spike" and applied:  # one to three rows less: nothing that the reader has to decide
+        rows = (b.first + 1, b.last + 1)
+        return Contradiction(b.kind, table.name, what, b.columns, rows, (first, last), done="left out")
     if b.kind == "not recorded" or (b.can_be_left_out and applied):
         what += "; left out here, though the study does not say so"
-    write = _window(b, table, time) if b.cuts else _spans(bad, table, time)
+    write = _window(b, table, time, columns) if b.cuts else _spans(bad, table, time)
     return Contradiction(b.kind, table.name, what, b.columns, (b.first + 1, b.last + 1), (first, last), write)
 
 
@@ -140,10 +151,20 @@ def _spans(bad: Sequence[BadRows], table: schema.ExperimentTable, time: Array) -
     return f"leave_out = {{{', '.join(lines)}}}"
 
 
-def _window(b: BadRows, table: schema.ExperimentTable, time: Array) -> str:
-    """Return the line that ends the comparison before a stretch; "" where nothing would be left."""
-    start = table.window[0] if table.window is not None else float(time[0])
-    return f"window = [{start:.12g}, {time[b.first]:.12g}]" if _inside(time, [(start, time[b.first])]).sum() > 2 else ""
+def _window(b: BadRows, table: schema.ExperimentTable, time: Array, columns: Mapping[str, Array]) -> str:
+    """Return the line that ends the comparison before a stretch, or begins it after, where more moves; "" where nothing would be left."""
+    start, end = table.window if table.window is not None else (float(time[0]), float(time[-1]))
+    parts = [(start, float(time[b.first])), (float(time[b.last]), end)]
+    others = [v for s, v in columns.items() if s not in b.columns]
+    moved = [sum(_moves(v, _inside(time, [part])) for v in others) for part in parts]
+    low, high = parts[1] if moved[1] > moved[0] else parts[0]
+    return f"window = [{low:.12g}, {high:.12g}]" if _inside(time, [(low, high)]).sum() > 2 else ""
+
+
+def _moves(values: Array, rows: NDArray[np.bool_]) -> float:
+    """Return how much of the range that a column moves over it moves over in some rows."""
+    known, inside = values[np.isfinite(values)], values[rows & np.isfinite(values)]
+    return float(np.ptp(inside) / np.ptp(known)) if inside.size and np.ptp(known) > 0.0 else 0.0
 
 
 def _without_column(b: BadRows, table: schema.ExperimentTable) -> str:

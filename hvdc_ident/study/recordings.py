@@ -38,12 +38,14 @@ from hvdc_ident.data.three_phase import (
     phasor_quantities,
     unwrapped,
 )
-from hvdc_ident.data.turning import whole_turns
+from hvdc_ident.data.turning import unwrapped_words, whole_turns
+from hvdc_ident.data.window_noise import window_rows
 from hvdc_ident.errors import InputError, StudyError, located, require_known
 from hvdc_ident.files import digest
 from hvdc_ident.formats import files_of, read_waveforms
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel
+from hvdc_ident.model.card import toml_table
 from hvdc_ident.study import schema
 from hvdc_ident.study.left_out import RowsLeftOut
 from hvdc_ident.summary.levels import NoiseNote
@@ -246,7 +248,7 @@ def _experiment(
     units = tuple(model.outputs[o].unit for o in outputs)
     converted = tuple(_conversion_words(table, model, s, c, data, mappings[s]) for s, c in columns.items())
     jumps = {s: whole_turns(mappings[s][0] * data[c]) for s, c in columns.items() if same_unit(_unit(model, s), "rad")}
-    converted += tuple(f"{s}: unwrapped, for it jumps by a whole turn in {n} places" for s, n in jumps.items() if n)
+    converted += tuple(f"{s}: {unwrapped_words(n)}" for s, n in jumps.items() if n)
     origin = replace(
         data.origin,
         time_unit=_time_unit(table, data.origin),
@@ -272,7 +274,27 @@ def _experiment(
         nuisance=tuple(dict.fromkeys(table.nuisance)),
     )
     experiment, notes = with_noise(experiment, stated, means)
-    return (_trimmed(experiment, table, mapped) if table.trim else experiment), notes
+    if table.trim:
+        experiment = _trimmed(experiment, table, mapped)
+    if windows := _windows(experiment, table, [o for o in outputs if columns[o] in recorded]):
+        said = replace(measured, origin=replace(origin, notes=(*origin.notes, windows)))
+        experiment = experiment.with_(measured=said)
+    return experiment, notes
+
+
+def _windows(experiment: Experiment, table: schema.ExperimentTable, outputs: Sequence[str]) -> str:
+    """Return the sentence on outputs whose noise shows that they are means over a window which the study does not state; "" for none."""
+    assert experiment.measured is not None
+    time, lengths = experiment.time, {}
+    for o in (o for o in outputs if o not in table.instrument):
+        if (rows := window_rows(time, experiment.measured[o], experiment.event)) is not None:
+            lengths[o] = float(f"{rows * float(np.median(np.diff(time))):.4g}")
+    if not lengths:
+        return ""
+    seen = ", ".join(f"{o} over {length:g} s" for o, length in lengths.items())
+    stated: dict[str, object] = {o: i.model_dump(by_alias=True, exclude_none=True) for o, i in table.instrument.items()}
+    stated |= {o: {"window-mean": length} for o, length in lengths.items()}
+    return f"the noise before the event is that of means, {seen}; to take them of the model too write: instrument = {toml_table(stated)}"
 
 
 def _within_inputs(data: Trajectory, columns: Sequence[str], place: str) -> Trajectory:

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hvdc_ident.data import FEWEST_QUIET, Array, Trajectory, before_event, conversion, same_unit
+from hvdc_ident.data.signals import distinct
 from hvdc_ident.data.three_phase import unwrapped
-from hvdc_ident.data.turning import Agreement, agreement, finer_is_angle, scatter, whole_turns
+from hvdc_ident.data.turning import Agreement, agreement, finer_is_angle, scatter, unwrapped_words, whole_turns
 from hvdc_ident.model import AnyModel
 from hvdc_ident.plants import LEVELS, shelf_model
 from hvdc_ident.study.column_matching import ColumnLine, Match
@@ -194,14 +195,20 @@ def angle_way(unit: str, stated: bool, time: Array, values: Array, frequency: Ar
 
 
 def fastest(time: Array, angle: Array) -> float:
-    """Return the largest frequency in Hz with which an angle in rad turns over a tenth of a second."""
+    """Return the largest frequency in Hz with which an angle in rad turns over a tenth of a second, or over four rows where those are
+    longer; of each such stretch less its largest change from row to row, which alone is a step of a clock or of the polarity."""
+    from scipy.ndimage import maximum_filter1d
+
     known = np.isfinite(angle)
-    t, theta = time[known], unwrapped(angle[known])
-    begins = t[t <= t[-1] - LASTS] if t.size else t
-    if not begins.size:
+    t, theta = distinct(time[known], unwrapped(angle[known]))
+    if t.size < 2:
         return 0.0
-    moved = np.interp(begins + LASTS, t, theta) - np.interp(begins, t, theta)
-    return float(np.abs(moved).max()) / (2.0 * math.pi * LASTS)
+    rows = max(4, round(LASTS / float(np.median(np.diff(t)))))
+    if t.size <= rows:
+        return 0.0
+    largest = maximum_filter1d(np.abs(np.diff(theta)), rows)[rows // 2 :][: t.size - rows]
+    moved = np.maximum(np.abs(theta[rows:] - theta[:-rows]) - largest, 0.0)
+    return float((moved / (t[rows:] - t[:-rows])).max()) / (2.0 * math.pi)
 
 
 @dataclass(frozen=True)
@@ -232,7 +239,7 @@ def settled(record: Trajectory, named: Mapping[str, Match], event: float | None,
     if "theta" in ways:
         angle = ways["theta"].scale * record[named["theta"].column.name]
         if jumps := whole_turns(angle):
-            notes.append(f"{named['theta'].column.name} jumps {jumps} times by a whole turn: it is unwrapped")
+            notes.append(f"{named['theta'].column.name} is {unwrapped_words(jumps)}")
         if "f" in ways:
             frequency = _converted(record, named["f"], ways["f"])
             found = agreement(record.time, angle, frequency, about.frequency)
@@ -258,8 +265,11 @@ _OWN = ("V", "theta", "f", *LEVELS.values())
 def agreement_words(found: Agreement) -> str:
     """Return in words how far an angle and a frequency of one voltage agree."""
     degrees = found.rms / DEGREE
-    if found.factor is None:
+    if found.factor is None and found.holds:
         return f"neither turns enough to compare them ({degrees:.2g} deg rms between them)"
+    if found.factor is None:
+        apart = f"{degrees:.3g} deg rms between them, where {found.unseen / DEGREE:.2g} would be seen"
+        return f"they disagree: one turns and the other does not, {apart}"
     if found.holds:
         return f"they agree within {degrees:.2g} deg rms, of {found.moves / DEGREE:.3g} deg"
     return f"they disagree: the angle turns {found.factor:.3g} times as far as the frequency says, {degrees:.3g} deg rms between them"

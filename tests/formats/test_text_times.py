@@ -280,3 +280,44 @@ def test_a_date_in_no_known_form_is_refused_as_a_date(tmp_path: Path, date: str)
         read_waveforms(put(tmp_path, f"Timestamp,V\n{date},1\n{date},2\n"))
     assert "21-Nov-2026 10:15:00" in said.value.expected and "line 2, column 1" in said.value.where
     assert "take out the row" not in str(said.value)
+
+
+# Rows that do not stand in the order of their instants
+
+
+def rows_of(instants: np.ndarray) -> list[str]:
+    return [f"{t:.2f},{np.sin(t):.6f}" for t in instants]
+
+
+def written_as(tmp_path: Path, rows: list[str]) -> Path:
+    (tmp_path / "r.csv").write_text("\n".join(["time [s],V", *rows]) + "\n")
+    return tmp_path / "r.csv"
+
+
+@pytest.mark.parametrize("order", ["reversed", "in two parts", "a block twice"])
+def test_rows_of_one_record_are_sorted_and_said(tmp_path: Path, order: str) -> None:
+    instants = np.arange(60) * 0.02
+    rows = rows_of(instants)
+    shuffled = {
+        "reversed": rows[::-1],
+        "in two parts": rows[25:] + rows[:25],
+        "a block twice": rows[:40] + rows[20:40] + rows[40:],
+    }[order]
+    found = read_waveforms(written_as(tmp_path, shuffled))
+    np.testing.assert_allclose(found.time, instants)
+    np.testing.assert_allclose(found["V"], np.sin(instants), atol=1e-6)
+    (note,) = found.origin.notes
+    assert "sorted" in note and ("20 rows that stand twice" in note) == (order == "a block twice")
+
+
+def test_rows_that_are_no_single_record_stay_refused(tmp_path: Path) -> None:
+    instants = np.arange(60) * 0.02
+    rows = rows_of(instants)
+    other = [f"{t:.2f},5" for t in instants[20:40]]
+    for wrong in (
+        rows[:40] + other + rows[40:],  # an hour twice, as of a clock that is set back
+        rows[:40] + rows_of(instants[20:40] + 0.01),  # between others
+        rows[30:] + rows_of(instants[:10]),  # a gap between
+    ):
+        with pytest.raises(WaveformError, match="the time goes back"):
+            read_waveforms(written_as(tmp_path, wrong))
