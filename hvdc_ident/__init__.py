@@ -16,122 +16,33 @@ about; or a whole study. `values` are numbers by name. Every result has `summary
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from importlib import import_module, metadata
+from typing import Any
 
+import lazy_loader
+
+from hvdc_ident import api
 from hvdc_ident.aliases import moved, warn
-from hvdc_ident.api import (
-    bode,
-    check,
-    diagnose,
-    export,
-    find_operating_point,
-    fit,
-    identify,
-    linearize,
-    sensitivities,
-    simulate,
-    sweep,
-)
-from hvdc_ident.lazy import offered
 
-if TYPE_CHECKING:
-    from hvdc_ident import linear
-    from hvdc_ident.data import Experiment, InputSignal, Trajectory, multisine, ramp, step
-    from hvdc_ident.discrepancy import Diagnosis
-    from hvdc_ident.effects import apply_effects
-    from hvdc_ident.fit.result import FitResult
-    from hvdc_ident.formats import read_waveforms
-    from hvdc_ident.identifiability import IdentifiabilityReport
-    from hvdc_ident.linearize import LinearModel, OperatingPoint
-    from hvdc_ident.model import Model
-    from hvdc_ident.models import load_model
-    from hvdc_ident.parameters import Input, Parameter
-    from hvdc_ident.sensitivity import SweepResult
-    from hvdc_ident.simulate import Simulation
-    from hvdc_ident.study.comparison import RunComparison, compare_runs
-    from hvdc_ident.study.new_study import new_study
-    from hvdc_ident.study.study import Study, load_study
+_offered, _, _names = lazy_loader.attach_stub(__name__, __file__)
+__all__ = sorted([*_names, "__version__"])
 
-    __version__: str
-
-_imported = offered(
-    __name__,
-    {
-        "data": "Experiment InputSignal Trajectory multisine ramp step",
-        "discrepancy": "Diagnosis",
-        "effects": "apply_effects",
-        "fit.result": "FitResult",
-        "formats": "read_waveforms",
-        "identifiability": "IdentifiabilityReport",
-        "linearize": "LinearModel OperatingPoint",
-        "model": "Model",
-        "models": "load_model",
-        "parameters": "Input Parameter",
-        "sensitivity": "SweepResult",
-        "simulate": "Simulation",
-        "study.comparison": "RunComparison compare_runs",
-        "study.new_study": "new_study",
-        "study.study": "Study load_study",
-    },
-)
-__all__ = [
-    "Diagnosis",
-    "Experiment",
-    "FitResult",
-    "IdentifiabilityReport",
-    "Input",
-    "InputSignal",
-    "LinearModel",
-    "Model",
-    "OperatingPoint",
-    "Parameter",
-    "RunComparison",
-    "Simulation",
-    "Study",
-    "SweepResult",
-    "Trajectory",
-    "__version__",
-    "apply_effects",
-    "bode",
-    "check",
-    "compare_runs",
-    "diagnose",
-    "export",
-    "find_operating_point",
-    "fit",
-    "identify",
-    "linear",
-    "linearize",
-    "load_model",
-    "load_study",
-    "multisine",
-    "new_study",
-    "ramp",
-    "read_waveforms",
-    "sensitivities",
-    "simulate",
-    "step",
-    "sweep",
-]
+# The verbs now: a package of a verb's name, once imported, would stand in its place.
+for _verb in set(_names) & set(vars(api)):
+    globals()[_verb] = getattr(api, _verb)
 
 
-if not TYPE_CHECKING:
-
-    def __getattr__(name):
-        """Return a public name, imported now; or the version."""
-        from importlib import import_module
-
-        if name == "__version__":
-            from importlib.metadata import version
-
-            return version("hvdc_ident")
-        if name in ("linear", "sensitivity"):
-            return import_module(f"hvdc_ident.{name}")
-        if module := moved(name):
-            warn(f"hvdc_ident.{name}", f"hvdc_ident.{module}.{name}", above=2)
-            return getattr(import_module(f"hvdc_ident.{module}"), name)
-        return _imported(name)
+def __getattr__(name: str) -> Any:
+    """Return a public name, imported now; or the version."""
+    if name == "__version__":
+        return metadata.version("hvdc_ident")
+    if name == "sensitivity":
+        return import_module("hvdc_ident.sensitivity")
+    if module := moved(name):
+        warn(f"hvdc_ident.{name}", f"hvdc_ident.{module}.{name}", above=2)
+        return getattr(import_module(f"hvdc_ident.{module}"), name)
+    return _offered(name)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return __all__

@@ -47,7 +47,7 @@ def _build(kind: str, source: Path, to: Path) -> str:
 def _package_files() -> set[str]:
     """The modules and the data of the package in the sources."""
     paths = (p.relative_to(ROOT) for p in (ROOT / "hvdc_ident").rglob("*") if "__pycache__" not in p.parts)
-    return {p.as_posix() for p in paths if p.suffix == ".py" or DATA.search(p.name)}
+    return {p.as_posix() for p in paths if p.suffix in (".py", ".pyi") or DATA.search(p.name)}
 
 
 def test_the_wheel_holds_the_package_with_its_data_and_nothing_else(built: dict[str, Path]) -> None:

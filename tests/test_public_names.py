@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
 import hvdc_ident
+
+PACKAGE = Path(hvdc_ident.__file__).parent
 
 
 def test_all_names_resolve() -> None:
@@ -19,7 +23,7 @@ def test_all_names_resolve() -> None:
 
 
 def test_another_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="no attribute 'no_such_thing'"):
+    with pytest.raises(AttributeError, match="no_such_thing"):
         _ = hvdc_ident.no_such_thing  # type: ignore[attr-defined]
 
 
@@ -51,3 +55,12 @@ def test_the_package_and_the_command_line_import_nothing_heavy() -> None:
     )
     heavy = {"numpy", "scipy", "sympy", "llvmlite", "matplotlib", "pydantic", "xarray", "control", "tomlkit"}
     assert not loaded & heavy
+
+
+@pytest.mark.parametrize("stub", sorted(p.relative_to(PACKAGE) for p in PACKAGE.rglob("__init__.pyi")), ids=str)
+def test_what_a_package_offers_lazily_is_there(stub: Path) -> None:
+    """The stub is what is offered: mypy reads it, and so does the import."""
+    package = importlib.import_module(".".join(["hvdc_ident", *stub.parts[:-1]]))
+    assert package.__all__
+    for name in package.__all__:
+        assert getattr(package, name) is not None

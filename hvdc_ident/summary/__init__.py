@@ -4,15 +4,6 @@
 which terminal, report, letter, notebook and workbench are made.
 """
 
-from typing import TYPE_CHECKING
+import lazy_loader
 
-from hvdc_ident.lazy import offered
-
-if TYPE_CHECKING:
-    from hvdc_ident.summary.decisions import summarise
-    from hvdc_ident.summary.results import Results
-    from hvdc_ident.summary.run_summary import RunSummary
-else:
-    __getattr__ = offered(__name__, {"results": "Results", "run_summary": "RunSummary", "decisions": "summarise"})
-
-__all__ = ["Results", "RunSummary", "summarise"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,13 @@
+from .estimate import fit as fit
+from .fit_parameter import FitParameter as FitParameter
+from .optimiser import Optimiser as Optimiser
+from .optimiser import OptimiserResult as OptimiserResult
+from .partial_fits import Group as Group
+from .partial_fits import fit_each as fit_each
+from .partial_fits import fit_individually as fit_individually
+from .problem import Problem as Problem
+from .result import Estimate as Estimate
+from .result import FitResult as FitResult
+from .result import StartOutcome as StartOutcome
+from .simulator import SimulationRun as SimulationRun
+from .simulator import Simulator as Simulator

@@ -1,0 +1,14 @@
+from .capabilities import Capabilities as Capabilities
+from .capabilities import read_capabilities as read_capabilities
+from .capabilities import tested_capabilities as tested_capabilities
+from .compile import compile_fmu as compile_fmu
+from .description import INTERFACES as INTERFACES
+from .description import Description as Description
+from .description import read_description as read_description
+from .evaluate import at_point as at_point
+from .evaluate import smooth_inputs as smooth_inputs
+from .model import FmuModel as FmuModel
+from .model import FmuState as FmuState
+from .model import read_fmu as read_fmu
+from .request import FmuPoint as FmuPoint
+from .worker_pool import Limits as Limits

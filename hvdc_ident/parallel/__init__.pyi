@@ -1,0 +1,11 @@
+from .child import Child as Child
+from .child import ChildEndedError as ChildEndedError
+from .child import Ending as Ending
+from .child import call as call
+from .cores import available_cores as available_cores
+from .cores import one_thread as one_thread
+from .patient import PatientPool as PatientPool
+from .pool import LocalPool as LocalPool
+from .pool import OpenPool as OpenPool
+from .pool import can_start as can_start
+from .progress import Watch as Watch
