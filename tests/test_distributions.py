@@ -19,6 +19,8 @@ import pytest
 
 from hvdc_ident.simulate.core import BUILDS
 
+pytestmark = pytest.mark.nightly
+
 ROOT = Path(__file__).resolve().parents[1]
 KEPT_OUT = shutil.ignore_patterns("__pycache__", ".*", "*-results", "build", "dist", "*.egg-info")
 BUILD = "import sys; sys.path.insert(0, ''); import build_backend as b; print(getattr(b, sys.argv[1])(sys.argv[2]))"

@@ -166,7 +166,7 @@ def a_broken_page(request: pytest.FixtureRequest) -> tuple[str, ...]:
     return BROKEN, str(request.getfixturevalue("study"))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("opened", [a_study, a_model, a_recording], indirect=True)
 def test_every_control_works_or_says_why_not(opened: tuple[Any, list[str], list[str]]) -> None:
     page, said, _ = opened
@@ -175,7 +175,7 @@ def test_every_control_works_or_says_why_not(opened: tuple[Any, list[str], list[
     assert not said, said
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize("opened", [a_broken_page], indirect=True)
 def test_a_control_that_is_broken_is_found(opened: tuple[Any, list[str], list[str]]) -> None:
     with pytest.raises(AssertionError, match="broken by hand"):

@@ -25,6 +25,8 @@ from hvdc_ident.discrepancy.search import one_round
 from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
 
+pytestmark = pytest.mark.nightly
+
 PERIOD = 0.033
 WINDOW = 0.05
 

@@ -13,6 +13,8 @@ from typer.testing import CliRunner
 from hvdc_ident.cli import app
 from hvdc_ident.study.json_schema import FILES, reference
 
+pytestmark = pytest.mark.nightly
+
 ROOT = Path(__file__).resolve().parents[2]
 WITHOUT_BLOCKS = ("workbench.md", "index.md", "report.md")
 GUIDES = sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in WITHOUT_BLOCKS)

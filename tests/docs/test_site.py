@@ -34,6 +34,8 @@ sys.path.insert(0, str(ROOT / "scripts"))
 from pages import effects as pictures  # noqa: E402
 from pages import gallery, notebook, reference, results  # noqa: E402
 
+pytestmark = pytest.mark.nightly
+
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -19,6 +19,8 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, parse_card
 from hvdc_ident.simulate import ModelSimulator
 
+pytestmark = pytest.mark.nightly
+
 LATE = """
 schema = 1
 name = "late"

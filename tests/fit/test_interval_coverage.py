@@ -10,6 +10,8 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.fit import FitParameter, Group, Problem, fit, fit_each, fit_individually
 from tests.fit.simulators import Closed, coloured, decay, line, parameters, recorded
 
+pytestmark = pytest.mark.nightly
+
 T = np.linspace(0.0, 1.0, 200)
 FREE = (FitParameter("a", 0.0, -50, 50), FitParameter("b", 0.0, -50, 50))
 LINE = Closed(parameters(a=0.0, b=0.0), {"y": line})

@@ -19,6 +19,8 @@ from hvdc_ident import find_operating_point, load_model
 from hvdc_ident.cli import app
 from tests.foreign.plant import Plant
 
+pytestmark = pytest.mark.nightly
+
 PLANTS = sorted(p.stem for p in Path(__file__).with_name("plants").glob("[a-z]*.py"))
 TRIED = ("lag", "delay", "gain", "offset", "limit", "deadband")
 """Effects that a diagnosis tries here: the hidden ones and some that might be taken for them."""

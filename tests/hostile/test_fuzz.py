@@ -7,6 +7,8 @@ from pathlib import Path
 import fuzz
 import pytest
 
+pytestmark = pytest.mark.nightly
+
 RUNS = 500
 SEED = 20_261_121
 

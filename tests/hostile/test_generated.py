@@ -16,6 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from plants import Plant, Seeded, recorded
 
+pytestmark = pytest.mark.nightly
+
 NUMBERS = (16, 36)
 """Studies that go through every command within a few seconds."""
 ONCE = ((64, "identify"),)

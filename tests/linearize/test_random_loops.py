@@ -8,6 +8,8 @@ import pytest
 
 import hvdc_ident as hi
 
+pytestmark = pytest.mark.nightly
+
 STATES = range(3)
 OMEGA = np.concatenate([np.linspace(0.0, 200.0, 40_001), np.geomspace(200.0, 1e6, 4001)[1:]])
 """rad/s; the steps turn the longest delay by less than 0.01 rad where the loops have a gain that matters."""

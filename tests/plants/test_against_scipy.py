@@ -11,6 +11,8 @@ from hvdc_ident.model import Model, parse_card
 from hvdc_ident.plants import UnitPart, parts_of, unit_card
 from hvdc_ident.plants.unit import shelf_model
 
+pytestmark = pytest.mark.nightly
+
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
 
 

@@ -76,7 +76,7 @@ def test_a_search_without_memory_says_so() -> None:
         equations.newton(np.zeros(2))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_runs_leave_no_memory_behind() -> None:
     model = parse_card(DELAYED)
     case = experiment("step", np.linspace(0.0, 2.0, 21), {"u": InputSignal.step(0.1, 0.0, 1.0)})

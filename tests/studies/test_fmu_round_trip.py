@@ -8,6 +8,8 @@ from hvdc_ident.fmu.compile import compiler
 from hvdc_ident.model import parse_card
 from tests.studies.study_module import expected, load
 
+pytestmark = pytest.mark.nightly
+
 STUDY, KNOWN = load("fmu_round_trip"), expected("fmu_round_trip")
 CARD = """
 schema = 1

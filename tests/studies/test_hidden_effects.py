@@ -34,6 +34,8 @@ from hidden.plants import DRIVE, STATION
 from hidden.reporting import report
 from hidden.simulator import STEP, Hidden, Run, Signal, simulate
 
+pytestmark = pytest.mark.nightly
+
 STUDY = load("hidden_effects")
 ROWS = 125
 TIME = np.arange(ROWS) * 4e-3
@@ -358,7 +360,7 @@ def test_the_sparse_law_finds_a_law_that_is_there():
     assert np.abs(found - residuals[-1]).max() < 0.05 * np.abs(residuals[-1]).max()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_large_effect_is_found_and_a_clean_record_is_left_alone(large):
     line = diagnosed(large)
     assert judging.outcome(line) in ("right", "covered"), line

@@ -25,6 +25,8 @@ from hidden.plants import FIRST, PLANTS
 from hidden.reporting import report
 from hidden.simulator import Hidden, Run, Signal, simulate
 
+pytestmark = pytest.mark.nightly
+
 STUDY = load("hidden_effects")
 MACHINE, CONVERTER = PLANTS["machine"], PLANTS["converter"]
 NEW = [MACHINE, CONVERTER]

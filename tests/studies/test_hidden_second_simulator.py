@@ -30,6 +30,8 @@ from hidden.simulator import Hidden, Run, Signal, simulate
 
 from hvdc_ident.model import read_card
 
+pytestmark = pytest.mark.nightly
+
 STUDY = load("hidden_effects")
 HYDRO, PARK = PLANTS["hydro"], PLANTS["park"]
 NEW = [HYDRO, PARK]

@@ -11,6 +11,8 @@ from tests.studies.study_module import STUDIES
 sys.path.insert(0, str(STUDIES))
 import index
 
+pytestmark = pytest.mark.nightly
+
 LIST = (STUDIES / "README.md").read_text(encoding="utf-8")
 
 

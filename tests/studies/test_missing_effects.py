@@ -12,6 +12,8 @@ from tests.studies.study_module import STUDIES, expected, load
 sys.path.insert(0, str(STUDIES))
 from common import diagnosing, ending, paper
 
+pytestmark = pytest.mark.nightly
+
 WHY, TOOLS, DYMOLA = load("why_table_3_is_biased"), load("two_tools_one_link"), load("dymola_missing")
 needs_tools = pytest.mark.skipif(not TOOLS.DATA.exists(), reason="reference data not found beside the project: dynawo")
 needs_dymola = pytest.mark.skipif(

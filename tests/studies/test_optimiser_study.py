@@ -7,6 +7,8 @@ import pytest
 from hvdc_ident.fit.optimisers import catalogue
 from tests.studies.study_module import STUDIES, expected, load
 
+pytestmark = pytest.mark.nightly
+
 STUDY, KNOWN = load("optimisers"), expected("optimisers")
 
 

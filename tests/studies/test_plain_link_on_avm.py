@@ -9,6 +9,8 @@ from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from tests.studies.study_module import expected, load
 
+pytestmark = pytest.mark.nightly
+
 STUDY, KNOWN = load("plain_link_on_avm"), expected("plain_link_on_avm")
 
 

@@ -6,6 +6,8 @@ import pytest
 
 from tests.studies.study_module import expected, load
 
+pytestmark = pytest.mark.nightly
+
 STUDY, KNOWN = load("software_to_software"), expected("software_to_software")
 
 

@@ -14,6 +14,8 @@ from tests.studies.study_module import STUDIES, expected, load
 sys.path.insert(0, str(STUDIES))
 from common import ending, paper
 
+pytestmark = pytest.mark.nightly
+
 NAMES = ("table_1", "table_2", "table_3", "table_4", "figure_5", "figure_6", "figure_7", "why_table_3_is_biased")
 PAPER = STUDIES.parents[1] / "shared" / "data" / "paper" / "tables.toml"
 

@@ -11,6 +11,8 @@ import hvdc_ident as hi
 from hvdc_ident.study.fitting import problem_of
 from tests.studies.study_module import load
 
+pytestmark = pytest.mark.nightly
+
 RUN = load("units_by_andes")
 HALF_SECOND = 25
 """Rows of half a second."""
