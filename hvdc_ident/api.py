@@ -71,17 +71,52 @@ def simulate(
 ) -> Simulation:
     """Return the model's outputs over time and, exactly, their derivatives by the named parameters.
 
-    model: a Model, a shipped name, the path of a card, an FMU or a study, or a Study.
-    data: times in s, an Experiment, or the name of an experiment of the study (left out: its only one).
-    values: of parameters, where they differ from the model's; or a FitResult. sensitivities: names of parameters.
-    inputs: by name a number, a signal (`step`, `ramp`, `multisine`) or samples at the times; others keep the model's value.
-    outputs: names of outputs or signals (default: all outputs).
-    tolerance: of the integration; rtol: shorthand for one with atol = rtol / 100.
-    partial: of a run that an FMU ends, the rows up to there, with status "ended"; else such a run has failed.
-    The start is the steady state of the inputs' first values unless a state says otherwise.
+    The start is the steady state of the inputs' first values unless a state says otherwise; an FMU begins at its own start.
 
-    Raises UnknownNameError, SteadyStateError where there is no steady start, SimulationError where the run stops early.
+    Parameters
+    ----------
+    model : Model, Study, str or Path
+        A Model, a shipped name, the path of a card, an FMU or a study, or a Study.
+    data : array of float (n,), Experiment or str, default None
+        Times in s, an Experiment, or the name of an experiment of the study. None: the study's only one.
+    values : dict of float or FitResult, default None
+        Values of parameters by name, in the model's units, where they differ from the model's; or a FitResult: its estimates.
+    sensitivities : str or list of str, default ()
+        Names of parameters by which the derivatives are wanted. The name of an input asks for the derivative by a constant added to it,
+        that of a state for the derivative by its start.
+    inputs : dict, default None
+        By name a number, a signal (`step`, `ramp`, `multisine`) or samples (n,) at the times, in the input's unit. Other inputs keep
+        the experiment's signal, or else the model's value.
+    outputs : str or list of str, default None
+        Names of outputs or signals. None: all outputs.
+    tolerance : Tolerance, default None
+        Error control of the integration. None: a relative error of 1e-8 and an absolute one of 1e-10, in the states' units.
+    rtol : float, default None
+        Shorthand for a tolerance with this relative error and atol = rtol / 100.
+    method : "auto", "explicit" or "rosenbrock", default "auto"
+        The integrator. "auto" takes the explicit one where no eigenvalue is so fast that it would rule the step. An FMU has its own.
+    partial : bool, default False
+        True gives, of a run that an FMU ends, the rows up to there, with status "ended"; else such a run has failed.
 
+    Returns
+    -------
+    Simulation
+        The outputs at the n times, in their units: `run["NAME"]` is (n,). `run.gradient("NAME")` is (n, parameters), in output unit
+        per parameter unit.
+
+    Raises
+    ------
+    InputError
+        No times, or several experiments and none chosen; a value that is no number.
+    UnknownNameError
+        A name of a parameter, input, output or experiment that is not there.
+    SteadyStateError
+        There is no steady start.
+    SimulationError
+        The run stops early.
+
+    Examples
+    --------
     >>> import numpy as np, hvdc_ident as hi
     >>> t = np.linspace(0.0, 0.5, 6)
     >>> run = hi.simulate("vsc-hvdc-link", t, inputs={"Pref2": hi.step(0.4, 0.5, at=0.1)}, outputs="Irorder2")
@@ -119,18 +154,48 @@ def find_operating_point(
 ) -> OperatingPoint:
     """Return the operating point at which every derivative is 0.
 
-    inputs: values of inputs (or of parameters, states and signals that are to hold). outputs: values that outputs are to
-    have (a trimmed point); the inputs that move them at rest are then found, or the inputs and parameters in `free`.
-    values: of parameters, where they differ from the model's; or a FitResult.
-    at="start": states with a given start stand there and only the rest is solved.
-    search: bounds, guess, moving, time as in `hvdc_ident.linearize.find_operating_point`.
+    Parameters
+    ----------
+    model : Model, Study, str or Path
+        A Model, a shipped name, the path of a card, an FMU or a study, or a Study.
+    inputs : dict of float, default None
+        Values of inputs by name (or of parameters, states and signals that are to hold), in the model's units. An input that is not
+        named keeps the model's value.
+    outputs : dict of float, default None
+        Values that outputs are to have (a trimmed point), in their units. The inputs that move them at rest are then found, or the
+        inputs and parameters in `free`.
+    values : dict of float or FitResult, default None
+        Values of parameters by name, in the model's units, where they differ from the model's; or a FitResult: its estimates.
+    free : str or list of str, default None
+        Names of inputs and parameters to be found. None: where `outputs` are given, the inputs that move these outputs at rest, if they
+        are as many.
+    at : "steady" or "start", default "steady"
+        "start": states with a given start stand there and only the rest is solved.
+    **search
+        Arguments of the search: `bounds`, {name: (low, high)} of anything but a fixed name; `guess`, {name: value} where it begins;
+        `moving`, names of states whose derivative need not be 0; `time`, the instant in s (default 0).
 
-    Raises UnknownNameError; SteadyStateError, with the worst equation, where there is no such point.
+    Returns
+    -------
+    OperatingPoint
+        The values of states, unknowns, inputs, outputs and parameters by name, in the model's units.
 
+    Raises
+    ------
+    UnknownNameError
+        A name that the model lacks.
+    SteadyStateError
+        There is no such point; the error names the worst equation.
+
+    Examples
+    --------
     >>> import hvdc_ident as hi
     >>> point = hi.find_operating_point("vsc-hvdc-link", {"Pref2": 0.5})
     >>> round(point.outputs["P2"], 9)
     0.5
+    >>> trimmed = hi.find_operating_point("vsc-hvdc-link", outputs={"P2": 0.6})
+    >>> round(trimmed.inputs["Pref2"], 9)
+    0.6
     """
     from hvdc_ident.linearize import find_operating_point as find
     from hvdc_ident.study.assemble import model_of, names_of, values_of
@@ -153,16 +218,49 @@ def linearize(
     side: Side = "refuse",
     descriptor: bool = False,
 ) -> LinearModel:
-    """Return the linear model between inputs and outputs (or signals; default: all) at an operating point.
+    """Return the linear model between inputs and outputs at an operating point.
 
-    point: default, the steady state at the model's values and `values`. A study gives the inputs, outputs and point of
-    its [linearize] where they are not named here.
-    pade_order: of every delay in the state space, default 5 (frequency responses take delays exactly). sensitivities: parameters whose
-    exact derivatives of A, B, C, D come along. side: of a limit on which the point lies, "refuse", "below" or "above".
-    descriptor: keep the algebraic unknowns as states, with E.
+    Of a study, what is not named here is as its [linearize] states it: inputs, outputs, side and the operating point.
 
-    Raises UnknownNameError, and LinearizationError on a kink or for an ill-posed loop.
+    Parameters
+    ----------
+    model : Model, Study, str or Path
+        A Model, a shipped name, the path of a card, an FMU or a study, or a Study.
+    point : OperatingPoint, default None
+        Where. None: the steady state at the model's values and `values`, or the point of a study's [linearize].
+    inputs : str or list of str, default None
+        Names of inputs. None: all, or those of a study's [linearize].
+    outputs : str or list of str, default None
+        Names of outputs or signals. None: all outputs, or those of a study's [linearize].
+    values : dict of float or FitResult, default None
+        Values of parameters by name, in the model's units, where they differ from the model's; or a FitResult: its estimates. They count
+        where no point is given.
+    sensitivities : str or list of str, default ()
+        Parameters whose exact derivatives of A, B, C, D come along, the shift of the operating point included.
+    pade_order : int, default None
+        Order of the Pade approximant of every delay in the state space. None: 5. Frequency responses take delays exactly.
+    side : "refuse", "below" or "above", default "refuse"
+        Of a limit on which the point lies: the derivative below or above it, or an error.
+    descriptor : bool, default False
+        True keeps the algebraic unknowns as states, with E.
 
+    Returns
+    -------
+    LinearModel
+        E dx/dt = A x + B u, y = C x + D u for the deviations from the point, in the model's units, time in s: A (n, n), B (n, inputs),
+        C (outputs, n), D (outputs, inputs).
+
+    Raises
+    ------
+    UnknownNameError
+        An input, output, signal or parameter that the model lacks.
+    SteadyStateError
+        There is no steady state, where no point is given.
+    LinearizationError
+        The point lies on a kink, an algebraic loop is ill-posed, an entry is not finite, or an FMU cannot answer what is asked.
+
+    Examples
+    --------
     >>> import hvdc_ident as hi
     >>> linear = hi.linearize("vsc-hvdc-link", inputs="Vdcref1", outputs="Irorder1")
     >>> linear.A.shape, linear.D.shape
@@ -205,8 +303,38 @@ def bode(
 ) -> FrequencyResponse:
     """Return the frequency response between inputs and outputs, delays exact; it draws itself with `plot()`.
 
-    model: as in `linearize`, or a LinearModel. omega: in rad/s (default: around the poles).
+    Parameters
+    ----------
+    model : Model, Study, LinearModel, str or Path
+        A Model, a shipped name, the path of a card, an FMU or a study, a Study, or a LinearModel.
+    omega : array of float (n,), default None
+        Frequencies in rad/s. None: from a decade below the slowest to a decade above the fastest pole that the response shows.
+    inputs : str or list of str, default None
+        Names of inputs. None: all, or those of a study's [linearize].
+    outputs : str or list of str, default None
+        Names of outputs or signals. None: all outputs, or those of a study's [linearize].
+    values : dict of float or FitResult, default None
+        Values of parameters by name, in the model's units, where they differ from the model's; or a FitResult: its estimates. They count
+        where no point is given; a LinearModel has its own.
+    point : OperatingPoint, default None
+        Where the model is linearised. None: its steady state, or the point of a study's [linearize]; a LinearModel has its own.
 
+    Returns
+    -------
+    FrequencyResponse
+        omega (n,) in rad/s and values (n, outputs, inputs), complex, in output unit per input unit.
+
+    Raises
+    ------
+    UnknownNameError
+        An input, output or signal that the model lacks.
+    SteadyStateError
+        There is no steady state, where no point is given.
+    LinearizationError
+        The point lies on a kink, or an algebraic loop is ill-posed.
+
+    Examples
+    --------
     >>> import hvdc_ident as hi
     >>> response = hi.bode("vsc-hvdc-link", [0.1, 30.0], inputs="Vdcref1", outputs="Irorder1")
     >>> response.magnitude.shape
@@ -240,13 +368,46 @@ def sensitivities(
 ) -> LocalSensitivities:
     """Return the exact derivatives of trajectories, steady state, eigenvalues and frequency responses by parameters.
 
-    data: times in s, an Experiment, several, or left out (then a study's own, if a study is given).
-    parameters: names (default: all). inputs: where `data` are times, the input signals; else names of the inputs of the
-    frequency response. values: where the derivatives are taken, if not at the model's values. omega: of the responses, rad/s.
-    ranges: (min, max) by parameter, as factors that normalise (default: its value, or its range where that is 0).
+    Parameters
+    ----------
+    model : Model, Study, str or Path
+        A Model, a shipped name, the path of a card or a study, or a Study; a model with equations.
+    data : array of float (n,), Experiment or list of Experiment, default None
+        Times in s, an Experiment, several, or left out: then a study's own, if a study is given.
+    parameters : str or list of str, default None
+        Names of parameters. None: all.
+    inputs : dict, str or list of str, default None
+        Where `data` are times, the input signals by name, as in `simulate`; else names of the inputs of the frequency response. None: all.
+    outputs : str or list of str, default None
+        Names of outputs or signals. None: of trajectories the recorded ones, else all outputs.
+    values : dict of float or FitResult, default None
+        Values of parameters by name, in the model's units, at which the derivatives are taken, where they differ from the model's;
+        or a FitResult: its estimates.
+    omega : array of float (m,), default None
+        Frequencies of the responses in rad/s. None: around the poles.
+    ranges : dict of (float, float), default None
+        (min, max) by parameter, in its unit: their distance is the factor that normalises. None: the size of its value, or its range
+        where that is 0.
 
-    Raises InputError for a model without equations (an FMU), UnknownNameError, SteadyStateError or SimulationError.
+    Returns
+    -------
+    LocalSensitivities
+        `trajectories` by experiment and output (None without data), `steady` of the steady state, `linear` of eigenvalues and frequency
+        responses (None where there is no linear model; `why` says it): in units per parameter unit, and normalised.
 
+    Raises
+    ------
+    InputError
+        A model without equations (an FMU).
+    UnknownNameError
+        A name of a parameter, input or output that is not there.
+    SteadyStateError
+        There is no steady state.
+    SimulationError
+        A run stops early.
+
+    Examples
+    --------
     >>> import numpy as np, hvdc_ident as hi
     >>> t = np.linspace(0.0, 0.5, 51)
     >>> found = hi.sensitivities("vsc-hvdc-link", t, "KIVDC", inputs={"Vdcref1": hi.step(1.0, 1.019, at=0.1)}, outputs="Irorder1")
@@ -303,12 +464,48 @@ def sweep(
 ) -> SweepResult:
     """Return the RMSE of each output in each experiment, and poles where wanted, at many values of some parameters.
 
-    data: a study, experiments or a table. parameters: {name: values}, several make their product; or `grid`, `log_grid`,
-    `latin_hypercube` of `hvdc_ident.sensitivity.sweep_points`. A study has its own in [[sweep]].
-    against: "data" (default where outputs were recorded), "base" (the run at the model's own values) or another model.
-    want: "rmse", "poles" or "bode" (default: "rmse", without data "poles").
-    executor, progress: as in `fit`. A point that fails is a row with a reason and no number.
+    Parameters
+    ----------
+    model : Model, Study, str or Path
+        A Model, a shipped name, the path of a card, an FMU or a study, or a Study.
+    data : Experiment, list of Experiment, Trajectory, Study, str or Path, default None
+        A study, experiments, or a table whose columns are named like the model's inputs and outputs; or the path of one. None: those of a
+        study, else none.
+    parameters : dict of list of float, Samples or list of Samples, default None
+        {name: values} in the parameter's unit, of which several make their product; or `grid`, `log_grid`, `latin_hypercube` of
+        `hvdc_ident.sensitivity.sweep_points`. None: those of a study's [[sweep]].
+    outputs : str or list of str, default None
+        Names of the outputs that are compared. None: the recorded ones against data, else all outputs.
+    against : "data", "base" or Model, default None
+        What the outputs are compared with: the recordings, the run at the model's own values, or another model's run. None: what a study's
+        [[sweep]] says, else "data" where outputs were recorded and "base" where none were.
+    want : str or list of str, default None
+        "rmse", "poles" or "bode", or several of them. None: what a study's [[sweep]] asks for where it gives the points, else "rmse",
+        without data "poles".
+    values : dict of float or FitResult, default None
+        Values of the parameters that are not swept, by name, in the model's units, where they differ from the given ones; or a FitResult.
+    executor : int or executor, default None
+        A number of processes on this machine, or anything with the `map` of concurrent.futures. None: this process.
+    progress : bool or function, default None
+        True for a bar on stderr, or a function called with runs done, runs in all and a line of text.
 
+    Returns
+    -------
+    SweepResult
+        A row for each of the n points: rmse (n, series) in the output's unit, poles (n, modes) in rad/s. A point that fails is a row
+        with a reason and no number.
+
+    Raises
+    ------
+    InputError
+        Names, values, data or an executor that do not fit.
+    StudyError
+        There is no parameter to sweep.
+    ComputationError
+        The run that the others are compared with stops early; one without a steady start is a SteadyStateError.
+
+    Examples
+    --------
     >>> import hvdc_ident as hi
     >>> table = hi.sweep("vsc-hvdc-link", parameters={"KIVDC": [250.0, 750.0, 1500.0]})
     >>> table.poles.shape
@@ -359,13 +556,42 @@ def identify(
 ) -> IdentifiabilityReport:
     """Return what the data tell about each parameter: a verdict with its evidence, the set to fit, what to measure next.
 
-    model: a Study, or a Model, a shipped name or a path. data: experiments, a study, or a table whose columns are named like
-    the model's inputs and outputs. parameters: names, or by name bounds (min, max), a start value, or a line as in a
-    study's [parameters], as {"k": (0, 10)} or [("k", 0, 10)]; a study has its own. pair: two of them whose common profile is wanted too.
-    executor, progress: as in `fit`.
+    Parameters
+    ----------
+    model : Model, Study, str or Path
+        A Study, or a Model, a shipped name or the path of a card, an FMU or a study.
+    data : Experiment, list of Experiment, Trajectory, Study, str or Path, default None
+        Experiments, a study, or a table whose columns are named like the model's inputs and outputs; or the path of one. None: a study's
+        own.
+    parameters : str, list or dict, default None
+        Names; or by name bounds (min, max), a start value, or a line as in a study's [parameters], in the parameter's unit: {"k": (0, 10)}
+        or [("k", 0, 10)]. None: a study's own.
+    pair : list of str, default None
+        Two of the parameters whose common profile is wanted too.
+    seed : int, default 0
+        Of the starts of the search; same seed, same result.
+    executor : int or executor, default None
+        A number of processes on this machine, or anything with the `map` of concurrent.futures. None: this process.
+    progress : bool or function, default None
+        True for a bar on stderr, or a function called with runs done, runs in all and a line of text.
 
-    Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated.
+    Returns
+    -------
+    IdentifiabilityReport
+        `parameters`, the verdict on each; `identifiable`, the names that a fit may estimate; `held`, the value and the reason of each
+        other one; `recommended`, what to measure next.
 
+    Raises
+    ------
+    StudyError
+        There is nothing to judge: data or parameters are missing.
+    UnknownNameError
+        A name of a parameter, input or output that the model lacks.
+    SimulationError
+        An experiment cannot be simulated.
+
+    Examples
+    --------
     >>> import numpy as np, hvdc_ident as hi
     >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
     >>> t = np.linspace(0.0, 5.0, 101)
@@ -400,15 +626,48 @@ def fit(
 ) -> FitResult:
     """Return the estimates of the parameters that the data identify; the others are held, each with its reason.
 
-    model, data, parameters: as in `identify`, whose report decides what is fitted (`report`: one that is there already).
-    force: names to fit whatever the verdict on them.
-    settings: keys of a study's [fit]: starts, optimiser, loss, whiten, mode, groups, guard, residual, band.
-    executor: a number of processes on this machine, or anything with the `map` of concurrent.futures.
-    progress: True for a bar on stderr, or a function called with runs done, runs in all and a line of text.
-    A `hvdc_ident.fit.Problem` is fitted as it stands, all that is free in it.
+    Parameters
+    ----------
+    model : Model, Study, Problem, str or Path
+        A Study, or a Model, a shipped name or the path of a card, an FMU or a study. A `hvdc_ident.fit.Problem` is fitted as it stands,
+        all that is free in it.
+    data : Experiment, list of Experiment, Trajectory, Study, str or Path, default None
+        Experiments, a study, or a table whose columns are named like the model's inputs and outputs; or the path of one. None: a study's
+        own.
+    parameters : str, list or dict, default None
+        Names; or by name bounds (min, max), a start value, or a line as in a study's [parameters], in the parameter's unit: {"k": (0, 10)}
+        or [("k", 0, 10)]. None: a study's own.
+    report : IdentifiabilityReport, default None
+        The report of `identify`, which decides what is fitted. None: it is made first.
+    force : str or list of str, default None
+        Names to fit whatever the verdict on them.
+    seed : int, default 0
+        Of the starts of the search; same seed, same result.
+    executor : int or executor, default None
+        A number of processes on this machine, or anything with the `map` of concurrent.futures. None: this process.
+    progress : bool or function, default None
+        True for a bar on stderr, or a function called with runs done, runs in all and a line of text.
+    **settings
+        Keys of a study's [fit]: starts, optimiser, loss, whiten, mode, groups, guard, residual, band. Of a Problem: arguments of
+        `hvdc_ident.fit.fit`.
 
-    Raises StudyError or UnknownNameError for what does not fit together. A fit that fails says so in `status`.
+    Returns
+    -------
+    FitResult
+        `estimates` by parameter, each with its value, standard deviation and 95 % interval in the parameter's unit; `held`, the reason of
+        each other one; `status`. A fit that fails says so in `status` and raises nothing.
 
+    Raises
+    ------
+    StudyError
+        Data or parameters are missing, or do not fit together.
+    UnknownNameError
+        A name of a parameter, input or output that the model lacks.
+    SimulationError
+        An experiment cannot be simulated when the report is made.
+
+    Examples
+    --------
     >>> import numpy as np, hvdc_ident as hi
     >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
     >>> t = np.linspace(0.0, 5.0, 101)
@@ -449,11 +708,46 @@ def diagnose(
 ) -> Diagnosis:
     """Return what the model lacks, if the data tell: the verdict, the missing effects, and the gap before and after.
 
-    model, data, parameters, report: as in `fit`. effects: names of the catalogue that are tried (default: all).
-    settings: keys of a study's [diagnose]: tolerance, most, thorough, budget. executor, progress: as in `fit`.
+    Parameters
+    ----------
+    model : Model, Study, str or Path
+        A Study, or a Model, a shipped name or the path of a card, an FMU or a study.
+    data : Experiment, list of Experiment, Trajectory, Study, str or Path, default None
+        Experiments, a study, or a table whose columns are named like the model's inputs and outputs; or the path of one. None: a study's
+        own.
+    parameters : str, list or dict, default None
+        Names; or by name bounds (min, max), a start value, or a line as in a study's [parameters], in the parameter's unit: {"k": (0, 10)}
+        or [("k", 0, 10)]. None: a study's own.
+    effects : str or list of str, default None
+        Names of the catalogue that are tried. None: those of a study's [diagnose], else all.
+    report : IdentifiabilityReport, default None
+        The report of `identify`, which decides what is refitted. None: it is made first.
+    seed : int, default 0
+        Of the starts of the searches; same seed, same result.
+    executor : int or executor, default None
+        A number of processes on this machine, or anything with the `map` of concurrent.futures. None: this process.
+    progress : bool or function, default None
+        True for a bar on stderr, or a function called with runs done, runs in all and a line of text.
+    **settings
+        Keys of a study's [diagnose]: places, tolerance (by output, in its unit), most, thorough, budget (s).
 
-    Raises StudyError where data or parameters are missing, ComputationError where the data identify no parameter.
+    Returns
+    -------
+    Diagnosis
+        `verdict` (named, ambiguous, unnameable, not-excited or no-evidence) and `text`; `findings`, each missing effect with its
+        probability and its likely places; `augmented`, the model with the effects and the new values; `gap` before and after.
 
+    Raises
+    ------
+    StudyError
+        Data or parameters are missing, or do not fit together.
+    UnknownNameError
+        A name of a parameter, input, output or effect that is not there.
+    ComputationError
+        The data identify no parameter; an experiment that cannot be simulated is a SimulationError.
+
+    Examples
+    --------
     >>> import numpy as np, hvdc_ident as hi
     >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
     >>> plant = hi.apply_effects(lag, [{"effect": "delay", "at": "u", "parameters": {"T": 0.3}}])
@@ -485,9 +779,31 @@ def diagnose(
 def check(model: ModelLike, data: DataLike | None = None, parameters: ParametersLike | None = None) -> Summary:
     """Return what was found in a study, or in a model, data and parameters: rows, event, noise, levels before the event.
 
-    No stage is run; the model is, once an experiment, and what hinders a run or a fit is told. What does not hold together raises
-    an InputError: what, where, expected, got, what to try.
+    No stage is run; the model is, once an experiment, and what hinders a run or a fit is told.
 
+    Parameters
+    ----------
+    model : Model, Study, str or Path
+        A Study, or a Model, a shipped name or the path of a card, an FMU or a study.
+    data : Experiment, list of Experiment, Trajectory, Study, str or Path, default None
+        Experiments, a study, or a table whose columns are named like the model's inputs and outputs; or the path of one. None: a study's
+        own.
+    parameters : str, list or dict, default None
+        Names; or by name bounds (min, max), a start value, or a line as in a study's [parameters], in the parameter's unit. None: a study's
+        own.
+
+    Returns
+    -------
+    Summary
+        `sizes` of the model, `candidates`, `experiments` with rows, event, levels and noise, and `hindrances`; it prints itself.
+
+    Raises
+    ------
+    InputError
+        Something does not hold together: the error says what, where, expected, got, and what to try.
+
+    Examples
+    --------
     >>> import hvdc_ident as hi
     >>> hi.check("vsc-hvdc-link").to_dict()["sizes"]["states"]
     6
@@ -509,15 +825,37 @@ def export(
 ) -> Path:
     """Write a model or its linear model in the format of the path's ending, and return the path.
 
-    .toml, .fmu and .mo are the model, .ssv its parameters, .mat, .json, .csv and .m its linear model.
-    source: a Study, a Model, a shipped name, a path, or a LinearModel. linear: the linear model even for .mo.
-    fmu: version and kinds of an FMU. values: of a study "given", "start" or "fitted" (left out, the fitted ones where a fit
-    stands in its folder of results, `folder`); or a FitResult, or values by name. "fitted" are the values that count: with the
-    effect where a diagnosis in the folder named one, which the file then holds too; "effect" and "fit" are either of them. The
-    file says which it holds.
+    Parameters
+    ----------
+    source : Model, Study, LinearModel, str or Path
+        A Study, a Model, a shipped name, the path of a card, an FMU or a study, or a LinearModel.
+    path : str or Path
+        The file to be written. .toml, .fmu and .mo are the model, .ssv its parameters, .mat, .json, .csv and .m its linear model.
+    linear : bool, default False
+        True writes the linear model even for .mo.
+    fmu : FmuOptions, default None
+        Version and kinds of an FMU. None: FMI 2.0, model exchange and co-simulation.
+    values : str, dict of float or FitResult, default None
+        Of a study "given", "start" or "fitted"; or a FitResult, or values by name in the model's units. "fitted" are the values that count:
+        with the effect where a diagnosis in the folder named one, which the file then holds too; "effect" and "fit" are either of them.
+        None: the fitted ones where a fit stands in `folder`, else the given ones. The file says which it holds.
+    folder : str or Path, default None
+        The folder of results in which a fit may stand. None: the study's own.
 
-    Raises StudyError for an ending that is not known and where fitted values are asked for and none stand.
+    Returns
+    -------
+    Path
+        The file that was written.
 
+    Raises
+    ------
+    StudyError
+        An ending that is not known or does not suit what is written, or fitted values are asked for and none stand.
+    UnknownNameError
+        A value of a parameter that the model lacks.
+
+    Examples
+    --------
     >>> import tempfile, hvdc_ident as hi
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     hi.export("vsc-hvdc-link", f"{folder}/link.mat").name

@@ -146,8 +146,29 @@ class InputSignal:
 
 
 def step(before: float, after: float, *, at: float) -> InputSignal:
-    """Return the signal that jumps from one value to another at an instant, s.
+    """Return the signal that jumps from one value to another at an instant.
 
+    Parameters
+    ----------
+    before : float
+        The value until then, in the input's unit.
+    after : float
+        The value from then on, in the input's unit.
+    at : float
+        The instant, s.
+
+    Returns
+    -------
+    InputSignal
+        The signal; called with times in s it gives its values, at the jump the one after it.
+
+    Raises
+    ------
+    WaveformError
+        A number is not finite.
+
+    Examples
+    --------
     >>> import hvdc_ident as hi
     >>> hi.step(1.0, 1.019, at=0.1)([0.0, 0.1, 0.2]).tolist()
     [1.0, 1.019, 1.019]
@@ -156,8 +177,31 @@ def step(before: float, after: float, *, at: float) -> InputSignal:
 
 
 def ramp(before: float, after: float, *, start: float, end: float) -> InputSignal:
-    """Return the signal that moves along a line from one value to another between two instants, s.
+    """Return the signal that moves along a line from one value to another between two instants.
 
+    Parameters
+    ----------
+    before : float
+        The value until `start`, in the input's unit.
+    after : float
+        The value from `end` on, in the input's unit.
+    start : float
+        Where the line begins, s.
+    end : float
+        Where it ends, s; later than `start`.
+
+    Returns
+    -------
+    InputSignal
+        The signal; called with times in s it gives its values.
+
+    Raises
+    ------
+    WaveformError
+        The end is not after the start, or a number is not finite.
+
+    Examples
+    --------
     >>> import hvdc_ident as hi
     >>> hi.ramp(0.0, 1.0, start=1.0, end=3.0)([0.0, 2.0, 4.0]).tolist()
     [0.0, 0.5, 1.0]
@@ -178,12 +222,38 @@ def multisine(
     end: float,
     samples: int = 40,
 ) -> InputSignal:
-    """Return sines of one amplitude around a level, from `start` to `end` in s; the level before and after.
+    """Return sines of one amplitude around a level, from one instant to another; the level before and after.
 
-    frequencies: in Hz. Phases are Schroeder's, -pi k (k - 1) / n, which keep the peak of n sines low (Schroeder 1970);
-    the sum is shifted to begin at the level. samples: points joined by lines in a period of the fastest sine; 40 follow it
-    to 0.3 % of its amplitude.
+    Phases are Schroeder's, -pi k (k - 1) / n, which keep the peak of n sines low (Schroeder 1970); the sum is shifted to begin at the
+    level.
 
+    Parameters
+    ----------
+    level : float
+        The value around which the sines move, in the input's unit.
+    amplitude : float
+        Of every sine, in the input's unit.
+    frequencies : float or list of float
+        Of the sines, in Hz; above 0.
+    start : float
+        Where they begin, s.
+    end : float
+        Where they end, s; later than `start`.
+    samples : int, default 40
+        Points joined by lines in a period of the fastest sine; 40 follow it to 0.3 % of its amplitude.
+
+    Returns
+    -------
+    InputSignal
+        The signal; called with times in s it gives its values.
+
+    Raises
+    ------
+    WaveformError
+        There is no frequency, one is not above 0, or the end is not after the start.
+
+    Examples
+    --------
     >>> import hvdc_ident as hi
     >>> u = hi.multisine(1.0, 0.01, [2.0, 5.0], start=0.5, end=1.5)
     >>> float(u(0.4)), bool(abs(u(1.0) - 1.0) < 0.04)

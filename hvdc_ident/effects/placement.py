@@ -153,11 +153,32 @@ def apply_effects(model: AnyModel, uses: Iterable[EffectUse | Mapping[str, Any]]
 def apply_effects(model: AnyModel, uses: Iterable[EffectUse | Mapping[str, Any]]) -> AnyModel:
     """Return the model with the effects inserted one after the other; an effect at its neutral value changes nothing.
 
-    uses: `EffectUse` objects or dicts {"effect": name, "at": place or places, "parameters": {NAME: value}}.
+    Parameters
+    ----------
+    model : Model
+        The model; it stays as it is. An FMU takes the effects that act on its inputs and outputs.
+    uses : list of EffectUse or dict
+        `EffectUse` objects or dicts {"effect": name, "at": place or places, "parameters": {NAME: value}}. A place is an input, signal,
+        algebraic unknown, state or output; a value is in the effect's unit, or a text: the parameter of the model that replaces it.
 
-        >>> lagging = apply_effects(load_model("vsc-hvdc-link"), [{"effect": "lag", "at": "Ir1", "parameters": {"T": 0.002}}])
+    Returns
+    -------
+    Model
+        The model with the effects, whose parameters are named EFFECT_PLACE_NAME unless a use says otherwise.
 
-    Raises ModelError or UnknownNameError for an effect, parameters, places and signals that do not fit the model.
+    Raises
+    ------
+    ModelError
+        An effect, parameters or places that do not fit the model.
+    UnknownNameError
+        An effect, a parameter, a place or a signal that is not there.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> lagging = hi.apply_effects(hi.load_model("vsc-hvdc-link"), [{"effect": "lag", "at": "Ir1", "parameters": {"T": 0.002}}])
+    >>> [name for name in lagging.parameters if "Ir1" in name]
+    ['lag_Ir1_T']
     """
     if not isinstance(model, Model):
         return model.with_effects(uses)

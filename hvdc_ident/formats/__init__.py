@@ -94,11 +94,29 @@ def formats() -> dict[str, Format]:
 
 @in_python
 def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None = None) -> Trajectory:
-    """The waveforms of a file of any known format: time in s, signals in the file's units, NaN where not recorded.
+    """Return the waveforms of a file of any known format: time in s, signals in the file's units, NaN where not recorded.
 
-    signals: names wanted, in that order; None for all of them.
-    Raises WaveformError where the file cannot be used, UnknownNameError for a signal it does not have.
+    Parameters
+    ----------
+    path : str or Path
+        The file; its format is recognised by its content.
+    signals : list of str, default None
+        Names wanted, in that order. None: all of them.
 
+    Returns
+    -------
+    Trajectory
+        time (n,) in s, values (n, signals), names, and units as the file or a signal's name states them ("" where neither does).
+
+    Raises
+    ------
+    WaveformError
+        The file cannot be used.
+    UnknownNameError
+        A signal that the file does not have.
+
+    Examples
+    --------
     >>> import tempfile
     >>> from pathlib import Path
     >>> from hvdc_ident import read_waveforms

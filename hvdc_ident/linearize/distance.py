@@ -35,8 +35,31 @@ class NuGap(Coded):
 def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
     """Return the nu-gap metric with its winding condition (Vinnicombe 1993, doi 10.1109/9.231459); delays exact on the axis.
 
-    Scale inputs and outputs first so that 1 has equal weight in each (`LinearModel.scaled`). Raises LinearizationError
-    where the numbers of channels differ.
+    Parameters
+    ----------
+    first : LinearModel
+        A model, its inputs and outputs scaled so that 1 has equal weight in each (`LinearModel.scaled`).
+    second : LinearModel
+        The other one, with as many inputs and outputs, scaled alike.
+
+    Returns
+    -------
+    NuGap
+        `value` in [0, 1]; `omega` in rad/s, where the chordal distance of the frequency responses is largest; that `distance`; `winding`,
+        the count that must be 0; where it is not, the value is 1.
+
+    Raises
+    ------
+    LinearizationError
+        The numbers of channels differ, the number of a model's unstable poles is not known, or there is no limit at high frequency.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> found = hi.linear.nu_gap(hi.linearize(lag), hi.linearize(lag, values={"k": 1.0}))
+    >>> round(found.value, 3), found.winding
+    (0.333, 0)
     """
     same_channels(first, second)
     grid = np.unique(np.concatenate([wide_omega(first, 2000), wide_omega(second, 2000)]))
@@ -135,10 +158,33 @@ def _wound(one: Characteristic, two: Characteristic, through: Array, axis: Array
 def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Peak:
     """Return the normalised coprime factor margin b(P, C) of a negative feedback loop, in [0, 1], and where it is least.
 
-    1/b is the H-infinity norm of [I; C] (I + P C)^-1 [I, P]; b is 0 where the loop is not stable. A controller with
-    margin b suits every plant within a nu-gap below b of P. Without a controller: the largest margin that any
-    controller attains, sqrt(1 - |[M; N]|_H^2) (Glover and McFarlane 1989), whose omega is nan. Scale first, as for
-    `nu_gap`. Raises LinearizationError where the sizes do not fit, or the loop is ill-posed.
+    1/b is the H-infinity norm of [I; C] (I + P C)^-1 [I, P]; b is 0 where the loop is not stable. A controller with margin b suits every
+    plant within a nu-gap below b of P.
+
+    Parameters
+    ----------
+    plant : LinearModel
+        P, its inputs and outputs scaled so that 1 has equal weight in each (`LinearModel.scaled`).
+    controller : LinearModel, default None
+        C, from the plant's outputs to its inputs, with the sign of negative feedback, scaled alike. None: the largest margin that any
+        controller attains, sqrt(1 - |[M; N]|_H^2) (Glover and McFarlane 1989).
+
+    Returns
+    -------
+    Peak
+        `value`, b, and `omega` in rad/s, where it is least; nan without a controller.
+
+    Raises
+    ------
+    LinearizationError
+        The sizes do not fit, the loop is ill-posed, or whether it is stable cannot be told.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> plant, controller = hi.linear.plant_and_controller(hi.load_model("vsc-hvdc-link"), ["Irorder1"], ["Vdc1_m"])
+    >>> hi.linear.ncf_margin(plant, controller).value <= hi.linear.ncf_margin(plant).value
+    True
     """
     if controller is None:
         return Peak(_attainable(plant), float("nan"))
@@ -246,9 +292,27 @@ class ModelDistance(Coded):
 def compare(first: LinearModel, second: LinearModel) -> ModelDistance:
     """Return how far two models with the same inputs and outputs are apart.
 
-    Every number depends on units: scale both first (`LinearModel.scaled`) so that 1 matters equally in each channel.
-    Raises LinearizationError where the numbers of inputs or outputs differ.
+    Parameters
+    ----------
+    first : LinearModel
+        A model. Every number depends on units: scale both first (`LinearModel.scaled`) so that 1 matters equally in each channel.
+    second : LinearModel
+        The other one, with as many inputs and outputs, scaled alike.
 
+    Returns
+    -------
+    ModelDistance
+        `nu_gap` in [0, 1]; `attainable`, the largest margin that a controller of the first attains; `difference`, the L-infinity norm of
+        first - second in output per input units; `relative`, that over the norm of the first. What cannot be computed is None, and
+        `notes` say why.
+
+    Raises
+    ------
+    LinearizationError
+        The numbers of inputs or outputs differ, or the nu-gap cannot be told.
+
+    Examples
+    --------
     >>> from hvdc_ident import linearize, load_model
     >>> from hvdc_ident.linear import compare
     >>> link = load_model("vsc-hvdc-link")

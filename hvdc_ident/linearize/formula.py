@@ -57,8 +57,44 @@ def symbolic_transfer(
 ) -> SymbolicTransfer:
     """Return the transfer function between an input and an output (or signal) with some parameters as symbols.
 
-    together: parameters shown as one symbol, such as {"C1": "C", "C2": "C"}. Only the states that lie between input and
-    output count. Raises UnknownNameError, and LinearizationError where more than six states do, or for delays.
+    Only the states that lie between input and output count. The operating point is held: it does not move with the symbols.
+
+    Parameters
+    ----------
+    model : Model
+        A model with equations.
+    input : str
+        Name of the input.
+    output : str
+        Name of an output or signal.
+    parameters : list of str
+        The parameters that stay symbols.
+    point : OperatingPoint, default None
+        Where. None: the steady state.
+    together : dict of str, default None
+        Parameters shown as one symbol, such as {"C1": "C", "C2": "C"}.
+
+    Returns
+    -------
+    SymbolicTransfer
+        `numerator` and `denominator`, sympy expressions in s (rad/s) and the symbols; other numbers are right to 15 digits.
+
+    Raises
+    ------
+    UnknownNameError
+        An input, output or parameter that the model lacks.
+    SteadyStateError
+        There is no steady state, where no point is given.
+    LinearizationError
+        More than six states lie between input and output, or the model has delays.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> found = hi.linear.symbolic_transfer(lag, "u", "y", ["T"])
+    >>> found.rounded(3)
+    ('2.00', 'T*s + 1.0')
     """
     if model.delays or model.sampled:
         raise LinearizationError("a model with delays has no rational formula", where=f"model '{model.name}'")

@@ -67,10 +67,39 @@ class Port:
 def port_impedance(
     model: Model, port: Port, omega: Sequence[float] | Array, point: OperatingPoint | None = None
 ) -> FrequencyResponse:
-    """Return the impedance seen at a port at omega, rad/s: (n, 2, 2) over [d, q] in the network's frame, or (n, 1, 1).
+    """Return the impedance seen at a port, delays exact.
 
-    In voltage unit per current unit, delays exact. Raises UnknownNameError for a signal that is not there,
-    LinearizationError where the disturbance drives no current.
+    Parameters
+    ----------
+    model : Model
+        A model with equations.
+    port : Port
+        The disturbed source, and voltage and current at the port, the current counted towards what is to be seen.
+    omega : array of float (n,)
+        Frequencies in rad/s.
+    point : OperatingPoint, default None
+        Where: its inputs and parameters hold, and the search begins at its states. None: the model's steady state.
+
+    Returns
+    -------
+    FrequencyResponse
+        values (n, 2, 2) over [d, q] in the network's frame, or (n, 1, 1) of a dc port, complex, in voltage unit per current unit.
+
+    Raises
+    ------
+    UnknownNameError
+        A signal that is not there.
+    SteadyStateError
+        There is no steady state.
+    LinearizationError
+        The disturbance drives no current, or the point lies on a kink.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> port = hi.linear.Port(source=("Iload1",), voltage=("Vdc1",), current=("-Iload1",))
+    >>> hi.linear.port_impedance(hi.load_model("vsc-hvdc-link"), port, [1.0, 10.0]).values.shape
+    (2, 1, 1)
     """
     return port_response(port_model(model, port, point), port, omega, "impedance")
 
@@ -78,7 +107,41 @@ def port_impedance(
 def port_admittance(
     model: Model, port: Port, omega: Sequence[float] | Array, point: OperatingPoint | None = None
 ) -> FrequencyResponse:
-    """Return the admittance seen at a port, the inverse of `port_impedance`; raises as it does."""
+    """Return the admittance seen at a port, the inverse of `port_impedance`, delays exact.
+
+    Parameters
+    ----------
+    model : Model
+        A model with equations.
+    port : Port
+        The disturbed source, and voltage and current at the port, the current counted towards what is to be seen.
+    omega : array of float (n,)
+        Frequencies in rad/s.
+    point : OperatingPoint, default None
+        Where: its inputs and parameters hold, and the search begins at its states. None: the model's steady state.
+
+    Returns
+    -------
+    FrequencyResponse
+        values (n, 2, 2) over [d, q] in the network's frame, or (n, 1, 1) of a dc port, complex, in current unit per voltage unit.
+
+    Raises
+    ------
+    UnknownNameError
+        A signal that is not there.
+    SteadyStateError
+        There is no steady state.
+    LinearizationError
+        The disturbance drives no voltage, or the point lies on a kink.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> link, port = hi.load_model("vsc-hvdc-link"), hi.linear.Port(source=("Iload1",), voltage=("Vdc1",), current=("-Iload1",))
+    >>> y, z = (of(link, port, [1.0, 10.0]).values for of in (hi.linear.port_admittance, hi.linear.port_impedance))
+    >>> bool(abs(y * z - 1.0).max() < 1e-9)
+    True
+    """
     return port_response(port_model(model, port, point), port, omega, "admittance")
 
 
@@ -335,9 +398,41 @@ def response_at_tones(
 ) -> FrequencyResponse:
     """Return the response at the frequencies at which a record was perturbed, by least squares on both signals.
 
-    time: (n,) s, rows may be uneven. omega: (k,) rad/s. Each signal is a constant, a drift and a sine at each frequency;
-    what is left of it gives the standard deviation, as white noise. Raises WaveformError for too few rows, a frequency
-    that the record is too short for, or one at which the input does not move.
+    Each signal is a constant, a drift and a sine at each frequency; what is left of it gives the standard deviation, as white noise.
+
+    Parameters
+    ----------
+    time : array of float (n,)
+        In s; rows may be uneven.
+    u : array of float (n,)
+        The recorded input, in its unit.
+    y : array of float (n,)
+        The recorded output, in its unit.
+    omega : array of float (k,)
+        The frequencies, in rad/s.
+    input : str, default "u"
+        The input's name in the result.
+    output : str, default "y"
+        The output's name in the result.
+
+    Returns
+    -------
+    FrequencyResponse
+        values (k, 1, 1), complex, in output unit per input unit, and std (k, 1, 1), the standard deviation of the error's modulus.
+
+    Raises
+    ------
+    WaveformError
+        Too few rows or a value not finite, a record too short to tell the frequencies apart, or one at which the input does not move.
+
+    Examples
+    --------
+    >>> import numpy as np, hvdc_ident as hi
+    >>> t = np.linspace(0.0, 10.0, 2001)
+    >>> u = np.sin(2 * np.pi * t)
+    >>> found = hi.linear.response_at_tones(t, u, 2 * u + 0.1, np.array([2 * np.pi]))
+    >>> round(float(found.magnitude[0, 0, 0]), 9)
+    2.0
     """
     t, u, y = (np.asarray(v, dtype=float) for v in (time, u, y))
     w = np.atleast_1d(np.asarray(omega, dtype=float))
@@ -380,9 +475,43 @@ def response_from_record(
 ) -> FrequencyResponse:
     """Return the response from recorded input to recorded output by Welch's averages, with coherence and standard deviation.
 
-    time: (n,) s; uneven rows are put on an even grid by straight lines. segments: how many, half overlapped; more give
-    a surer and coarser estimate. The standard deviation is sqrt((1 - g2)/(2 k g2)) |H| (Bendat and Piersol, 9.2) with k
-    the effective number of averages. Raises WaveformError for data that are too short, constant or not finite.
+    The standard deviation is sqrt((1 - g2)/(2 k g2)) |H| (Bendat and Piersol, 9.2) with g2 the coherence and k the effective number of
+    averages.
+
+    Parameters
+    ----------
+    time : array of float (n,)
+        In s; uneven rows are put on an even grid by straight lines.
+    u : array of float (n,)
+        The recorded input, in its unit.
+    y : array of float (n,)
+        The recorded output, in its unit.
+    input : str, default "u"
+        The input's name in the result.
+    output : str, default "y"
+        The output's name in the result.
+    segments : int, default 8
+        How many, half overlapped; more give a surer and coarser estimate. n is at least 16 times as many.
+    window : str, default "hann"
+        The window of each segment, by its name in `scipy.signal.get_window`.
+
+    Returns
+    -------
+    FrequencyResponse
+        omega (k,) in rad/s, values (k, 1, 1), complex, in output unit per input unit, std and coherence (k, 1, 1).
+
+    Raises
+    ------
+    WaveformError
+        The data are too short, constant or not finite.
+
+    Examples
+    --------
+    >>> import numpy as np, hvdc_ident as hi
+    >>> t, u = np.arange(4000) * 0.01, np.random.default_rng(0).standard_normal(4000)
+    >>> found = hi.linear.response_from_record(t, u, 2 * u)
+    >>> bool(abs(found.magnitude - 2.0).max() < 1e-9), found.coherence.shape == found.values.shape
+    (True, True)
     """
     import scipy.signal
 
@@ -432,11 +561,50 @@ def simulated_response(
 ) -> FrequencyResponse:
     """Return the response measured on the nonlinear model by a multisine about its steady state: a check on the linear one.
 
-    omega: wanted frequencies, rad/s; each is moved to a multiple of one base frequency, so read them from the result.
-    amplitude: of every sine, in the input's unit, small enough for no limit to act and large enough for the solver's
-    tolerance. Transients are waited for as long as the linear model's slowest stable mode asks.
+    Transients are waited for as long as the linear model's slowest stable mode asks.
 
-    Raises UnknownNameError, LinearizationError for an unstable point, SimulationError.
+    Parameters
+    ----------
+    model : Model
+        A model with equations.
+    input : str
+        The input that the multisine is added to.
+    outputs : list of str
+        Names of outputs or signals.
+    omega : array of float (n,)
+        Wanted frequencies, in rad/s; each is moved to a multiple of the lowest one, so read them from the result.
+    amplitude : float
+        Of every sine, in the input's unit, small enough for no limit to act and large enough for the solver's tolerance.
+    values : dict of float, default None
+        Values of parameters and inputs by name, in the model's units, where they differ from the model's.
+    periods : int, default 1
+        How many periods of the lowest frequency are measured.
+    rtol : float, default 1e-9
+        Relative error of the integration; the absolute one is rtol / 100.
+    seed : int, default 0
+        Of the phases of the sines; same seed, same result.
+
+    Returns
+    -------
+    FrequencyResponse
+        omega (k,) in rad/s and values (k, outputs, 1), complex, in output unit per input unit.
+
+    Raises
+    ------
+    UnknownNameError
+        An input or output that the model lacks.
+    LinearizationError
+        The operating point is unstable, or there is no frequency or amplitude above 0.
+    SimulationError
+        The run stops early.
+
+    Examples
+    --------
+    >>> import numpy as np, hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> found = hi.linear.simulated_response(lag, "u", ["y"], [2.0, 6.0], 0.01)
+    >>> bool(np.allclose(found.values[:, 0, 0], 2.0 / (1.0 + 0.5j * found.omega), rtol=1e-5))
+    True
     """
     from hvdc_ident.simulate import simulate
 

@@ -58,7 +58,45 @@ def one_sided(
     sensitivities: Sequence[str] = (),
     descriptor: bool = False,
 ) -> tuple[LinearModel, LinearModel]:
-    """Return the linear models below and above the limit on which a point lies; equal where it lies on none."""
+    """Return the linear models below and above the limit on which a point lies; equal where it lies on none.
+
+    Parameters
+    ----------
+    model : Model
+        The model.
+    point : OperatingPoint
+        Where it is linearised.
+    inputs : list of str, default None
+        Names of inputs. None: all.
+    outputs : list of str, default None
+        Names of outputs or signals. None: all outputs.
+    pade_order : int, default None
+        Order of the Pade approximant of every delay in the state space. None: 5. Frequency responses take delays exactly.
+    sensitivities : list of str, default ()
+        Parameters whose exact derivatives of A, B, C, D come along, the shift of the operating point included.
+    descriptor : bool, default False
+        True keeps the algebraic unknowns as states, with E.
+
+    Returns
+    -------
+    tuple of LinearModel
+        (below, above), in the model's units, time in s.
+
+    Raises
+    ------
+    UnknownNameError
+        A name that the model lacks.
+    LinearizationError
+        An algebraic loop is ill-posed, or an entry is not finite.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> limited = hi.Model("limited", inputs={"u": 1.0}, states={"x": "clip(u, -1, 1) - x"}, outputs={"y": "x"})
+    >>> below, above = hi.linear.one_sided(limited, hi.find_operating_point(limited))
+    >>> below.B.tolist(), above.B.tolist()
+    ([[1.0]], [[0.0]])
+    """
 
     def at(side: Side) -> LinearModel:
         return linearize(

@@ -117,8 +117,35 @@ def loop(
 ) -> Loop:
     """Return the loop opened at a named signal, unknown or state, or several opened together, at the operating point.
 
-    point: of the closed model; default, its steady state.
+    Parameters
+    ----------
+    model : Model
+        The closed model, with equations.
+    signal : str or list of str
+        Where the loop is opened; of a state between its integrator and its readers.
+    point : OperatingPoint, default None
+        Of the closed model. None: its steady state.
+    sensitivities : list of str, default ()
+        Parameters whose exact derivatives of the loop's A, B, C, D come along, the shift of the operating point included.
+    pade_order : int, default None
+        Order of the Pade approximant of every delay in the state space. None: 5. Frequency responses and margins take delays exactly.
 
+    Returns
+    -------
+    Loop
+        `open`: the linear model L from what is injected at the signals to minus what comes back; det(1 + L) = 0 closes it.
+
+    Raises
+    ------
+    UnknownNameError
+        A signal that the model lacks.
+    SteadyStateError
+        There is no steady state, where no point is given.
+    LinearizationError
+        The signal is an input, stands twice, or none is named; the point lies on a kink, or an algebraic loop is ill-posed.
+
+    Examples
+    --------
     >>> from hvdc_ident import load_model
     >>> from hvdc_ident.linear import loop, margins
     >>> opened = loop(load_model("vsc-hvdc-link"), "Irorder1")
@@ -151,11 +178,38 @@ def loop(
 def plant_and_controller(
     model: Model, inputs: Sequence[str], outputs: Sequence[str], point: OperatingPoint | None = None
 ) -> tuple[LinearModel, LinearModel]:
-    """Return (plant, controller) of a closed model, cut at the signals that go into the plant and those measured on it.
+    """Return the plant and the controller of a closed model, cut at the signals that go into the plant and those measured on it.
 
-    inputs, outputs: names of signals, unknowns or states. The plant is what lies between inputs and outputs with both cut,
-    the controller what lies between outputs and inputs, with the sign of negative feedback. Raises LinearizationError
-    where there is a way from inputs to inputs, or outputs to outputs, that passes neither: the cut does not part them.
+    Parameters
+    ----------
+    model : Model
+        The closed model, with equations.
+    inputs : list of str
+        Names of the signals, unknowns or states that go into the plant.
+    outputs : list of str
+        Names of the signals, unknowns or states measured on the plant.
+    point : OperatingPoint, default None
+        Of the closed model. None: its steady state.
+
+    Returns
+    -------
+    tuple of LinearModel
+        (plant, controller). The plant is what lies between inputs and outputs with both cut, the controller what lies between outputs and
+        inputs, with the sign of negative feedback.
+
+    Raises
+    ------
+    UnknownNameError
+        A signal that the model lacks.
+    LinearizationError
+        A way leads from inputs to inputs, or outputs to outputs, that passes neither: the cut does not part them.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> plant, controller = hi.linear.plant_and_controller(hi.load_model("vsc-hvdc-link"), ["Irorder1"], ["Vdc1_m"])
+    >>> plant.input_names, controller.input_names
+    (('Irorder1',), ('Vdc1_m',))
     """
     both = loop(model, (*inputs, *outputs), point).open
     back = both.negated()
@@ -352,9 +406,32 @@ def _disk_text(disk: Crossing) -> str:
 
 
 def margins(loop: Loop | LinearModel, omega: Array | None = None) -> Margins:
-    """Return the margins of one loop (1 + L = 0), searched on a grid around its poles (or omega, rad/s) and refined.
+    """Return the margins of one loop (1 + L = 0), searched on a grid around its poles and refined.
 
-    Raises LinearizationError for a model with more than one input or output.
+    Parameters
+    ----------
+    loop : Loop or LinearModel
+        The loop, or the linear model L from what is injected to minus what comes back.
+    omega : array of float (n,), default None
+        The grid, in rad/s. None: around the open and closed poles.
+
+    Returns
+    -------
+    Margins
+        `gain_margin` (a factor), `phase_margin` (degrees), `delay` (s), `modulus` (the smallest |1 + L|), `disk` (alpha), each with its
+        frequency in rad/s, and whether the closed loop is stable, delays exact; without stability margins are nan.
+
+    Raises
+    ------
+    LinearizationError
+        The model has more than one input or output, or the loop is ill-posed.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> found = hi.linear.margins(hi.linear.loop(hi.load_model("vsc-hvdc-link"), "Irorder1"))
+    >>> found.stable, round(found.phase_margin.value, 1)
+    (True, 65.3)
     """
     model = loop.open if isinstance(loop, Loop) else loop
     if len(model.input_names) != 1 or len(model.output_names) != 1:
@@ -406,8 +483,32 @@ def open_equation(model: LinearModel) -> Characteristic:
 def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMargins:
     """Return the margins of several loops opened together (det(1 + L) = 0), each alone and all at once.
 
-    A loop alone has the others closed: 1 + L_i = 1/S_ii with S = (1 + L)^-1. Raises LinearizationError where there are
-    not as many inputs as outputs, or the loops are ill-posed.
+    A loop alone has the others closed: 1 + L_i = 1/S_ii with S = (1 + L)^-1.
+
+    Parameters
+    ----------
+    loop : Loop or LinearModel
+        The loops, or the linear model L from what is injected to minus what comes back, with as many inputs as outputs.
+    omega : array of float (n,), default None
+        The grid on which margins are searched, in rad/s. None: around the open and closed poles.
+
+    Returns
+    -------
+    LoopMargins
+        `each`, the margins of every loop alone by signal; `disk`, alpha of the disk in which all gains and phases may vary at once (a
+        bound from below, exact for up to three loops); whether the closed loops are stable, delays exact.
+
+    Raises
+    ------
+    LinearizationError
+        There are not as many inputs as outputs, or the loops are ill-posed.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> found = hi.linear.loop_margins(hi.linear.loop(hi.load_model("vsc-hvdc-link"), ["Irorder1", "Irorder2"]))
+    >>> list(found.each), found.stable
+    (['Irorder1', 'Irorder2'], True)
     """
     model = loop.open if isinstance(loop, Loop) else loop
     names = model.input_names

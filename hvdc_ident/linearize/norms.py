@@ -37,8 +37,29 @@ class Peak(Coded):
 def linf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     """Return the L-infinity norm, max over w of the largest singular value of G(jw), stable or not.
 
-    Raises LinearizationError where a pole that the inputs reach and the outputs see lies on the imaginary axis: the norm is
-    infinite.
+    Parameters
+    ----------
+    model : LinearModel
+        G, its inputs and outputs in the units in which the norm is wanted (`LinearModel.scaled`).
+    tolerance : float, default 1e-13
+        The relative error at which the search ends.
+
+    Returns
+    -------
+    Peak
+        `value`, the norm, in output per input units, and `omega` in rad/s, where it is (0 and infinity are places).
+
+    Raises
+    ------
+    LinearizationError
+        A pole that the inputs reach and the outputs see lies on the imaginary axis: the norm is infinite.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> unstable = hi.Model("unstable", inputs={"u": 0.0}, states={"x": "3*u + x"}, outputs={"y": "x"})
+    >>> round(hi.linear.linf_norm(hi.linearize(unstable)).value, 9)
+    3.0
     """
     equation = _clear_of_axis(model)
     return largest_gain(equation, wide_omega(model, 4000 if equation.channels else 400), tolerance)
@@ -104,7 +125,30 @@ def largest_gain(equation: Characteristic, omega: Array, tolerance: float = 1e-1
 def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     """Return the H-infinity norm: the L-infinity norm of a stable model.
 
-    Raises LinearizationError where a pole that inputs reach and outputs see is not stable.
+    Parameters
+    ----------
+    model : LinearModel
+        G, its inputs and outputs in the units in which the norm is wanted (`LinearModel.scaled`).
+    tolerance : float, default 1e-13
+        The relative error at which the search ends.
+
+    Returns
+    -------
+    Peak
+        `value`, the largest singular value of G(jw), in output per input units, and `omega` in rad/s, where it is.
+
+    Raises
+    ------
+    LinearizationError
+        A pole that inputs reach and outputs see is not stable.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> found = hi.linear.hinf_norm(hi.linearize(lag))
+    >>> round(found.value, 9), found.omega  # the gain at rest
+    (2.0, 0.0)
     """
     _refuse_unstable(model, "an unstable model has no H-infinity norm")
     return linf_norm(model, tolerance)
@@ -133,10 +177,33 @@ AGREE = 1e-4
 
 
 def h2_norm(model: LinearModel) -> float:
-    """Return the H2 norm, by a Gramian. Raises LinearizationError where it is infinite: unstable, or D not 0.
+    """Return the H2 norm, by a Gramian.
 
-    Delays stand as their Pade approximants in the value, not in the verdict on stability. Both Gramians give it: where they do not
-    agree rounding has taken its digits, and LinearizationError is raised too.
+    It is the square root of the integral of trace(G(jw)* G(jw)) dw / (2 pi). Delays stand as their Pade approximants in the value, not in
+    the verdict on stability.
+
+    Parameters
+    ----------
+    model : LinearModel
+        G, its inputs and outputs in the units in which the norm is wanted (`LinearModel.scaled`).
+
+    Returns
+    -------
+    float
+        The norm, in output unit per input unit and square root of s.
+
+    Raises
+    ------
+    LinearizationError
+        The norm is infinite (the model is unstable, or D is not 0), or both Gramians, which give it, do not agree: rounding has taken its
+        digits.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> round(hi.linear.h2_norm(hi.linearize(lag)), 9)  # k / sqrt(2 T)
+    2.0
     """
     _refuse_unstable(model, "the H2 norm is infinite: the model is not stable")
     a, b, c, d = without_sliding_means(model)

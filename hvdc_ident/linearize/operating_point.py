@@ -81,8 +81,37 @@ def point_at(
 ) -> OperatingPoint:
     """Return the operating point at given states, which need not be at rest; unknowns are solved for.
 
-    Raises UnknownNameError for a name that is not a state, input or parameter, or a state left out; SteadyStateError
-    where the unknowns have no solution.
+    Parameters
+    ----------
+    model : Model
+        The model, or an FMU.
+    states : dict of float
+        The value of every state by name, in the model's units.
+    inputs : dict of float, default None
+        Values of inputs by name, in the model's units. An input that is not named keeps the model's value.
+    parameters : dict of float, default None
+        Values of parameters by name, in the model's units, where they differ from the model's.
+    time : float, default 0.0
+        The instant, s.
+
+    Returns
+    -------
+    OperatingPoint
+        The values of states, unknowns, inputs, outputs and parameters by name, in the model's units.
+
+    Raises
+    ------
+    UnknownNameError
+        A name that is not a state, input or parameter, or a state left out.
+    SteadyStateError
+        The unknowns have no solution.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> hi.linear.point_at(lag, {"x": 0.7}, {"u": 1.0}).outputs["y"]  # on the way to 2
+    0.7
     """
     missing = [n for n in model.states if n not in states]
     if missing:
@@ -96,7 +125,37 @@ def continuation(
 ) -> tuple[OperatingPoint, ...]:
     """Return the operating points along values of one parameter or input, each searched from the one before.
 
-    A step that fails is halved up to ten times on the way. Raises SteadyStateError with the last value reached.
+    A step that fails is halved up to ten times on the way.
+
+    Parameters
+    ----------
+    model : Model
+        The model, or an FMU.
+    name : str
+        The parameter or input that moves.
+    values : list of float
+        Its values, in its unit, in the order in which they are gone through.
+    fixed : dict of float, default None
+        Values of other parameters and inputs (or of states and signals that are to hold), in the model's units.
+
+    Returns
+    -------
+    tuple of OperatingPoint
+        One for each value.
+
+    Raises
+    ------
+    UnknownNameError
+        A name that the model lacks.
+    SteadyStateError
+        There is no operating point at a value; the error names the last value reached.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> points = hi.linear.continuation(hi.load_model("vsc-hvdc-link"), "Pref2", [0.2, 0.4, 0.6])
+    >>> [round(point.outputs["P2"], 9) for point in points]
+    [0.2, 0.4, 0.6]
     """
     if name not in model.parameters and name not in model.inputs:
         raise unknown_name("parameter or input", name, (*model.parameters, *model.inputs), where="continuation")

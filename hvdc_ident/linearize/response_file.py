@@ -48,12 +48,36 @@ class ResponseFile:
 def read_response(path: str | Path) -> ResponseFile:
     """Return the frequency response of a file.
 
-    Text: a titled column of frequencies (Hz; kHz, omega or rad/s where the title says so), and for each channel one column
-    of complex numbers ("1.2-0.3j"), or two: re and im, or mag (or dB) and phase (degrees, or rad); std for its standard
-    deviation. Frequencies that stand several times are repeated sweeps: the mean counts, and its scatter.
-    Touchstone (.s1p, .s2p, .sNp): S, Y or Z parameters; S are turned into Z.
+    Text: a titled column of frequencies (Hz; kHz, omega or rad/s where the title says so), and for each channel one column of complex
+    numbers ("1.2-0.3j"), or two: re and im, or mag (or dB) and phase (degrees, or rad); std for its standard deviation. Frequencies that
+    stand several times are repeated sweeps: the mean counts, and its scatter. Touchstone (.s1p, .s2p, .sNp): S, Y or Z parameters; S are
+    turned into Z.
 
-    Raises WaveformError for a file that is neither, or has a number missing.
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    ResponseFile
+        omega (n,) in rad/s, rising; `channels`, (n,) complex by name, in the file's units; `std`, (n,) by name where it is known.
+
+    Raises
+    ------
+    WaveformError
+        A file that is neither, or has a number missing.
+
+    Examples
+    --------
+    >>> import tempfile, hvdc_ident as hi
+    >>> from pathlib import Path
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     scan = Path(folder, "scan.csv")
+    ...     _ = scan.write_text("f_Hz,Z_re,Z_im\\n1,0.1,0.2\\n10,0.1,2.0\\n")
+    ...     found = hi.linear.read_response(scan)
+    >>> list(found.channels), found.channels["Z"].tolist()
+    (['Z'], [(0.1+0.2j), (0.1+2j)])
     """
     file = Path(path)
     try:

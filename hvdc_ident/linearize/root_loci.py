@@ -66,8 +66,38 @@ def root_locus(
 ) -> RootLocus:
     """Return the eigenvalues of the model along values of a parameter (or input), each at its own operating point.
 
-    Raises UnknownNameError, SteadyStateError with the value at which there is no operating point, and
-    LinearizationError on a kink.
+    Parameters
+    ----------
+    model : Model
+        A model with equations.
+    parameter : str
+        The parameter or input that moves.
+    values : array of float (n,)
+        Its values, in its unit.
+    fixed : dict of float, default None
+        Values of other parameters and inputs (or of states and signals that are to hold), in the model's units.
+
+    Returns
+    -------
+    RootLocus
+        eigenvalues (n, modes) in rad/s, column k one mode throughout, `stable` (n,), and `limits`, the values at which stability is lost or
+        won. With delays the columns are the rightmost roots of the exact characteristic equation.
+
+    Raises
+    ------
+    UnknownNameError
+        The parameter, or another name, is not in the model.
+    SteadyStateError
+        There is no operating point at a value, which the error names.
+    LinearizationError
+        There are no finite values, or a point lies on a kink.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> locus = hi.linear.root_locus(hi.load_model("vsc-hvdc-link"), "KPVDC", [1.0, 24.0, 100.0])
+    >>> locus.eigenvalues.shape, locus.stable.tolist()
+    ((3, 6), [True, True, True])
     """
     if parameter not in model.parameters and parameter not in model.inputs:
         raise unknown_name(

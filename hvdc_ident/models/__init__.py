@@ -76,14 +76,37 @@ def load_model(
     interface: Literal["model-exchange", "co-simulation"] | None = None,
     limits: Limits | Mapping[str, float] | None = None,
 ) -> AnyModel:
-    """Return a shipped model by name, or the model of a file: a model card (.toml), an FMU (.fmu), or Python (.py, needs trust).
+    """Return a shipped model by name, or the model of a file.
 
-    Python runs its code here; an FMU runs its own in a process of its own, which contains crashes, not malice: load
-    only FMUs you trust. interface: of an FMU that offers both (default: model exchange). limits: of an FMU's process, as
-    {"deadline": 300.0, "load": 60.0, "memory": 4096}: s for one run, s to begin, and MiB.
+    A Python file runs its code here; an FMU runs its own in a process of its own, which contains crashes, not malice: load only FMUs
+    you trust.
 
-    Raises UnknownNameError for a name that is not shipped and ModelError for a file that cannot be used.
+    Parameters
+    ----------
+    source : str or Path
+        The name of a shipped model, or the path of a model card (.toml), an FMU (.fmu) or a Python file (.py, needs `trust`).
+    trust : bool, default False
+        Whether a Python file may be run.
+    interface : "model-exchange" or "co-simulation", default None
+        Of an FMU that offers both. None: model exchange.
+    limits : Limits or dict of float, default None
+        Of an FMU's process, as {"deadline": 300.0, "load": 60.0, "memory": 4096}: s for one run, s to begin, and MiB. None: 60 s,
+        60 s and 2048 MiB.
 
+    Returns
+    -------
+    Model
+        The model; of an FMU an object that is used like one.
+
+    Raises
+    ------
+    UnknownNameError
+        A name that is not shipped.
+    ModelError
+        A file that cannot be used, or limits of a model that is no FMU.
+
+    Examples
+    --------
     >>> from hvdc_ident import load_model
     >>> link = load_model("vsc-hvdc-link")
     >>> list(link.states)

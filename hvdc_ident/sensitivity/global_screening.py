@@ -117,10 +117,49 @@ def morris(
     seed: int = 0,
     **options: Any,
 ) -> ScreeningResult:
-    """Return elementary effects of the RMSE over the ranges: trajectories (k + 1) runs for k parameters; same seed, same result.
+    """Return elementary effects of the RMSE over the ranges (Morris 1991, doi 10.1080/00401706.1991.10484804), through SALib.
 
-    ranges: (min, max) by parameter, in its unit. A trajectory with a failed run is left out and counted. options: as in
-    `sweep`. Raises InputError where SALib is not installed, ComputationError where no trajectory is whole.
+    It takes trajectories (k + 1) runs for k parameters. A trajectory with a failed run is left out and counted.
+
+    Parameters
+    ----------
+    model : Model
+        The model, or an FMU.
+    experiments : list of Experiment
+        The recordings with which the runs are compared.
+    ranges : dict of (float, float)
+        (min, max) by parameter, in its unit.
+    trajectories : int, default 20
+        How many, at least 2.
+    seed : int, default 0
+        Of the points; same seed, same result.
+    **options
+        Arguments of `hvdc_ident.sensitivity.sweep`: against, outputs, values, executor, progress.
+
+    Returns
+    -------
+    ScreeningResult
+        By output, experiment and parameter mu_star, mu, sigma and mu_star_conf, in the output's unit over the whole range; `failed` points
+        and `dropped` trajectories.
+
+    Raises
+    ------
+    InputError
+        SALib is not installed.
+    StudyError
+        Ranges that are not finite with min < max, or too few trajectories.
+    ComputationError
+        Fewer than two trajectories are whole.
+
+    Examples
+    --------
+    >>> import numpy as np, hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> t, u = np.linspace(0.0, 5.0, 51), {"u": hi.step(0.0, 1.0, at=1.0)}
+    >>> record = hi.Experiment(t, "step", inputs=u, outputs={"y": hi.simulate(lag, t, inputs=u)["y"]})
+    >>> found = hi.sensitivity.morris(lag, [record], {"T": (0.9, 1.1), "k": (1.0, 3.0)}, trajectories=4)
+    >>> found.evaluations, list(found.of("y", "step"))  # k matters most
+    (12, ['k', 'T'])
     """
     library("SALib", "global screening", "'hvdc_ident[screening]'")
     from SALib.analyze import morris as analyse
@@ -152,10 +191,48 @@ def sobol(
     seed: int = 0,
     **options: Any,
 ) -> ScreeningResult:
-    """Return first-order and total shares of the RMSE's variance over the ranges: samples (k + 2) runs; same seed, same result.
+    """Return first-order and total shares of the RMSE's variance over the ranges (Saltelli et al. 2010, doi 10.1016/j.cpc.2009.09.018).
 
-    samples: a power of 2. options: as in `sweep`. Raises InputError where SALib is not installed,
-    ComputationError where a run fails: the indices need every one.
+    It takes samples (k + 2) runs for k parameters, through SALib.
+
+    Parameters
+    ----------
+    model : Model
+        The model, or an FMU.
+    experiments : list of Experiment
+        The recordings with which the runs are compared.
+    ranges : dict of (float, float)
+        (min, max) by parameter, in its unit.
+    samples : int, default 256
+        How many; a power of 2.
+    seed : int, default 0
+        Of the points; same seed, same result.
+    **options
+        Arguments of `hvdc_ident.sensitivity.sweep`: against, outputs, values, executor, progress.
+
+    Returns
+    -------
+    ScreeningResult
+        By output, experiment and parameter S1 and ST, shares of the variance, with S1_conf and ST_conf.
+
+    Raises
+    ------
+    InputError
+        SALib is not installed.
+    StudyError
+        Ranges that are not finite with min < max, or a number of samples that is no power of 2.
+    ComputationError
+        A run fails: the indices need every one.
+
+    Examples
+    --------
+    >>> import numpy as np, hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> t, u = np.linspace(0.0, 5.0, 51), {"u": hi.step(0.0, 1.0, at=1.0)}
+    >>> record = hi.Experiment(t, "step", inputs=u, outputs={"y": hi.simulate(lag, t, inputs=u)["y"]})
+    >>> found = hi.sensitivity.sobol(lag, [record], {"T": (0.9, 1.1), "k": (1.0, 3.0)}, samples=16)
+    >>> found.evaluations, list(found.of("y", "step"))  # k matters most
+    (64, ['k', 'T'])
     """
     library("SALib", "global screening", "'hvdc_ident[screening]'")
     from SALib.analyze import sobol as analyse

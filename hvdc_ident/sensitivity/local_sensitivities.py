@@ -342,9 +342,50 @@ def linear_sensitivities(
 ) -> LinearSensitivities:
     """Return the exact derivatives of the eigenvalues and of the frequency response at the steady state of given values.
 
-    inputs, outputs: of the response; default, all. omega: rad/s; default, around the poles. ranges: as factors, as in
-    `trajectory_sensitivities`. Raises SteadyStateError where there is no operating point, LinearizationError where the
-    model has no linear one.
+    The shift of the operating point is included.
+
+    Parameters
+    ----------
+    model : Model
+        A model with equations.
+    parameters : list of str, default None
+        Names of parameters. None: all.
+    values : dict of float, default None
+        Values of parameters and inputs by name, in the model's units, where they differ from the model's.
+    inputs : list of str, default None
+        Names of inputs of the response. None: all.
+    outputs : list of str, default None
+        Names of outputs or signals of the response. None: all outputs.
+    omega : array of float (n,), default None
+        Frequencies in rad/s. None: around the poles.
+    ranges : dict of (float, float), default None
+        (min, max) by parameter, in its unit: their distance is the factor that normalises. None: the size of its value, or its range where
+        that is 0.
+
+    Returns
+    -------
+    LinearSensitivities
+        eigenvalues (m,) in rad/s with eigenvalue_gradients (m, k), and response (n, outputs, inputs) with response_gradients
+        (n, outputs, inputs, k), in units per unit of each of the k parameters.
+
+    Raises
+    ------
+    UnknownNameError
+        A name that the model lacks.
+    StudyError
+        A range without a width.
+    SteadyStateError
+        There is no operating point.
+    LinearizationError
+        The model has no linear one.
+
+    Examples
+    --------
+    >>> import hvdc_ident as hi
+    >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
+    >>> found = hi.linear.linear_sensitivities(lag, ["T"])
+    >>> found.eigenvalues.real.round(9).tolist(), found.eigenvalue_gradients.real.round(9).tolist()  # -1/T and 1/T^2
+    ([-2.0], [[4.0]])
     """
     from hvdc_ident.linearize import find_operating_point, frequency, linearize
 

@@ -229,10 +229,28 @@ class RunComparison(Coded, Shown):
 
 @in_python
 def compare_runs(first: str | Path, second: str | Path) -> RunComparison:
-    """Return two results side by side. first, second: folders of results, or studies whose results stand beside them.
+    """Return two results side by side.
 
-    Raises InputError where one of them holds no results.
+    Parameters
+    ----------
+    first : str or Path
+        A folder of results, or a study whose results stand beside it.
+    second : str or Path
+        The other one.
 
+    Returns
+    -------
+    RunComparison
+        `values`, each parameter's estimates in both and how far they are apart in units of both intervals; further the gaps, the
+        verdicts, the findings, and the files that differ.
+
+    Raises
+    ------
+    InputError
+        One of them holds no results.
+
+    Examples
+    --------
     >>> import tempfile, hvdc_ident as hi
     >>> from pathlib import Path
     >>> from hvdc_ident.study import load_study, run_all, StageOptions, write_starter

@@ -178,25 +178,49 @@ def new_study(
 ) -> NewStudy:
     """Write a study of recordings and a model into a folder, and return what was mapped and what was not.
 
-    recordings: files of any known waveform format, one experiment each. model: a shipped name, or the path of a card, an
-    FMU or a Python file (trust: it may run). limits: of an FMU. dyr: where a unit of a .dyr
-    file is from; terminals: what its files state of them. The study refers to the files where they are.
-
     Columns are mapped to inputs and outputs by name, exactly or but for case and punctuation, or as recorders name the quantity; units
-    are converted. Where a
-    signal and a column are each other's only candidates by unit, and the levels before the event agree, they are mapped too.
-    Everything else is a comment in the study with its candidates. Raises InputError where the folder holds a study, or a file or
-    the model cannot be used.
+    are converted. Where a signal and a column are each other's only candidates by unit, and the levels before the event agree, they are
+    mapped too. Everything else is a comment in the study with its candidates.
 
+    Parameters
+    ----------
+    folder : str or Path
+        Where `study.toml` is written. The study refers to the files where they are.
+    recordings : str, Path or list of these
+        Files of any known waveform format, one experiment each.
+    model : str or Path
+        A shipped name, or the path of a card, an FMU or a Python file.
+    trust : bool, default False
+        Whether a model that is Python code may be run.
+    limits : dict of float, default None
+        Of an FMU's process: deadline and load in s, memory in MiB.
+    dyr : DyrOfStudy, default None
+        Where a unit of a .dyr file is from: the file, the bus, the machine, and what is asked about first.
+    terminals : Terminals, default None
+        What the unit's files state of its terminals: nominal frequency in Hz, bases in MVA and kV, P and Q in MW and Mvar. None: what the
+        model's card states.
+
+    Returns
+    -------
+    NewStudy
+        `path`, the study's file; `recordings`, for each experiment the columns that are mapped, proposed, missing and unused.
+
+    Raises
+    ------
+    InputError
+        The folder holds a study, there is no recording, or a file or the model cannot be used.
+
+    Examples
+    --------
     >>> import tempfile, numpy as np, hvdc_ident as hi
     >>> from pathlib import Path
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     data = Path(folder, "step.csv")
-    ...     _ = data.write_text("time [s],PREF_2 [pu],P2 [pu],spare [kV]\\\\n0,0.4,0.4,1\\\\n0.1,0.5,0.42,1\\\\n0.2,0.5,0.45,1\\\\n")
+    ...     _ = data.write_text("time [s],PREF_2 [pu],P2 [pu],spare [kV]\\n0,0.4,0.4,1\\n0.1,0.5,0.42,1\\n0.2,0.5,0.45,1\\n")
     ...     found = hi.new_study(Path(folder, "study"), data, "vsc-hvdc-link")
     ...     study = hi.load_study(found.path)
     >>> [(m.target.name, m.column.name) for m in found.recordings[0].columns.mapped], study.experiments[0].outputs
-    ([('Pref2', 'PREF_2'), ('P2', 'P2')], ('P2',))
+    ([('P2', 'P2'), ('Pref2', 'PREF_2')], ('P2',))
     """
     path = Path(folder) / "study.toml"
     if path.exists():

@@ -129,12 +129,36 @@ def without_letter(content: bytes) -> bytes:
 
 @in_python
 def load_study(path: str | Path, trust: bool = False, limits: Mapping[str, float] | None = None) -> Study:
-    """Return the study of a file. trust: whether a model that is Python code may be run.
+    """Return the study of a file, with its model and its recordings.
 
-    limits: of an FMU, by their keys in [model], where they differ from what stands there: deadline and load in s, memory
-    in MiB.
+    Parameters
+    ----------
+    path : str or Path
+        The study file (TOML).
+    trust : bool, default False
+        Whether a model that is Python code may be run.
+    limits : dict of float, default None
+        Of an FMU, by their keys in [model], where they differ from what stands there: deadline and load in s, memory in MiB.
 
-    Raises InputError: StudyError, ModelError, UnknownNameError or WaveformError, with the place in the file.
+    Returns
+    -------
+    Study
+        `model`, `candidates` (the parameters that may be estimated), `experiments`, `responses` and `settings`.
+
+    Raises
+    ------
+    InputError
+        The file or what it names cannot be used: StudyError, ModelError, UnknownNameError or WaveformError, with the place in the file.
+
+    Examples
+    --------
+    >>> import tempfile, hvdc_ident as hi
+    >>> from pathlib import Path
+    >>> from hvdc_ident.study import write_starter
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     study = hi.load_study(write_starter(Path(folder, "mine")))
+    >>> study.model.name, list(study.candidates)
+    ('vsc-hvdc-link', ['KPVDC', 'KIVDC'])
     """
     from hvdc_ident.study.stages.sweep import sweep_reference
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 import typer
+from numpydoc.docscrape import FunctionDoc
 
 import hvdc_ident
 from hvdc_ident.cli import app
@@ -192,7 +193,7 @@ def _entry(name: str, thing: Any, example: str) -> Iterator[str]:
     yield ""
     if callable(thing):
         yield from ("```python", signature(name, thing), "```", "")
-        yield from (_prose(inspect.getdoc(thing) or "", inspect.signature(thing).parameters), "")
+        yield from (_sections(thing) if inspect.isfunction(thing) else _prose(thing), "")
     else:
         yield from ("The version of the installed package, as text.", "")
     if inspect.isclass(thing):
@@ -220,17 +221,44 @@ def signature(name: str, thing: Any) -> str:
     return f"{name}(\n" + "".join(f"    {a},\n" for a in arguments) + f"){arrow}"
 
 
-def _prose(doc: str, names: Iterable[str]) -> str:
-    """Return a docstring's paragraphs as HTML: its text is not Markdown. Examples are left to the page's own.
+SECTIONS = ("Parameters", "Returns", "Raises")
+"""Sections of a function's docstring that the page shows; the example below them is the page's own."""
 
-    names: of arguments or fields; an explanation of one of them begins a line.
-    """
-    any_name = "|".join(sorted(map(re.escape, names), key=len, reverse=True)) or "(?!)"
+
+def _sections(function: Callable[..., Any]) -> str:
+    """Return a docstring in numpydoc's sections as HTML: its text, and a list for each section."""
+    doc = FunctionDoc(function)
+    parts = [f"<p>{_marked(p)}</p>" for p in _paragraphs([*doc["Summary"], "", *doc["Extended Summary"]])]
+    for title in SECTIONS:
+        lines = "".join(_line(p.name, p.type, p.desc) for p in doc[title])
+        parts.append(f'<p class="section">{title}</p><dl>{lines}</dl>')
+    return f'<div class="docstring">{"".join(parts)}<p class="section">Example</p></div>'
+
+
+def _line(name: str, kind: str, text: Sequence[str]) -> str:
+    """Return an argument with its type and meaning; a result or an error has a type alone."""
+    facts = f'<span class="facts">{_marked(kind)}</span>' if name and kind else ""
+    meaning = "".join(f"<p>{_marked(p)}</p>" for p in _paragraphs(text))
+    return f"<dt><code>{escape(name or kind)}</code>{facts}</dt><dd>{meaning}</dd>"
+
+
+def _prose(thing: Any) -> str:
+    """Return the paragraphs of a docstring in prose as HTML, without examples; an explanation of a field begins a line."""
+    any_name = "|".join(sorted(map(re.escape, inspect.signature(thing).parameters), key=len, reverse=True)) or "(?!)"
     explained = re.compile(rf"(^|(?<=[.;)]\s))((?:{any_name})(?:, (?:{any_name}))*):(?=\s)")
-    paragraphs = [p for p in re.split(r"\n\s*\n", doc) if ">>>" not in p and not p.lstrip().startswith("...")]
-    marked = (re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(" ".join(p.split()), quote=False)) for p in paragraphs)
+    paragraphs = _paragraphs((inspect.getdoc(thing) or "").splitlines())
+    marked = (_marked(p) for p in paragraphs if ">>>" not in p)
     lines = (re.sub(r"^<br>", "", explained.sub(r"<br><b>\2</b>:", p)) for p in marked)
     return '<div class="docstring">' + "".join(f"<p>{p}</p>" for p in lines) + "</div>"
+
+
+def _paragraphs(lines: Sequence[str]) -> list[str]:
+    return [p for p in re.split(r"\n\s*\n", "\n".join(lines).strip()) if p]
+
+
+def _marked(text: str) -> str:
+    """Return a paragraph of a docstring as HTML: its text is not Markdown, but for code."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", escape(" ".join(text.split()), quote=False))
 
 
 def _members(kind: type) -> Iterator[str]:
