@@ -168,7 +168,7 @@ def fit_each(
     for name, result in zip(parts, outcomes, strict=True):
         results[name] = result
         if progress:
-            progress(len(results), len(parts), f"'{name}': {result.status}")
+            progress(len(results), len(parts), f"'{name}' alone: {result.status}")
     return {f.name: _row(f, results) for f in problem.free}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -148,12 +148,20 @@ def _one_by_one(
     """The statistics over fits to single experiments, each begun at the estimates, group by group."""
     at = {f.name: result.values[f.name] for f in problem.free}
     parts = [part_of(problem, g, at) for g in groups] or [problem]
+    parts = [p for p in parts if len(p.fitted_experiments) > 1]
     table: dict[str, Any] = {}
+    done, count = 0, sum(len(p.fitted_experiments) for p in parts)
     for part in parts:
         begun = replace(part, free=tuple(replace(f, start=min(max(at[f.name], f.min), f.max)) for f in part.free))
-        if len(begun.fitted_experiments) > 1:
-            table |= fit_each(begun, whiten=whiten, executor=executor, progress=progress)
+        told = None if progress is None else partial(_beside_others, progress, done, count)
+        table |= fit_each(begun, whiten=whiten, executor=executor, progress=told)
+        done += len(part.fitted_experiments)
     return table
+
+
+def _beside_others(progress: Progress, before: int, count: int, done: int, _: int, text: str) -> None:
+    """Tell the progress of one part of so many pieces of work. before: those of the parts before it."""
+    progress(before + done, count, text)
 
 
 def curves_of_run(experiment: Experiment, run: Trajectory) -> dict[str, Curve]:

@@ -205,7 +205,7 @@ def _run(
 
     budget = options.budget
     limit: dict[str, Any] = {} if budget is None else {"limit": lambda: budget.left}
-    progress: Progress = StageProgress(so_far.progress, wanted.name, wanted.phases(study), **limit)
+    progress: Progress = StageProgress(so_far.progress, wanted.name, wanted.last, **limit)
     inside = replace(
         options, folder=folder, keep=keep, progress=progress if budget is None else budget.watched(progress)
     )

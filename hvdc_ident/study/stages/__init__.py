@@ -81,16 +81,6 @@ def no_verdict(data: Mapping[str, Any]) -> str:
     return ""
 
 
-def one_phase(study: Study) -> int:
-    """Return 1, for a stage that counts one thing."""
-    return 1
-
-
-def two_by_group(study: Study) -> int:
-    """Return 2 for each group of a fit, whose search and profiles are counted one after the other."""
-    return 2 * max(1, len(study.settings.fit.groups if study.settings.fit else ()))
-
-
 def no_files(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
     """Return no files, for a result on which no file of another stage rests."""
     return {}
@@ -107,10 +97,9 @@ class Stage:
     uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
     takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
     from its JSON; told_in_part: also where a part of the work failed. verdict: the same in one phrase, for the screen of a run.
-    searches: whether it also runs at the start values, where a search begins; all run at the given ones. phases: how many
-    things it counts, one after the other, as progress. parts: what it does, in order: how the texts of its progress begin, and in
-    words. follow: the files that rest on its result and on those beside it in the
-    folder, whatever its end was, given the study, the folder and its JSON.
+    searches: whether it also runs at the start values, where a search begins; all run at the given ones. parts: what it does, in
+    order: how the texts of its progress begin, and in words; none of a stage that does one thing. follow: the files that rest on its
+    result and on those beside it in the folder, whatever its end was, given the study, the folder and its JSON.
     """
 
     name: str
@@ -127,9 +116,13 @@ class Stage:
     verdict: Callable[[Mapping[str, Any]], str] = no_verdict
     searches: bool = False
     told_in_part: bool = False
-    phases: Callable[[Study], int] = one_phase
     parts: Mapping[str, str] = field(default_factory=dict)
     follow: Callable[[Study, Path, Mapping[str, Any]], Mapping[str, str]] = no_files
+
+    @property
+    def last(self) -> str:
+        """How the texts of progress begin in the last part; "" for a stage that does one thing."""
+        return ([*self.parts] or [""])[-1]
 
 
 @cache

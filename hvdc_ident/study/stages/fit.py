@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
     from hvdc_ident.fit import FitResult, Problem
@@ -145,7 +145,6 @@ STAGE = Stage(
     tell=lines_of,
     verdict=verdict,
     searches=True,
-    phases=two_by_group,
     parts={"search for the optimum": "the search for the optimum", "'": "the fits to single experiments"},
     follow=follow,
 )

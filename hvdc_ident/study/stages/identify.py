@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
@@ -84,8 +84,8 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     if rest < SOON:
         return
     about = (
-        f"One evaluation of the model with its derivatives took {duration(first.seconds)}. The search takes {starts} starts "
-        f"of about {A_START} each, {duration(rest)} or so, then profiles. An interrupt keeps this answer and what is finished."
+        f"One evaluation of the model with its derivatives took {duration(first.seconds)}. The search takes {starts} starts of some ten "
+        "to a hundred each, then profiles. An interrupt keeps this answer and what is finished."
     )
     options.announce([*first.lines, about])
 
@@ -139,7 +139,6 @@ STAGE = Stage(
     tell=lines_of,
     verdict=verdict,
     searches=True,
-    phases=two_by_group,
     parts={
         "first answer": "the answer at the given values",
         "structure": "the structure of the model",
