@@ -630,4 +630,4 @@ def _told(progress: Progress | bool | None, verb: str) -> Iterator[Progress | No
     from hvdc_ident.study.stages import stage
 
     with progress_bar(quiet=not progress) as shown:
-        yield StageProgress(shown, verb, stage(verb).last)
+        yield StageProgress(shown, verb, stage(verb).counted)

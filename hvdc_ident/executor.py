@@ -148,7 +148,8 @@ class StageProgress:
     what they find. So a share is told only while the last thing is counted, and only where its pieces tell the time that is left
     (`time_left`). It never runs backwards. A line with nothing counted changes the text alone.
 
-    label: before each text. last: how the texts begin while the last thing is counted; "": it counts one thing. clock: returns s.
+    label: before each text. last: how the texts begin while the last thing is counted; "": it counts one thing; None: after none of
+    them the end is near. clock: returns s.
     limit: returns the s that are left of a budget, within which any work ends.
     """
 
@@ -156,7 +157,7 @@ class StageProgress:
         self,
         progress: Progress,
         label: str,
-        last: str = "",
+        last: str | None = "",
         clock: Callable[[], float] = time.monotonic,
         limit: Callable[[], float] = lambda: math.inf,
     ) -> None:
@@ -170,7 +171,7 @@ class StageProgress:
     def __call__(self, done: int, total: int, text: str) -> None:
         """Report that so much of a thing is done."""
         now = self._clock()
-        if not text.startswith(self._last):
+        if self._last is None or not text.startswith(self._last):
             self._counted, self._known = (0, 0), False
         elif total > 1:
             self._count(done, total, now)

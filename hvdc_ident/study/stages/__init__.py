@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.budget import Budget
+from hvdc_ident.budget import Budget, Known
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.executor import Progress, silent
 
@@ -81,6 +81,11 @@ def no_verdict(data: Mapping[str, Any]) -> str:
     return ""
 
 
+def nothing_known(study: Study, known: Sequence[Known], options: StageOptions) -> Mapping[str, Any]:
+    """Return no JSON, for a stage whose parts are of no use before its end."""
+    return {}
+
+
 def no_files(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
     """Return no files, for a result on which no file of another stage rests."""
     return {}
@@ -98,8 +103,10 @@ class Stage:
     takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
     from its JSON; told_in_part: also where a part of the work failed. verdict: the same in one phrase, for the screen of a run.
     searches: whether it also runs at the start values, where a search begins; all run at the given ones. parts: what it does, in
-    order: how the texts of its progress begin, and in words; none of a stage that does one thing. follow: the files that rest on its
-    result and on those beside it in the folder, whatever its end was, given the study, the folder and its JSON.
+    order: how the texts of its progress begin, and in words; none of a stage that does one thing. counted: how the texts begin while
+    the last thing is counted after which little is left; None where there is no such thing. so_far: the JSON of what its parts had come
+    to where its budget ended it; what runs the model has no time left. follow: the files that rest on its result and on those beside
+    it in the folder, whatever its end was, given the study, the folder and its JSON.
     """
 
     name: str
@@ -117,12 +124,9 @@ class Stage:
     searches: bool = False
     told_in_part: bool = False
     parts: Mapping[str, str] = field(default_factory=dict)
+    counted: str | None = ""
+    so_far: Callable[[Study, Sequence[Known], StageOptions], Mapping[str, Any]] = nothing_known
     follow: Callable[[Study, Path, Mapping[str, Any]], Mapping[str, str]] = no_files
-
-    @property
-    def last(self) -> str:
-        """How the texts of progress begin in the last part; "" for a stage that does one thing."""
-        return ([*self.parts] or [""])[-1]
 
 
 @cache
