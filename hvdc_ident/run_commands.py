@@ -120,7 +120,7 @@ def run_lines(done: Sequence[Done], summary: RunSummary | None, truth: Sequence[
         state = state_of(d)
         verdict = d.failed or d.stage.verdict(d.data)
         if "not_tried" in d.data and (known := d.stage.verdict(d.data)):
-            verdict = f"{verdict}; known: {known}"
+            verdict = f"{verdict}; {known}"
         lines.append(f"{d.stage.name}: {state}; {verdict}" if verdict else f"{d.stage.name}: {state}")
     if summary is None:
         return lines

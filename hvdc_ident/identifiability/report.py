@@ -188,6 +188,7 @@ class IdentifiabilityReport(Coded, Shown):
         rows = [(n, v.verdict, v.value, v.unit, interval_text(v.ci95)) for n, v in self.parameters.items()]
         yield Table(("parameter", "verdict", "value", "unit", "95 % interval"), tuple(rows))
         yield "\n".join(f"{n}: {v.reason}" for n, v in self.parameters.items())
+        yield "\n".join(f"{n}: no verdict. {u.text}" for n, u in self.unsettled.items())
         if self.recommended is not None:
             yield f"Measure next: {self.recommended.text}"
         elif self.not_recommended:

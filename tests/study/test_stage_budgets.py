@@ -207,7 +207,7 @@ def test_a_verdict_that_stands_is_told_though_the_search_was_not_ended(tmp_path:
     assert said == {"a": "structurally-unidentifiable", "b": "structurally-unidentifiable"}
     assert list(done.data["unsettled"]) == ["k"] and not done.data["identifiable"]
     told = "\n".join(run_lines([done], None))
-    assert "known: structurally-unidentifiable: a, b; no verdict: k" in told
+    assert "; structurally-unidentifiable: a, b; no verdict: k" in told
 
 
 def test_a_report_by_groups_keeps_the_verdicts_of_the_groups_before(tmp_path: Path) -> None:
