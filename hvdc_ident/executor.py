@@ -146,7 +146,8 @@ class StageProgress:
     A stage counts one thing after the other: starts of a search, sides of profiles, experiments. What one of them takes does not tell
     what the next will: starts of one search took 7 to 119 evaluations each, and how many rounds of candidates there are depends on
     what they find. So a share is told only while the last thing is counted, and only where its pieces tell the time that is left
-    (`time_left`). It never runs backwards. A line with nothing counted changes the text alone.
+    (`time_left`). It never runs backwards. A line with nothing counted changes the text alone. Time is counted from the first line, as
+    people see it.
 
     label: before each text. last: how the texts begin while the last thing is counted; "": it counts one thing; None: after none of
     them the end is near. clock: returns s.
@@ -162,7 +163,8 @@ class StageProgress:
         limit: Callable[[], float] = lambda: math.inf,
     ) -> None:
         self._progress, self._label, self._last, self._clock, self._limit = progress, label, last, clock, limit
-        self._begun = self._before = clock()
+        self._begun: float | None = None
+        self._before = 0.0
         self._counted: tuple[int, int] = (0, 0)
         self._times: list[float] = []
         self._reached = 0
@@ -171,23 +173,24 @@ class StageProgress:
     def __call__(self, done: int, total: int, text: str) -> None:
         """Report that so much of a thing is done."""
         now = self._clock()
+        if self._begun is None:
+            self._begun = now
         if self._last is None or not text.startswith(self._last):
             self._counted, self._known = (0, 0), False
         elif total > 1:
-            self._count(done, total, now)
-        self._before = now
+            self._count(done, total, now, now - self._begun)
+            self._before = now
         reached, scale = (self._reached, SCALE) if self._known else (0, 1)
         self._progress(reached, scale, f"{self._label}: {text}")
 
-    def _count(self, done: int, total: int, now: float) -> None:
+    def _count(self, done: int, total: int, now: float, elapsed: float) -> None:
         before, of = self._counted
-        if total != of or done < before:
-            before, self._times = 0, []
+        if total != of or done < before:  # another thing: when its first pieces began is not known
+            before, self._times = done, []
         if done > before:
             self._times += [(now - self._before) / (done - before)] * (done - before)
         self._counted = (done, total)
         left = time_left(self._times, total - done)
-        elapsed = now - self._begun
         self._known = left is not None and elapsed > 0.0
         if left is None or not self._known:
             return
