@@ -529,7 +529,7 @@ def sweep(
     elif against not in ("data", "base"):
         against = model_of(against)
     chosen: Any = names_of(want, "quantity") or (swept_names(tables) if tables and parameters is None else None)
-    with _open(executor) as pool, _told(progress, "sweep", 1) as told:
+    with _open(executor) as pool, _told(progress, "sweep") as told:
         return swept(
             study.model,
             study.experiments,
@@ -607,7 +607,7 @@ def identify(
     both = {"pair": list(names_of(pair, "parameter") or ())} if pair else {}
     study = _asked(study_of(model, data, parameters, identifiability=both), "identify")
     need(study, "identify")
-    with _open(executor) as pool, _told(progress, "identify", 2) as told:
+    with _open(executor) as pool, _told(progress, "identify") as told:
         return judged(study, seed=seed, executor=pool, progress=told)
 
 
@@ -683,7 +683,7 @@ def fit(
     from hvdc_ident.study.assemble import names_of, study_of
     from hvdc_ident.study.stages.identify import judged
 
-    with _open(executor) as pool, _told(progress, "fit", 4) as told:
+    with _open(executor) as pool, _told(progress, "fit") as told:
         if isinstance(model, Problem):
             return fit_of(model, seed=seed, executor=pool, progress=told, **settings)
         study = _asked(study_of(model, data, parameters, fit=settings), "fit")
@@ -770,7 +770,7 @@ def diagnose(
     tried = {} if chosen is None else {"effects": "all" if chosen == ("all",) else list(chosen)}
     study = _asked(study_of(model, data, parameters, diagnose={**settings, **tried}), "diagnose")
     need(study, "diagnose")
-    with _open(executor) as pool, _told(progress, "diagnose", 3) as told:
+    with _open(executor) as pool, _told(progress, "diagnose") as told:
         found = report or judged(study, seed=seed, executor=pool, progress=told)
         return diagnosed(study, found, seed=seed, executor=pool, progress=told)
 
@@ -959,12 +959,13 @@ def _open(executor: Workers) -> Iterator[Executor | None]:
 
 
 @contextmanager
-def _told(progress: Progress | bool | None, verb: str, phases: int) -> Iterator[Progress | None]:
-    """Open a bar on stderr for True; a function is taken as it is. phases: how many things the verb counts, one after the other."""
+def _told(progress: Progress | bool | None, verb: str) -> Iterator[Progress | None]:
+    """Open a bar on stderr for True; a function is taken as it is. verb: the name of its stage."""
     if not isinstance(progress, bool):
         yield progress
         return
     from hvdc_ident.executor import StageProgress, progress_bar
+    from hvdc_ident.study.stages import stage
 
     with progress_bar(quiet=not progress) as shown:
-        yield StageProgress(shown, verb, phases)
+        yield StageProgress(shown, verb, stage(verb).counted)

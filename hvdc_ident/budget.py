@@ -26,8 +26,27 @@ TO_CONCLUDE = 0.15
 """Share of the time left in which a search that can answer at any time concludes: it runs the model with what it found."""
 
 
+@dataclass(frozen=True)
+class Known:
+    """What a part of some work had come to when its budget ended it.
+
+    done: what has ended, in lines. not_tried: what of the part has not been begun or not ended, in words; later: of what follows it.
+    """
+
+    done: tuple[str, ...] = ()
+    not_tried: tuple[str, ...] = ()
+    later: tuple[str, ...] = ()
+
+
 class BudgetSpent(KeyboardInterrupt):
-    """The time that the work may take is over: it ends as by an interrupt, which no part of it takes for a failure of its own."""
+    """The time that the work may take is over: it ends as by an interrupt, which no part of it takes for a failure of its own.
+
+    known: what each part that it passes had come to, the innermost first; a part puts its own in place of what it takes up in it.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message)
+        self.known: list[Known] = []
 
 
 @dataclass(frozen=True)

@@ -117,56 +117,87 @@ EVERY = 60.0
 """Seconds between two lines of progress where there is no terminal for a bar."""
 
 
+def time_left(times: Sequence[float], pieces: int) -> float | None:
+    """Return the time in s that so many more pieces of work take, from the times of those done; None where these do not tell.
+
+    They tell where such a sum lies within a factor of 2 of what is returned. That is decided by the means of blocks of pieces, for a
+    pool hands over several at once: k blocks with the relative standard deviation v foretell m more to within t v sqrt(1/k + 1/m),
+    which may be half at most: the sum then lies between half and one and a half times the mean. t is Student's, at 95 %.
+    """
+    if pieces == 0:
+        return 0.0
+    size = max(1, math.isqrt(len(times)))
+    count = len(times) // size
+    if count < 2:
+        return None
+    from scipy.special import stdtrit  # the stages that count pieces have loaded it
+
+    last = times[len(times) - count * size :]
+    blocks = [sum(last[k : k + size]) / size for k in range(0, len(last), size)]
+    mean = sum(blocks) / count
+    spread = math.sqrt(sum((b - mean) ** 2 for b in blocks) / (count - 1))
+    off = float(stdtrit(count - 1, 0.975)) * spread * math.sqrt(1.0 / count + size / pieces)
+    return pieces * mean if off <= 0.5 * mean else None
+
+
 class StageProgress:
-    """Progress of a stage as people see it, in thousandths of its time: it never runs backwards, whatever is counted inside.
+    """Progress of a stage as people see it: the share of its time that is over, in thousandths; 0 of 1 where it cannot be known.
 
-    A stage counts one thing after the other: starts of a search, sides of profiles. Each is a phase; it begins where the
-    total is another one, or the count falls. The time left is that of the phase at its pace so far, and for each phase that
-    is still to come the mean time of those so far. A line with nothing counted (0 of 1) changes the text alone.
+    A stage counts one thing after the other: starts of a search, sides of profiles, experiments. What one of them takes does not tell
+    what the next will: starts of one search took 7 to 119 evaluations each, and how many rounds of candidates there are depends on
+    what they find. So a share is told only while the last thing is counted, and only where its pieces tell the time that is left
+    (`time_left`). It never runs backwards. A line with nothing counted changes the text alone. Time is counted from the first line, as
+    people see it.
 
-    phases: how many there will be. label: before each text. clock: returns s. limit: returns the s that are left of a budget, within
-    which any work ends.
+    label: before each text. last: how the texts begin while the last thing is counted; "": it counts one thing; None: after none of
+    them the end is near. clock: returns s.
+    limit: returns the s that are left of a budget, within which any work ends.
     """
 
     def __init__(
         self,
         progress: Progress,
         label: str,
-        phases: int = 1,
+        last: str | None = "",
         clock: Callable[[], float] = time.monotonic,
         limit: Callable[[], float] = lambda: math.inf,
     ) -> None:
-        self._progress, self._label, self._phases, self._clock, self._limit = progress, label, phases, clock, limit
-        self._begun = self._last = clock()
-        self._finished: list[float] = []
-        self._phase: tuple[float, int, int] | None = None
+        self._progress, self._label, self._last, self._clock, self._limit = progress, label, last, clock, limit
+        self._begun: float | None = None
+        self._before = 0.0
+        self._counted: tuple[int, int] = (0, 0)
+        self._times: list[float] = []
         self._reached = 0
+        self._known = False
 
     def __call__(self, done: int, total: int, text: str) -> None:
-        """Report that so much of a phase is done."""
+        """Report that so much of a thing is done."""
         now = self._clock()
-        if total > 1:
-            self._count(done, total, now)
-        self._last = now
-        self._progress(self._reached, SCALE, f"{self._label}: {text}")
+        if self._begun is None:
+            self._begun = now
+        if self._last is None or not text.startswith(self._last):
+            self._counted, self._known = (0, 0), False
+        elif total > 1:
+            self._count(done, total, now, now - self._begun)
+            self._before = now
+        reached, scale = (self._reached, SCALE) if self._known else (0, 1)
+        self._progress(reached, scale, f"{self._label}: {text}")
 
-    def _count(self, done: int, total: int, now: float) -> None:
-        if self._phase is None or total != self._phase[2] or done < self._phase[1]:
-            if self._phase is not None:
-                self._finished.append(now - self._phase[0])
-            self._phase = (self._last if done else now, done, total)
-        begun = self._phase[0]
-        self._phase = (begun, done, total)
-        share = done / total
-        if not share:
+    def _count(self, done: int, total: int, now: float, elapsed: float) -> None:
+        before, of = self._counted
+        if total != of or done < before:  # another thing: when its first pieces began is not known
+            before, self._times = done, []
+        if done > before:
+            self._times += [(now - self._before) / (done - before)] * (done - before)
+        self._counted = (done, total)
+        left = time_left(self._times, total - done)
+        self._known = left is not None and elapsed > 0.0
+        if left is None or not self._known:
             return
-        whole = (now - begun) / share
-        to_come = max(0, self._phases - len(self._finished) - 1)
-        left = (1.0 - share) * whole + to_come * (sum(self._finished) + whole) / (len(self._finished) + 1)
         left = min(left, max(self._limit(), 0.0))
-        elapsed = now - self._begun
-        if elapsed + left > 0.0:
-            self._reached = max(self._reached, min(SCALE, round(SCALE * elapsed / (elapsed + left))))
+        self._reached = max(self._reached, min(SCALE, round(SCALE * elapsed / (elapsed + left))))
+        # What was told before may not be taken back: a share that has come to mean half the time that is left is not told.
+        self._known = 2.0 * elapsed * (SCALE - self._reached) >= self._reached * left
 
 
 @contextmanager
@@ -194,7 +225,8 @@ class _Lines:
     def __call__(self, done: int, total: int, text: str) -> None:
         if time.monotonic() - self._last >= EVERY:
             self._last = time.monotonic()
-            print(f"{100 * done // max(total, 1)} %, {text}", file=sys.stderr, flush=True)
+            share = f"{100 * done // total} %, " if total > 1 else ""
+            print(f"{share}{text}", file=sys.stderr, flush=True)
 
     def close(self) -> None:
         """End the lines."""
@@ -216,15 +248,13 @@ class _Bar:
             if now - self._begun < PATIENCE:
                 return
             self._shown = _opened_bar()
-        share = done / total if total else 0.0
-        finish = now + (now - self._stage_begun) * (1.0 - share) / share if share else None
         self._shown.update(
             self._shown.task_ids[0],
             completed=done,
-            total=total,
+            total=total if total > 1 else None,
             description=text,
             begun=self._stage_begun,
-            finish=finish,
+            finish=finish_of(self._stage_begun, now, done, total),
         )
 
     def close(self) -> None:
@@ -233,12 +263,21 @@ class _Bar:
             self._shown.stop()
 
 
+def finish_of(begun: float, told: float, done: int, total: int) -> float | None:
+    """Return the instant at which a stage ends whose share `done` of `total` of its time was over when it was told; None where no
+    share is known. Instants in s."""
+    return told + (told - begun) * (total - done) / done if total > 1 and done else None
+
+
 def times_of(begun: float, finish: float | None, now: float) -> str:
-    """Return how long a stage has taken and how much longer it takes, as "1:05, about 20 s left". Instants in s."""
+    """Return how long a stage has taken and how much longer it takes, as "1:05, about 20 s left". Instants in s.
+
+    Of a stage that should have ended more than a second ago it is not known how much longer it takes.
+    """
     elapsed = int(now - begun)
     hours, minutes = divmod(elapsed // 60, 60)
     shown = f"{hours}:{minutes:02d}:{elapsed % 60:02d}" if hours else f"{minutes}:{elapsed % 60:02d}"
-    if finish is None:
+    if finish is None or now - finish > 1.0:
         return shown
     left = finish - now
     return f"{shown}, {'about ' + duration(math.ceil(left)) if left > 1.0 else 'a moment'} left"
@@ -257,9 +296,16 @@ def _opened_bar() -> Any:
             """Return the times of the task."""
             return Text(times_of(task.fields["begun"], task.fields["finish"], time.monotonic()))
 
+    class Share(rich_progress.ProgressColumn):
+        """The share that is over, in per cent; nothing where it is not known."""
+
+        def render(self, task: rich_progress.Task) -> Text:
+            """Return the share of the task."""
+            return Text("" if task.total is None else f"{task.percentage:>3.0f}%")
+
     columns = (
         rich_progress.BarColumn(bar_width=20),
-        rich_progress.TaskProgressColumn(),
+        Share(),
         Times(table_column=Column(no_wrap=True)),
         rich_progress.TextColumn(
             "{task.description}", markup=False, table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")

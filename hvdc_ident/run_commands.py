@@ -119,6 +119,8 @@ def run_lines(done: Sequence[Done], summary: RunSummary | None, truth: Sequence[
     for d in done:
         state = state_of(d)
         verdict = d.failed or d.stage.verdict(d.data)
+        if "not_tried" in d.data and (known := d.stage.verdict(d.data)):
+            verdict = f"{verdict}; {known}"
         lines.append(f"{d.stage.name}: {state}; {verdict}" if verdict else f"{d.stage.name}: {state}")
     if summary is None:
         return lines
@@ -150,13 +152,8 @@ def stage_command(stage: Stage) -> Callable[..., None]:
         console.print_json(done.data)
         console.say(*(f"steady state, {line}" for line in done.data.get("steady_state", ())))
         silent = (done.failed and not (stage.told_in_part or done.unfinished)) or console.json or console.quiet
-        lines = (
-            ()
-            if silent
-            else done.data.get("done", ())
-            if done.unfinished and not stage.told_in_part
-            else stage.tell(done.data)
-        )
+        ended = done.data.get("done", ()) if done.unfinished else ()
+        lines = () if silent else (*ended, *stage.tell(done.data))
         console.say(*(pasteable(line, study, out, access) for line in lines))
         console.say(f"{stage.name}: {state_of(done)}; {folder / stage.file}")
         if done.failed:

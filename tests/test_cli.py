@@ -15,7 +15,6 @@ from typer.testing import CliRunner, Result
 
 from hvdc_ident.cli import app
 from hvdc_ident.errors import SimulationError, unknown_name
-from hvdc_ident.executor import StageProgress, times_of
 from hvdc_ident.simulate import core
 from hvdc_ident.study.stages import stages
 
@@ -177,55 +176,6 @@ def test_run_prints_the_verdict_of_each_stage_and_the_values(study: Path) -> Non
     assert header.split() == ["parameter", "unit", "given", "fitted", "95", "%", "interval"]
     assert row[:3] == ["k", "1/s", "1"] and float(row[4]) < 5.0 < float(row[6])
     assert lines[-1] == f"report: {study.parent / 'study-results' / 'report.html'}"
-
-
-def staged(*phases: tuple[int, float], declared: int) -> list[tuple[float, float, float]]:
-    """(time, share told, share in truth) of a stage of phases of (steps, s a step), by a clock that only the steps move."""
-    now, told = [0.0], []
-    progress = StageProgress(lambda done, total, _: told.append(done / total), "stage", declared, clock=lambda: now[0])
-    whole = sum(steps * s for steps, s in phases)
-    rows = []
-    for steps, s in phases:
-        for done in range(steps + 1):
-            now[0] += s if done else 0.0
-            progress(done, steps, "text")
-            rows.append((now[0], told[-1], now[0] / whole))
-    return rows
-
-
-def test_the_share_of_a_stage_is_that_of_its_time() -> None:
-    """Two phases of ten steps of 1 s: after each step the share told is the elapsed time over 20 s."""
-    for _, told, true in staged((10, 1.0), (10, 1.0), declared=2):
-        assert told == pytest.approx(true, abs=1e-3)
-
-
-@pytest.mark.parametrize("phases", [((4, 1.0), (20, 3.0), (4, 0.1)), ((30, 2.0), (3, 0.1)), ((2, 1.0),) * 6])
-def test_progress_never_runs_backwards_and_ends_at_the_whole(phases: tuple[tuple[int, float], ...]) -> None:
-    told = [share for _, share, _ in staged(*phases, declared=len(phases))]
-    assert told == sorted(told) and told[-1] == 1.0
-    last, steps = len(told) - phases[-1][0] - 1, phases[-1][0]
-    assert steps and told[last] < 1.0  # the phase before the last one is not the end
-
-
-def test_a_line_without_a_count_changes_the_text_alone() -> None:
-    lines: list[tuple[int, int, str]] = []
-    progress = StageProgress(lambda *line: lines.append(line), "fit", 1, clock=iter(range(100)).__next__)
-    for done, total, text in ((1, 4, "search"), (0, 1, "curvature"), (2, 4, "search")):
-        progress(done, total, text)
-    assert lines[1] == (lines[0][0], lines[0][1], "fit: curvature") and lines[2][0] > lines[1][0]
-
-
-@pytest.mark.parametrize(
-    ("begun", "finish", "now", "words"),
-    [
-        (0.0, None, 65.0, "1:05"),
-        (10.0, 95.2, 75.0, "1:05, about 21 s left"),
-        (0.0, 3700.5, 3700.0, "1:01:40, a moment left"),
-        (0.0, 7800.0, 600.0, "10:00, about 2 h left"),
-    ],
-)
-def test_the_times_beside_the_bar(begun: float, finish: float | None, now: float, words: str) -> None:
-    assert times_of(begun, finish, now) == words
 
 
 class Browser:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import hvdc_ident as hi
 from hvdc_ident.app.study_folder import stamp
 from hvdc_ident.errors import HvdcIdentError, InputError
-from hvdc_ident.executor import times_of
+from hvdc_ident.executor import finish_of, times_of
 from hvdc_ident.parallel import Child
 from hvdc_ident.study.pipeline import FIRST, standing
 from hvdc_ident.study.stages import Stage, stages
@@ -165,7 +165,7 @@ class StudyRun:
         self.said: list[str] = []
         self.outcome: Outcome = "running"
         self.message = ""
-        self._begun = self._stage_begun = time.monotonic()
+        self._stage_begun = self._told = time.monotonic()
         self._cancelled = threading.Event()
         self._child = Child(work, study_file, folder, what, trust)
         self._thread = threading.Thread(target=self._follow, daemon=True)
@@ -185,9 +185,8 @@ class StudyRun:
     @property
     def times(self) -> str:
         """The time that the stage has taken, and how much longer it takes."""
-        now = time.monotonic()
-        finish = now + (now - self._stage_begun) * (1.0 - self.share) / self.share if self.share else None
-        return times_of(self._stage_begun, finish, now)
+        finish = finish_of(self._stage_begun, self._told, self.done, self.total)
+        return times_of(self._stage_begun, finish, time.monotonic())
 
     def cancel(self) -> None:
         """End the work; what was finished is kept."""
@@ -222,9 +221,10 @@ class StudyRun:
 
     def _take(self, told: Mapping[str, Any]) -> None:
         before = self.stage
+        self._told = time.monotonic()
         self.done, self.total, self.text = told["done"], told["total"], told["text"]
         if self.stage != before:
-            self._stage_begun = time.monotonic()
+            self._stage_begun = self._told
 
 
 class Runs:

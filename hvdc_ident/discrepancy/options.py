@@ -70,34 +70,22 @@ class DiagnosisOptions:
             raise StudyError("a number of effects or starts is below 1", where="options of a diagnosis")
 
 
-STEPS_AFTER = 60
-"""Steps that the bar leaves room for behind those that are known: about what one more round of refits takes."""
-
-
 @dataclass(eq=False)
 class Course:
-    """Progress of a search as people see it: in per cent, never backwards, with the best hypothesis so far.
+    """Progress of a search as people see it: the steps of the batch at work, with the best hypothesis so far.
 
-    How many steps there will be is not known before the end, so the bar leaves room for one more round.
+    How many batches there will be depends on what they find, and is not known before the end.
     """
 
     progress: Progress
-    finished: int = 0
-    batch: int = 0
-    done: int = 0
-    percent: int = 0
     best: str = ""
     left: float = math.inf
 
     def step(self, done: int, total: int, text: str) -> None:
         """Report that so many steps of a batch are done."""
-        if done < self.done or total != self.batch:
-            self.finished, self.batch = self.finished + self.batch, total
-        self.done = done
-        reached = 100 * (self.finished + done) // (self.finished + total + STEPS_AFTER)
-        self.percent = max(self.percent, reached)
+        count = f", {done} of {total}" if total > 1 else ""
         best = f"; best so far: {self.best}, {self.left:.3g} times the noise is left" if self.best else ""
-        self.progress(self.percent, 100, text + best)
+        self.progress(done, total, f"{text}{count}{best}")
 
     def lead(self, label: str, left: float) -> None:
         """Remember a hypothesis that leaves less than those before. left: root mean square of its residual, in noise units."""

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hvdc_ident.budget import BudgetSpent
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import Executor, Progress
@@ -34,6 +35,7 @@ from hvdc_ident.fit.result import NOT_ASKED, Covariance, Estimate, FitResult, St
 from hvdc_ident.fit.search import (
     DISTINCT,
     SAME,
+    StartsSoFar,
     cost_at,
     distinct,
     higher_ends,
@@ -86,9 +88,13 @@ def fit(
         return failed(first, points, runs, f"no start reached an end: {runs[0].message}")
     try:
         problem, result = _result(first, points, runs, whiten)
+        return assessed(problem, result) if assess else result
     except SimulationError as e:
         return failed(first, points, runs, f"the optimum cannot be simulated again: {e}")
-    return assessed(problem, result) if assess else result
+    except BudgetSpent as end:
+        so_far = StartsSoFar.of(first, runs, len(runs))
+        end.known.append(replace(so_far, not_tried=("the estimates and their intervals at the lowest of the starts",)))
+        raise
 
 
 def _result(

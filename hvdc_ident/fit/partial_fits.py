@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import stdtrit
 
+from hvdc_ident.budget import BudgetSpent, Known
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError, StudyError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
@@ -24,10 +25,12 @@ from hvdc_ident.fit.estimate import failed, fit, result_at
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.fit.optimiser import LocalMinimum, OptimiserResult
 from hvdc_ident.fit.problem import Problem
-from hvdc_ident.fit.result import Covariance, FitResult, StartOutcome, Status
+from hvdc_ident.fit.result import Covariance, EachSoFar, FitResult, StartOutcome, Status
+from hvdc_ident.fit.search import outcome_lines
 from hvdc_ident.fit.simulator import unknown_of
 from hvdc_ident.fit.uncertainty import NO_INTERVAL, samples_by_output
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import listed
 
 _WORST: tuple[Status, ...] = ("failed", "not-converged", "two-optima", "at-bound", "converged")
 
@@ -59,8 +62,14 @@ def fit_individually(
     check_groups(problem, groups)
     whole, at = problem, {f.name: f.given for f in problem.free}
     parts: list[FitResult] = []
-    for group in groups:
-        result = fit(part_of(problem, group, at), assess=False, begun=begun(group.parameters), **options)
+    for number, group in enumerate(groups, start=1):
+        try:
+            result = fit(part_of(problem, group, at), assess=False, begun=begun(group.parameters), **options)
+        except BudgetSpent as end:
+            rest = listed([n for g in groups[number:] for n in g.parameters])
+            before = tuple(line for r in parts for line in outcome_lines(r.starts))
+            end.known.insert(0, Known(before, later=(f"all of {rest}",) if rest else ()))
+            raise
         at |= {n: e.value for n, e in result.estimates.items()}
         whole = in_final_weights(whole, result)
         parts.append(result)
@@ -165,10 +174,17 @@ def fit_each(
     parts = _parts(problem, runs)
     outcomes: Iterator[FitResult] = mapped(executor, partial(_alone, whiten=whiten), list(parts.values()))
     results: dict[str, FitResult] = {}
-    for name, result in zip(parts, outcomes, strict=True):
-        results[name] = result
-        if progress:
-            progress(len(results), len(parts), f"'{name}': {result.status}")
+    try:
+        for name, result in zip(parts, outcomes, strict=True):
+            results[name] = result
+            if progress:
+                progress(len(results), len(parts), f"'{name}' alone: {result.status}")
+    except BudgetSpent as end:
+        done = tuple(f"'{name}' alone: {r.status}" for name, r in results.items())
+        rest = listed([f"'{n}'" for n in parts if n not in results])
+        table = {f.name: _row(f, results) for f in problem.free} if results else {}
+        end.known.append(EachSoFar(done, (f"the fits to {rest} alone",) if rest else (), table=table))
+        raise
     return {f.name: _row(f, results) for f in problem.free}
 
 

@@ -7,12 +7,13 @@ round: a step is a piece of work of its own, wherever it is done, and an executo
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
+from hvdc_ident.budget import BudgetSpent, Known
 from hvdc_ident.codec import NOT_STORED
 from hvdc_ident.data import Array
 from hvdc_ident.errors import SimulationError
@@ -30,6 +31,7 @@ from hvdc_ident.fit.profile_path import (
 )
 from hvdc_ident.fit.uncertainty import ONE_SIDED, TWO_SIDED
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.text import listed
 
 Asked = tuple[str, float]
 """A side: the unknown and the direction, -1.0 or 1.0."""
@@ -85,6 +87,22 @@ class Profiles:
     cost: float
     by_name: FrozenMap[Profile]
     restarts: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ProfilesSoFar(Known):
+    """Profiles whose budget has ended them. ends: by name the lower and the upper side, None where it has not come to its end."""
+
+    ends: Mapping[str, tuple[Side | None, Side | None]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, sides: Mapping[Asked, Side], asked: Collection[Asked]) -> ProfilesSoFar:
+        """Return the profiles by the sides that have come to their ends, of those that were asked for."""
+        names = tuple(dict.fromkeys(n for n, _ in asked))
+        ends = {n: (sides.get((n, -1.0)), sides.get((n, 1.0))) for n in names}
+        walking = [n for n, both in ends.items() if None in both]
+        done = tuple(f"profile of {n} walked" for n in names if n not in walking)
+        return cls(done, (f"the rest of the profile{'s' if len(walking) > 1 else ''} of {listed(walking)}",), ends=ends)
 
 
 def profiles(
@@ -227,14 +245,18 @@ def _follow(
     for asked in steps:
         advance(asked, None)
     count = 0
-    while waiting:
-        asked_steps, waiting = waiting, {}
-        ends = take(list(asked_steps.values()))
-        for asked in asked_steps:
-            if progress:
-                count += 1
-                progress(len(sides), len(steps), f"profile of {asked[0]}, step {count} of all profiles together")
-            advance(asked, next(ends))
+    try:
+        while waiting:
+            asked_steps, waiting = waiting, {}
+            ends = take(list(asked_steps.values()))
+            for asked in asked_steps:
+                if progress:
+                    count += 1
+                    progress(len(sides), len(steps), f"profile of {asked[0]}, step {count} of all profiles together")
+                advance(asked, next(ends))
+    except BudgetSpent as end:
+        end.known.append(ProfilesSoFar.of(sides, paths))
+        raise
     return sides
 
 

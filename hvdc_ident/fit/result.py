@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
+from hvdc_ident.budget import Known
 from hvdc_ident.codec import INLINE, NOT_STORED, Coded
 from hvdc_ident.data import Array
 from hvdc_ident.display import Shown, Table, axes_of, data_frame
@@ -79,6 +80,21 @@ class StartOutcome:
     message: str
     evaluations: int
     group: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class FitSoFar(Known):
+    """A fit whose estimates have been found, where a budget has ended what was to follow. forced: estimated against the report."""
+
+    result: FitResult | None = None
+    forced: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class EachSoFar(Known):
+    """Fits to single experiments that a budget has ended. table: of those that have ended, as `per_experiment` of a result."""
+
+    table: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

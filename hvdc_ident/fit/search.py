@@ -7,11 +7,12 @@ misfit gives.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
+from hvdc_ident.budget import BudgetSpent, Known
 from hvdc_ident.data import MAD_TO_STD, Array
 from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress, mapped
@@ -89,6 +90,35 @@ class Search:
         return sorted(reached, key=lambda end: end.cost)
 
 
+@dataclass(frozen=True)
+class StartsSoFar(Known):
+    """The starts of a search that its budget has ended. best: by unknown, where the lowest of them ended; empty where none has."""
+
+    best: FrozenMap[float] = field(default_factory=FrozenMap)
+
+    @classmethod
+    def of(cls, problem: Problem, runs: Sequence[OptimiserResult], count: int) -> StartsSoFar:
+        """Return those of a search for a problem's unknowns that was to make so many runs."""
+        reached = [r for r in runs if r.cost is not None]
+        best = min(reached, key=lambda r: r.cost or 0.0).theta if reached else ()
+        first = f"start {len(runs) + 1}" if len(runs) + 1 == count else f"starts {len(runs) + 1} to {count}"
+        return cls(
+            outcome_lines(runs),
+            (f"{first} of the search for the optimum",) if len(runs) < count else (),
+            best=FrozenMap(dict(zip(problem.names, map(float, best), strict=bool(reached)))),
+        )
+
+
+def outcome_lines(runs: Sequence[OptimiserResult | StartOutcome]) -> tuple[str, ...]:
+    """Return how each start of a search ended, in lines."""
+    return tuple(_outcome_line(k, run) for k, run in enumerate(runs, start=1))
+
+
+def _outcome_line(number: int, run: OptimiserResult | StartOutcome) -> str:
+    cost = "no cost" if run.cost is None else f"cost {run.cost:.6g}"
+    return f"search for the optimum, start {number} {run.status} after {run.evaluations} evaluations, {cost}"
+
+
 def search(
     problem: Problem,
     optimiser: Optimiser | str | None,
@@ -118,7 +148,7 @@ def search(
         count, number = starts or STARTS, 0
         while True:
             points = _round(problem, count - len(found.points), seed, number)
-            runs = _runs(problem, method, points, count, len(found.runs), executor, progress)
+            runs = _runs(problem, method, points, count, found.runs, executor, progress)
             found = Search((*found.points, *points), (*found.runs, *runs))
             count, number = 2 * count, number + 1
             if starts or not _worth_more(problem, found, misfit_expected=misfit_expected):
@@ -139,22 +169,27 @@ def _runs(
     method: Optimiser,
     points: Sequence[Array],
     count: int,
-    done: int,
+    before: Sequence[OptimiserResult],
     executor: Executor | None,
     progress: Progress | None,
 ) -> list[OptimiserResult]:
-    """Return the run from each point. count: of all starts so far planned; done: those that were made before."""
-    if progress:
-        why = " (they disagree)" if done else ""
-        progress(done, count, f"search for the optimum, start {done + 1} of {count}{why}")
-    runs: list[OptimiserResult] = []
-    for run in mapped(executor, partial(method.run, problem), points):
-        runs.append(run)
+    """Return the run from each point. count: of all starts so far planned; before: the runs that were made before.
+
+    Where the budget ends, `StartsSoFar` is what is known.
+    """
+    runs = list(before)
+    try:
         if progress:
-            cost = "no cost" if run.cost is None else f"cost {run.cost:.6g}"
-            text = f"start {done + len(runs)} {run.status} after {run.evaluations} evaluations, {cost}"
-            progress(done + len(runs), count, f"search for the optimum, {text}")
-    return runs
+            why = " (they disagree)" if runs else ""
+            progress(len(runs), count, f"search for the optimum, start {len(runs) + 1} of {count}{why}")
+        for run in mapped(executor, partial(method.run, problem), points):
+            runs.append(run)
+            if progress:
+                progress(len(runs), count, _outcome_line(len(runs), run))
+    except BudgetSpent as end:
+        end.known.append(StartsSoFar.of(problem, runs, count))
+        raise
+    return runs[len(before) :]
 
 
 def _worth_more(problem: Problem, found: Search, *, misfit_expected: bool) -> bool:
@@ -257,7 +292,7 @@ def _taken_up(
                 stay[alike] = o.message
         which.append(None if o.cost is None else alike)
     going = [k for k in range(len(places)) if k not in stay]
-    gone = _runs(problem, method, [places[k] for k in going], len(going), 0, executor, progress)
+    gone = _runs(problem, method, [places[k] for k in going], len(going), (), executor, progress)
     runs = dict(zip(going, gone, strict=True)) | {k: _stayed(problem, places[k], why) for k, why in stay.items()}
     points, results = [], []
     for number, (o, k) in enumerate(zip(begun, which, strict=True)):

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hvdc_ident.budget import BudgetSpent
 from hvdc_ident.data import Experiment
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor, Progress
@@ -42,7 +43,8 @@ from hvdc_ident.identifiability.practical import (
 )
 from hvdc_ident.identifiability.report import CONDITIONS, Contribution, Held, IdentifiabilityReport, Pilot
 from hvdc_ident.identifiability.structural import StructuralAnalysis, structural_analysis
-from hvdc_ident.identifiability.verdicts import WIDE, scale_of, unjudged_verdict, with_misfit_remark
+from hvdc_ident.identifiability.unfinished import joined_so_far, report_so_far
+from hvdc_ident.identifiability.verdicts import HIDDEN_BY_MISFIT, WIDE, scale_of, unjudged_verdict, with_misfit_remark
 from hvdc_ident.immutable import FrozenMap, joined
 from hvdc_ident.model import Model
 from hvdc_ident.sensitivity import collinear_subsets
@@ -68,21 +70,40 @@ def identifiability(
     candidates: the parameters to judge, with start, bounds and the given values, at which those are held that these data
     do not tell. held: values of other parameters.
     pair: two candidates whose common profile is wanted too, over twice their intervals, where both are fitted.
-    Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated.
+    Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated. Where a budget ends it,
+    `ReportSoFar` is what is known.
     """
     simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
     problem = Problem(simulator, tuple(experiments), tuple(candidates), held=FrozenMap(held or {}))
     assessment = Assessment(problem, seed, profile_options or ProfileOptions(), progress)
     _check(assessment)
-    assessment.report_stage("structure")
     model = subject.model if isinstance(subject, WithResponses) else subject
-    structure = _structure(model if isinstance(model, Model) else None, problem, seed)
+    try:
+        return _assessed(assessment, model if isinstance(model, Model) else None, starts, pair, executor)
+    except BudgetSpent as end:
+        end.known[:] = [report_so_far(assessment, end.known)]
+        raise
+
+
+def _assessed(
+    assessment: Assessment,
+    model: Model | None,
+    starts: int | None,
+    pair: tuple[str, str] | None,
+    executor: Executor | None,
+) -> IdentifiabilityReport:
+    """Return the report, stage by stage. model: None of what is no model, whose structure is judged by numbers."""
+    problem, seed = assessment.problem, assessment.seed
+    assessment.report_stage("structure")
+    structure = _structure(model, problem, seed)
+    assessment.structure = structure
     hold_structural(assessment, structure)
     free = tuple(f for f in problem.free if f.name not in assessment.held)
     if free:
         given = {n: assessment.free[n].given for n in assessment.held}
         admissible = replace(problem, free=free, held=problem.held | given)
-        first, result = pilot_fit(admissible, starts=starts, seed=seed, executor=executor, progress=progress)
+        first, result = pilot_fit(admissible, starts=starts, seed=seed, executor=executor, progress=assessment.progress)
+        assessment.pilot = result
     else:
         first, result = at_given_values(problem)
     _data_notes(assessment, first, result)
@@ -222,8 +243,7 @@ def _unjudged(
     if at.excess == 1.0:
         return ()
     verdicts, ratio = assessment.verdicts, float(np.sqrt(at.excess))
-    hidden = ("insensitive", "practically-unidentifiable", "at-bound")
-    others = [n for n in assessment.free if n not in fitted and verdicts[n].verdict in hidden]
+    others = [n for n in assessment.free if n not in fitted and verdicts[n].verdict in HIDDEN_BY_MISFIT]
     unjudged = noise_half_widths(whole, fitted, others) if others else {}
     for n, half in unjudged.items():
         verdicts[n] = unjudged_verdict(verdicts[n], ratio, half)
@@ -275,11 +295,15 @@ def identifiability_by_group(
     problem = Problem(simulator, tuple(experiments), tuple(candidates))
     check_groups(problem, groups)
     at = {f.name: f.given for f in problem.free}
-    reports = []
-    for group in groups:
+    reports: list[IdentifiabilityReport] = []
+    for number, group in enumerate(groups, start=1):
         part = part_of(problem, group, at)
         both = pair if pair and set(pair) <= set(group.parameters) else None
-        report = identifiability(subject, part.experiments, part.free, held=part.held, pair=both, **options)
+        try:
+            report = identifiability(subject, part.experiments, part.free, held=part.held, pair=both, **options)
+        except BudgetSpent as end:
+            joined_so_far(reports, end, [g.parameters for g in groups[number:]])
+            raise
         at |= {n: v.value for n, v in report.parameters.items()}
         reports.append(_noted(report, part))
     # What to measure next is that of the first group that needs it; the notes say what the others would.

@@ -11,17 +11,23 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hvdc_ident.budget import BudgetSpent
 from hvdc_ident.errors import SimulationError, require_known
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import Estimate, FitResult, Problem
 from hvdc_ident.fit.assessment import in_final_weights
 from hvdc_ident.fit.profile import Profile
+from hvdc_ident.fit.result import FitSoFar
+from hvdc_ident.fit.search import outcome_lines
 from hvdc_ident.identifiability.pilot_fit import LocalAnalysis
 from hvdc_ident.identifiability.practical import Assessment, profiles_of
 from hvdc_ident.identifiability.report import Held, IdentifiabilityReport
 from hvdc_ident.identifiability.verdicts import Verdict
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.next_step import NextStep
+
+NOT_WALKED = "its profile was not walked to its end: no interval of it is known"
+"""Why an estimate of a fit with forced ones has no interval, where the budget ended before its profile did."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,8 @@ def gated_fit(
     another set: those of this fit are walked, and are the intervals of all; forced ones are marked.
     whole: the fit is of all data at once, as the report's profiles are; else only weak ones take theirs, and forced ones have none.
     Where nothing is left to fit the status is "failed" and the message says so. One that is held on a bound makes the
-    status "at-bound", for that is where the fit of all would have ended.
+    status "at-bound", for that is where the fit of all would have ended. Where a budget ends what follows the estimates, `FitSoFar` has
+    these.
     """
     selection = gate(report, force)
     if not selection.fitted:
@@ -103,15 +110,46 @@ def gated_fit(
             rmse_given=problem.rmse_given,
             next=(*diagnosis, NextStep("identify"), NextStep("force")),
         )
-    result = fit(gated(problem, selection))
-    if result.status == "failed":
-        return result
-    systematic = result.adequacy is not None and result.adequacy.systematic  # then neither has an interval
-    if systematic:
+    result: FitResult | None = None
+    try:
+        result = fit(gated(problem, selection))
+        if result.status == "failed":
+            return result
+        walks = selection.forced and whole and not _is_systematic(result)
+        walked = _profiles_of_fit(gated(problem, selection), result, executor, progress) if walks else None
+    except BudgetSpent as end:
+        own = [k for k in end.known if isinstance(k, FitSoFar)]
+        if result is not None:
+            done = (*outcome_lines(result.starts), *(line for k in end.known for line in k.done))
+            own = [FitSoFar(done, tuple(w for k in end.known for w in k.not_tried), result=result)]
+        if own and own[0].result is not None:
+            stated = _allowed(problem, own[0].result, report, selection, None, whole=whole)
+            end.known[:] = [replace(own[0], result=stated, forced=selection.forced)]
+        raise
+    return _allowed(problem, result, report, selection, walked, whole=whole)
+
+
+def _is_systematic(result: FitResult) -> bool:
+    """Return whether a fit leaves more than noise: then no estimate of it has an interval."""
+    return result.adequacy is not None and result.adequacy.systematic
+
+
+def _allowed(
+    problem: Problem,
+    result: FitResult,
+    report: IdentifiabilityReport,
+    selection: Gate,
+    walked: FrozenMap[Profile] | None,
+    *,
+    whole: bool,
+) -> FitResult:
+    """Return a fit with its estimates as the report allows them to be stated. walked: the profiles of a fit with forced ones."""
+    if _is_systematic(result):
         estimates = dict(result.estimates)
-    elif selection.forced and whole:
-        walked = _profiles_of_fit(gated(problem, selection), result, executor, progress)
+    elif walked is not None:
         estimates = {n: _by_profile(n, e, walked, report, selection) for n, e in result.estimates.items()}
+    elif selection.forced and whole:
+        estimates = {n: e.without_interval(NOT_WALKED) for n, e in result.estimates.items()}
     else:
         estimates = {n: _stated(n, e, report, selection, whole=whole) for n, e in result.estimates.items()}
     on_bound = _at_bound(report, selection)

@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 
 from hvdc_ident.executor import Executor, Progress
-from hvdc_ident.fit import FitParameter, Problem
+from hvdc_ident.fit import FitParameter, FitResult, Problem
 from hvdc_ident.fit.jump_instants import PlacedInstant, within
 from hvdc_ident.fit.nonsmooth import LUCK, roughness, trend_of
 from hvdc_ident.fit.profile import Profile, profiles, trend_profiles
@@ -70,6 +70,7 @@ class Assessment:
     where an input is moved that was not. ends: where the starts of the pilot fit ended, with their costs. optima: others
     as good as the last one. placed: instants of jumps that lie between two rows, by the parameter that sets them. opened: those held for an
     open profile, in their order. profiled: by parameter its first profile with two ends, and how many of these were held then.
+    structure, pilot: the analysis of the structure and the pilot fit, None before they have come to their ends.
     """
 
     problem: Problem
@@ -90,6 +91,8 @@ class Assessment:
     placed: Mapping[str, PlacedInstant] = field(default_factory=dict)
     opened: list[str] = field(default_factory=list)
     profiled: dict[str, tuple[Profile, int]] = field(default_factory=dict)
+    structure: StructuralAnalysis | None = None
+    pilot: FitResult | None = None
 
     def __post_init__(self) -> None:
         self.free: dict[str, FitParameter] = {f.name: f for f in self.problem.free}

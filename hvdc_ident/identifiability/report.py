@@ -40,6 +40,20 @@ class Held:
 
 
 @dataclass(frozen=True)
+class Unsettled:
+    """What is known of a candidate on which there is no verdict, for the work was ended.
+
+    value: at the lowest cost so far, None where no start has ended. profile_ends: the ends of its profile that were found, None where no
+    part of it was walked. text: what was tried and what was not, in sentences.
+    """
+
+    value: float | None
+    unit: str
+    profile_ends: tuple[float | None, float | None] | None
+    text: str
+
+
+@dataclass(frozen=True)
 class Contribution:
     """Share of each parameter's information that comes from an experiment, by parameter."""
 
@@ -103,7 +117,8 @@ class IdentifiabilityReport(Coded, Shown):
     combinations: what is seen of those that cannot be told apart. collinear: subsets with their index, worst first within
     each size. experiments: what each contributes. profiles: of those that have one; pilot: the fit at whose optimum all stands.
     pair: the common profile of two, its rises in units of the threshold of one. notes: remarks on the data and on what the
-    search met. recommended: what to measure next; not_recommended: why nothing is.
+    search met. recommended: what to measure next; not_recommended: why nothing is. unsettled: of a report whose work was ended, each
+    candidate without a verdict.
     """
 
     parameters: FrozenMap[Verdict] = field(default_factory=FrozenMap)
@@ -123,6 +138,7 @@ class IdentifiabilityReport(Coded, Shown):
     pair: PairProfile | None = None
     pilot: Pilot = field(default_factory=Pilot)
     notes: tuple[str, ...] = ()
+    unsettled: FrozenMap[Unsettled] = field(default_factory=FrozenMap, metadata=stored_as("unsettled", optional=True))
     thresholds: FrozenMap[float] = field(default_factory=FrozenMap, metadata=NOT_STORED)
     stored_properties: ClassVar[tuple[str, ...]] = ("misspecified",)
 
@@ -172,6 +188,7 @@ class IdentifiabilityReport(Coded, Shown):
         rows = [(n, v.verdict, v.value, v.unit, interval_text(v.ci95)) for n, v in self.parameters.items()]
         yield Table(("parameter", "verdict", "value", "unit", "95 % interval"), tuple(rows))
         yield "\n".join(f"{n}: {v.reason}" for n, v in self.parameters.items())
+        yield "\n".join(f"{n}: no verdict. {u.text}" for n, u in self.unsettled.items())
         if self.recommended is not None:
             yield f"Measure next: {self.recommended.text}"
         elif self.not_recommended:

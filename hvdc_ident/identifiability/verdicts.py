@@ -27,6 +27,8 @@ VerdictName = Literal[
 ]
 WIDE = 0.5
 """A half-width of more than this share of the value (of the range where 0 is admissible) makes a parameter weak."""
+HIDDEN_BY_MISFIT: tuple[VerdictName, ...] = ("insensitive", "practically-unidentifiable", "at-bound")
+"""Verdicts that are taken back where the misfit alone led to them: the parameter is then not judged."""
 COLLINEAR = 20.0
 """A standard deviation that the others make so many times larger is worded, and so is half of that: a parameter that is known well all the
 same is not weak."""

@@ -80,7 +80,11 @@ def _framed(name: str, title: str, body: str) -> str:
 
 def _warnings(results: Results, s: RunSummary) -> list[str]:
     """Stages that failed, experiments without a run, and results of an earlier state of the study."""
-    unfinished = {data.get("stage") for data in results.stages.values() if data.get("status") == "unfinished"}
+    unfinished = {
+        data.get("stage")
+        for data in results.stages.values()
+        if data.get("status") == "unfinished" or "not_tried" in data
+    }
     lines = [
         f"<strong>{text(n)} {'is unfinished' if n in unfinished else 'failed'}</strong>: {prose(why.rstrip('.'))}."
         for n, why in s.failures.items()

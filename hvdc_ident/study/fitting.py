@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy as sp
 
+from hvdc_ident.budget import BudgetSpent
 from hvdc_ident.errors import ComputationError, SteadyStateError
 from hvdc_ident.files import csv_columns
 from hvdc_ident.fit import FitResult, Group, Problem, StartOutcome, fit, fit_each, fit_individually
@@ -17,6 +18,8 @@ from hvdc_ident.fit.judgement import Judgement, Judgements, judge
 from hvdc_ident.fit.likelihood import loss
 from hvdc_ident.fit.partial_fits import part_of
 from hvdc_ident.fit.residual import Curve, compared_rows
+from hvdc_ident.fit.result import EachSoFar, FitSoFar
+from hvdc_ident.fit.search import outcome_lines
 from hvdc_ident.fit.tolerance_profile import tolerance
 from hvdc_ident.identifiability import gated_fit
 from hvdc_ident.model import Model
@@ -26,6 +29,7 @@ from hvdc_ident.study.recorded_inputs import fitted_records
 from hvdc_ident.study.schema import FitTable
 from hvdc_ident.study.study import priors
 from hvdc_ident.summary.stage_results import Derived, ExperimentContext
+from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
     from hvdc_ident.data import Experiment, Trajectory
@@ -134,7 +138,14 @@ def fitted(
         result = fit(problem, **common, begun=begun(names))
     if result.status == "failed" or len(problem.fitted_experiments) < 2:
         return result
-    return replace(result, per_experiment=_one_by_one(problem, groups, result, asked.whiten, executor, progress))
+    try:
+        return replace(result, per_experiment=_one_by_one(problem, groups, result, asked.whiten, executor, progress))
+    except BudgetSpent as end:
+        own = next((k for k in end.known if isinstance(k, EachSoFar)), EachSoFar())
+        done = (*outcome_lines(result.starts), *own.done)
+        whole = replace(result, per_experiment=dict(own.table))
+        end.known[:] = [FitSoFar(done, own.not_tried, own.later, result=whole)]
+        raise
 
 
 def _one_by_one(
@@ -148,12 +159,26 @@ def _one_by_one(
     """The statistics over fits to single experiments, each begun at the estimates, group by group."""
     at = {f.name: result.values[f.name] for f in problem.free}
     parts = [part_of(problem, g, at) for g in groups] or [problem]
+    parts = [p for p in parts if len(p.fitted_experiments) > 1]
     table: dict[str, Any] = {}
+    done, count = 0, sum(len(p.fitted_experiments) for p in parts)
     for part in parts:
         begun = replace(part, free=tuple(replace(f, start=min(max(at[f.name], f.min), f.max)) for f in part.free))
-        if len(begun.fitted_experiments) > 1:
-            table |= fit_each(begun, whiten=whiten, executor=executor, progress=progress)
+        told = None if progress is None else partial(_beside_others, progress, done, count)
+        try:
+            table |= fit_each(begun, whiten=whiten, executor=executor, progress=told)
+        except BudgetSpent as end:
+            own = next((k for k in end.known if isinstance(k, EachSoFar)), EachSoFar())
+            rest = [f"the fits of {listed(p.names)} to single experiments" for p in parts[parts.index(part) + 1 :]]
+            end.known[:] = [replace(own, later=tuple(rest), table={**table, **own.table})]
+            raise
+        done += len(part.fitted_experiments)
     return table
+
+
+def _beside_others(progress: Progress, before: int, count: int, done: int, _: int, text: str) -> None:
+    """Tell the progress of one part of so many pieces of work. before: those of the parts before it."""
+    progress(before + done, count, text)
 
 
 def curves_of_run(experiment: Experiment, run: Trajectory) -> dict[str, Curve]:

@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.budget import Budget, BudgetSpent
+from hvdc_ident.budget import Budget, BudgetSpent, Known
 from hvdc_ident.codec import plain
 from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.executor import Progress, StageProgress
@@ -54,7 +54,7 @@ class Done:
     @property
     def unfinished(self) -> bool:
         """True where its budget ended it."""
-        return self.data.get("status") == UNFINISHED
+        return self.data.get("status") == UNFINISHED or "not_tried" in self.data
 
 
 def run_stage(study: Study, name: str, folder: Path, options: StageOptions) -> Done:
@@ -205,19 +205,21 @@ def _run(
 
     budget = options.budget
     limit: dict[str, Any] = {} if budget is None else {"limit": lambda: budget.left}
-    progress: Progress = StageProgress(so_far.progress, wanted.name, wanted.phases(study), **limit)
+    progress: Progress = StageProgress(so_far.progress, wanted.name, wanted.counted, **limit)
     inside = replace(
         options, folder=folder, keep=keep, progress=progress if budget is None else budget.watched(progress)
     )
     try:
         with nullcontext() if budget is None else budget.timed():
+            if budget is not None and budget.spent:  # what this stage builds on has taken all of it
+                raise BudgetSpent(f"{budget.text} is over")
             levels = rest()
             outcome = wanted.run(study, inside, earlier)
     except ComputationError as error:
         outcome = _failed(error)
-    except BudgetSpent:
+    except BudgetSpent as end:
         assert budget is not None
-        outcome = so_far.ended_by(budget, wanted)
+        outcome = so_far.ended_by(budget, wanted, end.known, wanted.so_far(study, end.known, inside))
     if outcome.unfinished and _kept(study, wanted, folder, options) is not None:  # the whole one from before stays
         return Done(wanted, {**heading_of(study, options.seed), **plain(outcome.data)}, outcome.failed, fresh=True)
     return _written(study, wanted, folder, options, outcome, levels)
@@ -226,36 +228,33 @@ def _run(
 class _SoFar:
     """What a stage under way has told so far, from which a result is made where its budget ends it.
 
-    first: its first answer. said: the texts of its progress, the last one at the end.
+    first: its first answer. last: the last text of its progress, without the stage's name.
     """
 
     def __init__(self, progress: Progress) -> None:
         self._progress = progress
         self.first: Mapping[str, Any] = {}
-        self.said: dict[str, None] = {}
+        self.last = ""
 
     def progress(self, done: int, total: int, text: str) -> None:
-        """Pass on progress and remember its text, without the stage's name."""
-        self.said[text.partition(": ")[2]] = None
+        """Pass on progress and remember its text."""
+        self.last = text.partition(": ")[2]
         self._progress(done, total, text)
 
-    def ended_by(self, budget: Budget, wanted: Stage) -> StageResult:
-        """Return the result of a stage that its budget has ended: what it had come to, and what was not tried."""
-        last = next(reversed(self.said), "")
-        begun = [p for p in wanted.parts if any(t.startswith(p) for t in self.said)]
-        open_parts = [words for p, words in wanted.parts.items() if p not in begun]
-        rest = f"the rest of {wanted.parts[begun[-1]]}" if begun else ""
-        not_tried = [t for t in (rest, *open_parts) if t]
-        message = f"ended by {budget.text}" + (f" at: {last}" if last else "")
+    def ended_by(self, budget: Budget, wanted: Stage, known: Sequence[Known], found: Mapping[str, Any]) -> StageResult:
+        """Return the result of a stage that its budget has ended: what it had come to, and what was not tried.
+
+        known: what its parts had come to; found: the JSON that the stage makes of it.
+        """
+        parts = list(wanted.parts.items())
+        at = next((k for k, (begins, _) in enumerate(parts) if self.last.startswith(begins)), -1)
+        rest = [w for k in known for w in k.not_tried] or ([f"the rest of {parts[at][1]}"] if at >= 0 else [])
+        not_tried = [*rest, *(words for _, words in parts[at + 1 :]), *(w for k in known for w in k.later)]
+        message = f"ended by {budget.text}" + (f" at: {self.last}" if self.last else "")
         message += f"; not tried: {listed(not_tried)}" if not_tried else ""
-        done = [t for t in self.said if _is_outcome(t)]
-        data = {**self.first, "status": UNFINISHED, "message": message, "done": done, "not_tried": not_tried}
-        return StageResult(data, failed=message, unfinished=True)
-
-
-def _is_outcome(text: str) -> bool:
-    """Return True for progress that tells an outcome, and not what begins: how a start of a search ended."""
-    return " evaluations, " in text
+        done = [line for k in known for line in k.done]
+        about = {"message": message, "done": done, "not_tried": not_tried}
+        return StageResult({**self.first, "status": UNFINISHED, **found, **about}, failed=message, unfinished=True)
 
 
 def _not_tried(budget: Budget) -> StageResult:

@@ -466,6 +466,6 @@ def _failures(stages: Mapping[str, Json]) -> dict[str, str]:
     """Return the reason of every stage that failed, by its name."""
     found = {n: str(s["failed"]) for n, s in ((stages.get("run") or {}).get("stages") or {}).items() if s.get("failed")}
     for name, data in stages.items():
-        if data.get("status") in ("failed", "unfinished") and data.get("stage") not in found:
+        if (data.get("status") in ("failed", "unfinished") or "not_tried" in data) and data.get("stage") not in found:
             found[str(data.get("stage") or name)] = str(data.get("message", ""))
     return found

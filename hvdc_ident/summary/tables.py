@@ -49,9 +49,13 @@ def verdicts_table(report: IdentifiabilityReport) -> Table:
     """Return each candidate's verdict with its value, interval and reason."""
     ratio = report.pilot.chi2_per_dof if report.misspecified else None
     name = "95 % interval" if ratio is None else f"95 % interval (χ²/dof {figures(ratio, 3)})"
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (n, v.verdict, estimate_texts(v.value, v.ci95)[0], interval_text(v.ci95), v.unit, v.reason)
         for n, v in report.parameters.items()
+    ]
+    rows += [
+        (n, "none yet", "" if u.value is None else estimate_texts(u.value, u.profile_ends)[0], "", u.unit, u.text)
+        for n, u in report.unsettled.items()
     ]
     return Table(("parameter", "verdict", "value", name, "unit", "why"), tuple(rows)).without_empty()
 

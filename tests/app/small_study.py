@@ -39,14 +39,14 @@ LATE = 0.03
 """Time constant of the plant's sensor, s, which the card lacks."""
 
 
-def write_small_study(folder: Path) -> Path:
-    """A lag of 5 1/s, recorded late by another lag, twice with noise."""
+def write_small_study(folder: Path, late: float = LATE) -> Path:
+    """A lag of 5 1/s, recorded late by another lag, twice with noise. late: time constant of that, s; 0: none."""
     time = np.arange(201) * 0.01
     random = np.random.default_rng(3)
     text = STUDY
     (folder / "lag.toml").write_text(CARD)
-    missing = {"effect": "lag", "at": "u", "parameters": {"T": LATE}}
-    plant = hi.apply_effects(hi.load_model(folder / "lag.toml"), [missing])
+    missing = {"effect": "lag", "at": "u", "parameters": {"T": late}}
+    plant = hi.apply_effects(hi.load_model(folder / "lag.toml"), [missing] if late else [])
     for name, to in (("up", 1.0), ("down", -0.5)):
         y = hi.simulate(plant, time, {"k": 5.0}, inputs={"u": hi.step(0.0, to, at=0.5)})["y"]
         rows = np.column_stack([time, np.where(time >= 0.5, to, 0.0), y + 0.005 * random.standard_normal(201)])

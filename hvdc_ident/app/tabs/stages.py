@@ -128,7 +128,7 @@ class StageDesk:
             )
             self._cancel.tooltip("Ends the work now. What is finished is kept, and the next run goes on from there.")
         with ui.column().classes("w-full gap-0 q-pt-sm") as self._progress:
-            self._bar = ui.linear_progress(0.0, show_value=False).props("instant-feedback aria-label=progress")
+            self._share = ui.linear_progress(0.0, show_value=False).props("instant-feedback aria-label=progress")
             self._times = ui.label("").classes("text-caption")
             self._text = ui.label("").classes("text-caption").style("overflow-wrap: anywhere; min-height: 2.6em")
         self._progress.set_visibility(False)
@@ -233,7 +233,8 @@ class StageDesk:
             button.set_enabled(not working)
         trouble = self._unreadable
         if found is not None and working:
-            self._bar.value = found.share
+            self._share.value = found.share
+            self._share.props(remove="indeterminate") if found.share else self._share.props("indeterminate")
             self._times.text = f"{percentage(found.share)}, {found.times}" if found.share else found.times
             self._text.text = found.text
         elif found is not None:

@@ -30,10 +30,17 @@ COLUMNS = 3
 
 def _render(results: Results) -> str:
     report, kept = results.objects.identified, results.get("identifiability")
-    if kept.get("first"):
+    if kept.get("first") and not report.parameters and not report.unsettled:
         return _first(str(kept["message"]), CramerRaoBounds.from_dict(kept["first"]))
-    if not report.parameters:
+    if not report.parameters and not report.unsettled:
         return ""
+    if report.unsettled:
+        message = f"<p><strong>{text(capital(str(kept['message'])))}.</strong></p>"
+        return (
+            message
+            + table_of(verdicts_table(report))
+            + "".join(f"<p class='small'>{text(n)}</p>" for n in report.notes)
+        )
     parts = [
         _lead(report),
         table_of(verdicts_table(report)),

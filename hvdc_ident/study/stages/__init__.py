@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.budget import Budget
+from hvdc_ident.budget import Budget, Known
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.executor import Progress, silent
 
@@ -81,14 +81,9 @@ def no_verdict(data: Mapping[str, Any]) -> str:
     return ""
 
 
-def one_phase(study: Study) -> int:
-    """Return 1, for a stage that counts one thing."""
-    return 1
-
-
-def two_by_group(study: Study) -> int:
-    """Return 2 for each group of a fit, whose search and profiles are counted one after the other."""
-    return 2 * max(1, len(study.settings.fit.groups if study.settings.fit else ()))
+def nothing_known(study: Study, known: Sequence[Known], options: StageOptions) -> Mapping[str, Any]:
+    """Return no JSON, for a stage whose parts are of no use before its end."""
+    return {}
 
 
 def no_files(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
@@ -107,10 +102,11 @@ class Stage:
     uses: stages whose result it takes where one stands in the folder; they run before it in a run, never because of it.
     takes: names of `StageOptions` that only some stages have and that decide its result. tell: the result in lines for people,
     from its JSON; told_in_part: also where a part of the work failed. verdict: the same in one phrase, for the screen of a run.
-    searches: whether it also runs at the start values, where a search begins; all run at the given ones. phases: how many
-    things it counts, one after the other, as progress. parts: what it does, in order: how the texts of its progress begin, and in
-    words. follow: the files that rest on its result and on those beside it in the
-    folder, whatever its end was, given the study, the folder and its JSON.
+    searches: whether it also runs at the start values, where a search begins; all run at the given ones. parts: what it does, in
+    order: how the texts of its progress begin, and in words; none of a stage that does one thing. counted: how the texts begin while
+    the last thing is counted after which little is left; None where there is no such thing. so_far: the JSON of what its parts had come
+    to where its budget ended it; what runs the model has no time left. follow: the files that rest on its result and on those beside
+    it in the folder, whatever its end was, given the study, the folder and its JSON.
     """
 
     name: str
@@ -127,8 +123,9 @@ class Stage:
     verdict: Callable[[Mapping[str, Any]], str] = no_verdict
     searches: bool = False
     told_in_part: bool = False
-    phases: Callable[[Study], int] = one_phase
     parts: Mapping[str, str] = field(default_factory=dict)
+    counted: str | None = ""
+    so_far: Callable[[Study, Sequence[Known], StageOptions], Mapping[str, Any]] = nothing_known
     follow: Callable[[Study, Path, Mapping[str, Any]], Mapping[str, str]] = no_files
 
 

@@ -34,7 +34,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     from hvdc_ident.study.size_curves import size_curves
 
     _need(study)
-    if "parameters" not in earlier["identify"]:
+    if "parameters" not in earlier["identify"] or "not_tried" in earlier["identify"]:
         why = f"nothing can be diagnosed before the stage identify has run: {earlier['identify'].get('message', 'it failed')}"
         return StageResult({"status": "failed", "message": why}, failed=why)
     report = IdentifiabilityReport.from_dict(earlier["identify"])
@@ -183,6 +183,7 @@ STAGE = Stage(
     searches=True,
     follow=follow,
     told_in_part=True,
+    counted=None,
     parts={
         "the nominal model": "the fit of the model as it is",
         "round": "rounds of candidates",

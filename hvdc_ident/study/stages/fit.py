@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 
 if TYPE_CHECKING:
+    from hvdc_ident.budget import Known
     from hvdc_ident.fit import FitResult, Problem
-    from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
     from hvdc_ident.summary.stage_results import Context
 
 
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the estimates with their intervals, RMSE before and after, and the values in the forms other tools read."""
+    from hvdc_ident.budget import BudgetSpent
+    from hvdc_ident.fit.result import FitSoFar
+    from hvdc_ident.fit.search import outcome_lines
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.next_step import next_phrases
     from hvdc_ident.study import fitting
@@ -24,7 +27,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     from hvdc_ident.study.pipeline import executor_of
 
     fitting.need(study, "fit")
-    if "parameters" not in earlier["identify"]:
+    if "parameters" not in earlier["identify"] or "not_tried" in earlier["identify"]:
         why = f"nothing can be fitted before the stage identify has run: {earlier['identify'].get('message', 'it failed')}"
         return StageResult({"status": "failed", "message": why}, failed=why)
     report = IdentifiabilityReport.from_dict(earlier["identify"])
@@ -33,28 +36,43 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             study, report, force=options.force, seed=options.seed, executor=executor, progress=options.progress
         )
     problem = fitting.problem_of(study)
-    data = {**result.to_dict(), **_context(study, problem, options, report, result)}
+    forced = [n for n in options.force if n in result.fitted and n not in report.identifiable]
+    data = {**result.to_dict(), **_context(study, problem, forced)}
     if result.status == "failed":
         tried = f". Try: {next_phrases(result.next)}" if result.next else ""
         return StageResult(data, failed=f"{result.message}{tried}")
-    sets = {"given": fitting.curves_at_given(study), "fitted": result.curves}
-    data["judgement"] = fitting.judgement_of(study, sets, result)
-    data["derived"] = fitting.derived(study, result)
-    if study.responses:
-        data["responses"] = compared(study, {"given": study.given, "fitted": result.values})
+    try:
+        options.progress(0, 1, "comparison of the fitted model with the recordings")
+        sets = {"given": fitting.curves_at_given(study), "fitted": result.curves}
+        data["judgement"] = fitting.judgement_of(study, sets, result)
+        data["derived"] = fitting.derived(study, result)
+        if study.responses:
+            data["responses"] = compared(study, {"given": study.given, "fitted": result.values})
+    except BudgetSpent as end:
+        end.known[:] = [FitSoFar(outcome_lines(result.starts), result=result, forced=tuple(forced))]
+        raise
     files = _files(study, result, data["derived"])
     return StageResult(data, files, failed=result.message if result.status == "not-converged" else "")
 
 
-def _context(
-    study: Study, problem: Problem, options: StageOptions, report: IdentifiabilityReport, result: FitResult
-) -> dict[str, Any]:
+def so_far(study: Study, known: Sequence[Known], options: StageOptions) -> Mapping[str, Any]:
+    """Return the estimates, where the budget ended after they were found."""
+    from hvdc_ident.fit.result import FitSoFar
+    from hvdc_ident.study import fitting
+
+    found = next((k for k in known if isinstance(k, FitSoFar) and k.result is not None), None)
+    if found is None or found.result is None:
+        return {}
+    return {**found.result.to_dict(), **_context(study, fitting.problem_of(study), found.forced)}
+
+
+def _context(study: Study, problem: Problem, forced: Sequence[str]) -> dict[str, Any]:
     """Return what a reader of the JSON needs beside the result: candidates, units, experiments, noise."""
     from hvdc_ident.study import fitting
     from hvdc_ident.study.study import candidate_lines
 
     return {
-        "forced": [n for n in options.force if n in result.fitted and n not in report.identifiable],
+        "forced": list(forced),
         "candidates": candidate_lines(study),
         "units": {o: e.measured.unit(o) for e in problem.experiments if e.measured is not None for o in e.outputs},
         "experiments": {e.name: fitting.context_of(e) for e in problem.experiments},
@@ -90,7 +108,7 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     from hvdc_ident.text import capital
 
     fit, about = fit_of(data), Context.from_dict(data)
-    if fit is None:
+    if fit is None or fit.status == "unfinished":
         return []
     more = [f"{capital(fit.adequacy.text)}."] if fit.adequacy is not None and fit.adequacy.text else []
     more += [f"{fit.roughness['text']}."] if fit.roughness else []
@@ -145,7 +163,12 @@ STAGE = Stage(
     tell=lines_of,
     verdict=verdict,
     searches=True,
-    phases=two_by_group,
-    parts={"search for the optimum": "the search for the optimum", "'": "the fits to single experiments"},
+    so_far=so_far,
+    parts={
+        "search for the optimum": "the search for the optimum",
+        "'": "the fits to single experiments",
+        "comparison": "the comparison of the fitted model with the recordings",
+    },
+    counted="'",
     follow=follow,
 )

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from hvdc_ident.study.stages import Stage, StageOptions, StageResult, two_by_group
+from hvdc_ident.study.stages import Stage, StageOptions, StageResult
 from hvdc_ident.text import listed
 
 if TYPE_CHECKING:
+    from hvdc_ident.budget import Known
     from hvdc_ident.executor import Executor, Progress
     from hvdc_ident.identifiability import IdentifiabilityReport
     from hvdc_ident.study.study import Study
@@ -33,6 +34,15 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
     with executor_of(study, options, "identify") as executor:
         report = judged(study, seed=options.seed, executor=executor, progress=options.progress)
     return StageResult({**report.to_dict(), "candidates": candidate_lines(study)})
+
+
+def so_far(study: Study, known: Sequence[Known], options: StageOptions) -> Mapping[str, Any]:
+    """Return the verdicts that stood when the budget ended, and what was known of the other candidates."""
+    from hvdc_ident.identifiability.unfinished import ReportSoFar
+    from hvdc_ident.study.study import candidate_lines
+
+    found = next((k.report for k in known if isinstance(k, ReportSoFar)), None)
+    return {} if found is None else {**found.to_dict(), "candidates": candidate_lines(study)}
 
 
 def judged(
@@ -84,8 +94,8 @@ def _first_answer(study: Study, options: StageOptions, starts: int) -> None:
     if rest < SOON:
         return
     about = (
-        f"One evaluation of the model with its derivatives took {duration(first.seconds)}. The search takes {starts} starts "
-        f"of about {A_START} each, {duration(rest)} or so, then profiles. An interrupt keeps this answer and what is finished."
+        f"One evaluation of the model with its derivatives took {duration(first.seconds)}. The search takes {starts} starts of some ten "
+        "to a hundred each, then profiles. An interrupt keeps this answer and what is finished."
     )
     options.announce([*first.lines, about])
 
@@ -100,7 +110,9 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     from hvdc_ident.summary.stage_results import identified_of
 
     report = identified_of(data)
-    width = max(map(len, report.parameters), default=0)
+    width = max(map(len, (*report.parameters, *report.unsettled)), default=0)
+    if not report.parameters and not report.unsettled:
+        return []
     lines = [*report.pilot.doubts]
     beside = ""
     if report.misspecified:
@@ -109,6 +121,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
         ratio = report.pilot.chi2_per_dof
         beside = "" if ratio is None else f" (chi2/dof {ratio:.3g})"
     lines += [f"{n:{width}}  {v.verdict}: {v.reason}{beside if v.ci95 else ''}" for n, v in report.parameters.items()]
+    lines += [f"{n:{width}}  no verdict: {u.text}" for n, u in report.unsettled.items()]
     lines += [*report.notes, *([report.not_recommended] if report.not_recommended else [])]
     lines += map(next_sentence, summarise({"identifiability": data}).next)
     names = listed(report.identifiable)
@@ -124,6 +137,7 @@ def verdict(data: Mapping[str, Any]) -> str:
     groups: dict[str, list[str]] = {}
     for name, v in report.parameters.items():
         groups.setdefault(v.verdict, []).append(name)
+    groups |= {"no verdict": [*report.unsettled]} if report.unsettled else {}
     found = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
     unknown = misfit_sentence(report.pilot.outputs_of_misfit).rstrip(".")
     return "; ".join(part for part in (report.pilot.search_doubt, found, unknown) if part)
@@ -139,7 +153,8 @@ STAGE = Stage(
     tell=lines_of,
     verdict=verdict,
     searches=True,
-    phases=two_by_group,
+    so_far=so_far,
+    counted=None,
     parts={
         "first answer": "the answer at the given values",
         "structure": "the structure of the model",

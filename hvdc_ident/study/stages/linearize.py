@@ -62,7 +62,7 @@ def _described(
     study = with_model(study, selected)
     point = model.point
     assert point is not None
-    options.progress(1, 3, "modes and transfer functions")
+    options.progress(0, 1, "modes and transfer functions")
     functions = [model.transfer_function(i, o) for o in model.output_names for i in model.input_names]
     fields = {
         "linear": model,
@@ -80,7 +80,7 @@ def _described(
         "jacobian_check": CHECKS[model.provenance["method"]],
         "frequency_response": model.bode() if len(functions) <= MOST_CHANNELS else None,
     }
-    options.progress(2, 3, "norms, margins, ports and comparisons")
+    options.progress(0, 1, "norms, margins, ports and comparisons")
     more, files = analyses(study, model)
     return {**fields, **more, "responses": tuple(compared(study, {selected.name: selected.values}))}, files
 
