@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hvdc_ident.data.bad_rows import BadRows, bad_rows, gaps, without_bad_rows
-from hvdc_ident.data.contradiction import Contradiction
+from hvdc_ident.data.contradiction import Band, Contradiction, bands
 from hvdc_ident.data.experiment import Experiment, SignalLike, experiment, recording_lines
 from hvdc_ident.data.noise import (
     FEWEST_QUIET,
@@ -43,6 +43,7 @@ __all__ = [
     "UNITS",
     "Array",
     "BadRows",
+    "Band",
     "Contradiction",
     "Experiment",
     "InputNoise",
@@ -55,6 +56,7 @@ __all__ = [
     "Trajectory",
     "at_rest",
     "bad_rows",
+    "bands",
     "before_event",
     "conversion",
     "event_time",

@@ -218,7 +218,13 @@ class Experiment(Shown):
             "notes": list(origin.notes),
             "not_recorded": {o: n for o, n in gaps.items() if n},
             "contradictions": [
-                {"kind": c.kind, "columns": list(c.columns), "times": list(c.times or ()), "text": c.text}
+                {
+                    "kind": c.kind,
+                    "columns": list(c.columns),
+                    "times": list(c.times or ()),
+                    "what": f"{c.what}; {c.done}" if c.done else c.what,
+                    "text": c.text,
+                }
                 for c in origin.contradictions
             ],
         }
