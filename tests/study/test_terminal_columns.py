@@ -54,15 +54,15 @@ def machine() -> Model:
     return model.with_values(point.inputs)
 
 
-def recorded(machine: Model, **inputs: InputSignal) -> Columns:
-    """What a recorder sees at the terminals: V in pu, theta in rad, f in Hz, MW and Mvar, with noise."""
+def recorded(machine: Model, noise: float = 1.0, **inputs: InputSignal) -> Columns:
+    """What a recorder sees at the terminals: V in pu, theta in rad, f in Hz, MW and Mvar, with so many times the usual noise."""
     time = np.arange(0.0, 4.0, 1.0 / RATE)
     run = hi.simulate(machine, time, inputs=inputs)
     angle = np.unwrap(np.arctan2(run["Vi"], run["Vr"]))
     rng = np.random.default_rng(3)
 
     def noisy(values: Array, std: float) -> Array:
-        return np.asarray(values + std * rng.standard_normal(time.size))
+        return np.asarray(values + noise * std * rng.standard_normal(time.size))
 
     f = F0 + np.gradient(angle, time) / (2.0 * np.pi)
     return {
