@@ -1,6 +1,7 @@
 // Curves on canvas, drawn by uPlot: grids one above the other with one abscissa and one cursor, or a plane of points.
 // put(grid, column, values) replaces one column of one grid's data; whole(grid, columns) replaces all of them, and
-// refine(grid, columns) does so while the same part of the abscissa stays in view. mark(key, at) moves a marker.
+// refine(grid, columns) does so while the same part of the abscissa stays in view. mark(key, at) moves a marker. shade(grid, bands) shades
+// spans of the abscissa, each {first, last, kind, what}.
 // Of a plane it draws what lies on it: the axis of the imaginary numbers, and at each pole its frequency and damping.
 const FONT = "12px system-ui, sans-serif", WIDE = 62;
 const ink = () => paint("var(--soft)"), faint = () => paint("var(--grid)");
@@ -109,6 +110,7 @@ export default {
   emits: ["ready", "marked", "viewed"],
   mounted() {
     this.plots = [];
+    this.bands = {};
     this.at = Object.fromEntries((this.markers || []).map((m) => [m.key, m.at]));
     this.sync = uPlot.sync(this.log ? "frequency" : this.plane ? "plane" : "time");
     this.$el.setAttribute("role", "img");
@@ -136,7 +138,7 @@ export default {
           axes: [{ ...axis(g === last ? this.xtitle : "", 2), size: g === last ? 34 : 8, values: g < last ? () => [] : this.log ? decades : digits }, { ...axis(grid.title, 3), values: digits }],
           cursor: { sync: { key: this.sync.key }, drag: { x: true, y: this.plane } },
           legend: { show: true, live: !this.plane, markers: { dash: (u, k) => (k && !this.plane && grid.curves[k - 1].mark ? "dotted" : u.series[k].dash ? "dashed" : "solid") } }, focus: { alpha: 1 },
-          hooks: this.plane ? { drawAxes: [upright] } : this.markers?.length ? this.marking(g) : {},
+          hooks: this.plane ? { drawAxes: [upright] } : { ...(this.markers?.length ? this.marking(g) : {}), ...this.shading(g) },
         };
         const empty = [[], ...grid.curves.map(() => [])];
         const plot = new uPlot(options, this.data?.[g] ?? empty, this.$el);
@@ -190,6 +192,47 @@ export default {
         }],
       };
     },
+    // The bands of one grid: below its curves, each with its kind at the foot where there is room, and what it is as the pointer's title.
+    shading(g) {
+      const ends = (u, band, canvas) => {  // one row is seen too
+        const [a, b] = [band.first, band.last].map((t) => u.valToPos(t, "x", canvas)), thin = 1.5 * (canvas ? devicePixelRatio : 1);
+        return [a - thin, b + thin];
+      };
+      return {
+        drawAxes: [(u) => {
+          const { ctx, bbox } = u, px = devicePixelRatio;
+          ctx.save();
+          ctx.beginPath();
+          ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+          ctx.clip();
+          ctx.font = `${11 * px}px system-ui, sans-serif`;
+          ctx.textAlign = "left";
+          ctx.textBaseline = "alphabetic";
+          let taken = bbox.left;
+          for (const band of this.bands[g] || []) {
+            const [a, b] = ends(u, band, true), wide = ctx.measureText(band.kind).width;
+            ctx.globalAlpha = 0.25;
+            ctx.fillStyle = paint("var(--given)");
+            ctx.fillRect(a, bbox.top, b - a, bbox.height);
+            const left = Math.min(Math.max(a, bbox.left) + 3 * px, bbox.left + bbox.width - wide);
+            if (left < taken || b < bbox.left || a > bbox.left + bbox.width) continue;
+            ctx.globalAlpha = 1;
+            ctx.fillStyle = paint("var(--ink)");
+            ctx.fillText(band.kind, left, bbox.top + bbox.height - 4 * px);
+            taken = left + wide + 3 * px;
+          }
+          ctx.restore();
+        }],
+        setCursor: [(u) => {
+          const at = u.cursor.left, met = (this.bands[g] || []).filter((band) => {
+            const [a, b] = ends(u, band, false);
+            return at >= a - 2 && at <= b + 2;
+          });
+          const said = met.map((band) => `${band.kind}: ${band.what}`).join("\n");
+          if (u.over.title !== said) u.over.title = said;
+        }],
+      };
+    },
     // The ends of the abscissa: of a plane around 0, of decades the data's own; else the plot's.
     ends() {
       return this.plane ? { range: around } : this.log ? { range: (u, low, high) => [low ?? 1, high ?? 10] } : {};
@@ -239,6 +282,10 @@ export default {
       plot.setData(columns, min == null);
       if (min != null) plot.setScale("x", { min, max });
       setTimeout(() => { this.refining = false; }, 0);  // the plot says so in a microtask
+    },
+    shade(grid, bands) {
+      this.bands[grid] = bands;
+      this.plots[grid].redraw(false);
     },
     mark(key, at) {
       this.at[key] = at;

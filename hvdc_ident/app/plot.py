@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from nicegui import ui
 from numpy.typing import NDArray
 
 from hvdc_ident.colours import variable
-from hvdc_ident.data import Array
+from hvdc_ident.data import Array, Band
 from hvdc_ident.report.drawing import base_style
 
 RECORDED, GIVEN, NOW, EFFECT = (variable(name) for name in ("measured", "given", "fitted", "effect"))
@@ -88,12 +88,15 @@ class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
             markers=[asdict(m) for m in markers],
         )
         self._drawn: dict[int, list[NDArray[np.float32]]] = {}
+        self._shaded: dict[int, list[dict[str, Any]]] = {}
         self.on("ready", self._draw)  # the browser builds a plot when its tab is opened for the first time
 
     def _draw(self) -> None:
         """Send what was sent before there was a plot."""
         for grid, columns in self._drawn.items():
             self.run_method("whole", grid, columns)
+        for grid, bands in self._shaded.items():
+            self.run_method("shade", grid, bands)
 
     def put(self, grid: int, column: int, values: Array) -> None:
         """Replace the values of one column (0: the abscissa) of a grid: (n,), thinned as the others were."""
@@ -110,6 +113,11 @@ class Plot(ui.element, component="plot.js"):  # type: ignore[call-arg]
     def refine(self, grid: int, columns: Sequence[Array]) -> None:
         """Replace all columns of a grid and go on looking at the same part of it: (n,) each."""
         self.run_method("refine", grid, [np.ascontiguousarray(columns[0]), *(_short(c) for c in columns[1:])])
+
+    def shade(self, grid: int, bands: Sequence[Band]) -> None:
+        """Shade spans of the abscissa of a grid, in place of those before: each with its kind, and what it is where it is pointed at."""
+        self._shaded[grid] = [asdict(b) for b in bands]
+        self.run_method("shade", grid, self._shaded[grid])
 
     def mark(self, key: str, at: float) -> None:
         """Move a marker."""

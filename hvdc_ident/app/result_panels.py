@@ -139,6 +139,7 @@ def _overlay(results: Results, experiment: str, place: Any, *, errors: bool) -> 
         plot = Plot(grids, "time, s", TALL * len(grids) + 30, f"Waveforms of {experiment}").classes("w-full")
         for k, overlay in enumerate(overlays):
             plot.whole(k, thinned(*overlay_columns(overlay, sets, errors=errors)))
+            plot.shade(k, overlay.bad)
 
 
 def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = False) -> list[Array]:

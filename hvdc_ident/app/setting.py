@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hvdc_ident as hi
-from hvdc_ident.data import Array, Experiment, SignalLike
+from hvdc_ident.data import Array, Band, Experiment, SignalLike, bands
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import FrequencyResponse, LinearModel
@@ -122,6 +122,10 @@ class Setting:
         if self.record is None or self.record.measured is None or output not in self.record.outputs:
             return np.full(self.time.size, np.nan)
         return self.record.measured[output]
+
+    def bad(self, output: str) -> tuple[Band, ...]:
+        """Return the bands of the record's rows that cannot be right or were left out, of an output or of what is played in."""
+        return () if self.record is None else bands(self.record.recording, set(self.record.outputs) - {output})
 
     def with_value(self, name: str, value: float) -> Setting:
         """Return the setting with another value of a parameter."""

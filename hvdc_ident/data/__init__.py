@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hvdc_ident.data.bad_rows import BadRows, bad_rows, gaps, without_bad_rows
-from hvdc_ident.data.contradiction import Contradiction
+from hvdc_ident.data.contradiction import Band, Contradiction, bands
 from hvdc_ident.data.experiment import Experiment, SignalLike, experiment, recording_lines
 from hvdc_ident.data.noise import (
     FEWEST_QUIET,
@@ -14,6 +14,7 @@ from hvdc_ident.data.noise import (
     at_rest,
     before_event,
     input_noise,
+    noise_before,
     noise_estimate,
     noise_floor,
     quiet_rows,
@@ -43,6 +44,7 @@ __all__ = [
     "UNITS",
     "Array",
     "BadRows",
+    "Band",
     "Contradiction",
     "Experiment",
     "InputNoise",
@@ -55,6 +57,7 @@ __all__ = [
     "Trajectory",
     "at_rest",
     "bad_rows",
+    "bands",
     "before_event",
     "conversion",
     "event_time",
@@ -65,6 +68,7 @@ __all__ = [
     "is_even",
     "is_unit",
     "multisine",
+    "noise_before",
     "noise_estimate",
     "noise_floor",
     "quiet_rows",

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -31,3 +33,24 @@ class Contradiction:
         write = f"; write: {self.write}" if self.write and not self.done else ""
         otherwise = f" (otherwise write: {self.write})" if self.write and self.done else ""
         return f"{self.where}: {self.what}{done}{write}{otherwise}"
+
+
+@dataclass(frozen=True)
+class Band:
+    """A span of time of a recording whose rows cannot be right or were left out. first, last: s. kind, what: of its contradiction."""
+
+    first: float
+    last: float
+    kind: str
+    what: str
+
+
+def bands(recording: Mapping[str, Any], others: Collection[str]) -> tuple[Band, ...]:
+    """Return the bands that a figure of a recording shades. recording: `Experiment.recording`; others: signals that the figure does
+    not show, and on which nothing in it depends: what is wrong with these alone is not told.
+    """
+    return tuple(
+        Band(float(c["times"][0]), float(c["times"][1]), c["kind"], c["what"])
+        for c in recording.get("contradictions", ())
+        if c["times"] and not (c["columns"] and set(c["columns"]) <= set(others))
+    )

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hvdc_ident.data.noise import InputNoise, noise_estimate
+from hvdc_ident.data.noise import InputNoise, noise_before, noise_floor
 from hvdc_ident.data.signals import InputSignal, event_time, input_signal
 from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
 from hvdc_ident.display import Shown, Table
@@ -158,12 +158,12 @@ class Experiment(Shown):
         yield Table(header, tuple(outputs)) if outputs else ""
 
     def _noise(self, output: str, event: float | None) -> float | None:
-        """Return the noise of an output as stated, else as its rows show it; None where they do not."""
-        values = self.measured[output] if self.measured is not None else np.empty(0)
-        known = values[np.isfinite(values)]
-        if output in self.noise or self.domain == "frequency" or not known.size or np.ptp(known) == 0.0:
+        """Return the noise of an output as stated, else as its rows show it before the event; None where they do not."""
+        if output in self.noise or self.measured is None:
             return self.noise.get(output)
-        return noise_estimate(self.time, values, event).std or None
+        values = self.measured[output]
+        std = noise_before(self.time, values, event).std
+        return std if std > noise_floor(values) else None
 
     def table(self) -> Trajectory:
         """Return inputs and recorded outputs over time, as one table."""
@@ -218,7 +218,13 @@ class Experiment(Shown):
             "notes": list(origin.notes),
             "not_recorded": {o: n for o, n in gaps.items() if n},
             "contradictions": [
-                {"kind": c.kind, "columns": list(c.columns), "times": list(c.times or ()), "text": c.text}
+                {
+                    "kind": c.kind,
+                    "columns": list(c.columns),
+                    "times": list(c.times or ()),
+                    "what": f"{c.what}; {c.done}" if c.done else c.what,
+                    "text": c.text,
+                }
                 for c in origin.contradictions
             ],
         }

@@ -125,6 +125,20 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> N
     return NoiseEstimate(max(std, white_std(records)), freedom, ESTIMATED)
 
 
+def noise_before(time: Array, values: Array, event: float | None) -> NoiseEstimate:
+    """Return the noise of an output as its recorded rows tell it; of source "" where too few lie before the event, and a fit's residual
+    has to tell.
+
+    time, values, event: as for `noise_estimate`.
+    """
+    known = np.isfinite(values)
+    t, v = time[known], values[known]
+    if int(before_event(t, v, event).sum()) < FEWEST_QUIET:
+        return NoiseEstimate()
+    # A column that does not move has no scatter to measure others by.
+    return noise_estimate(t, v, event) if np.ptp(v) else NoiseEstimate(source=ESTIMATED)
+
+
 def input_noise(time: ArrayLike, values: ArrayLike, event: float | None) -> InputNoise:
     """Return the noise that the record of an input shows, as `noise_estimate` finds it."""
     found, v = noise_estimate(time, values, event), np.asarray(values, dtype=float)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hvdc_ident.colours import EFFECT, FITTED, GIVEN, MARK, RECORDED
-from hvdc_ident.data import Array, Trajectory
+from hvdc_ident.data import Array, Band, Trajectory, bands
 from hvdc_ident.report.drawing import PlottedCurve, figure, svg, visible, visible_rows, zoomable
 from hvdc_ident.summary import Results
 from hvdc_ident.summary.decisions import STAGES
@@ -31,7 +31,7 @@ class Overlay:
     """A recorded output of an experiment and the model's runs by set of values ("given", "fitted", "effect").
 
     runs: tables with the columns OUTPUT and OUTPUT.measured; with OUTPUT.low and OUTPUT.high, between which a sample is
-    expected, that band is shaded. bad: spans of time in s whose rows cannot be right or were left out.
+    expected, that band is shaded. bad: rows that cannot be right or were left out.
     """
 
     experiment: str
@@ -40,7 +40,7 @@ class Overlay:
     runs: Mapping[str, Trajectory]
     event: float | None = None
     window: tuple[float, float] | None = None
-    bad: tuple[tuple[float, float], ...] = ()
+    bad: tuple[Band, ...] = ()
 
     @property
     def record(self) -> Trajectory:
@@ -111,21 +111,7 @@ def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[st
         runs,
         about.event,
         about.window,
-        _bad(results, about.recording, output),
-    )
-
-
-def _bad(results: Results, recording: Mapping[str, Any], output: str) -> tuple[tuple[float, float], ...]:
-    """Return the spans of time in s in which rows of an output, or of what is played in, cannot be right or were left out.
-
-    recording: `Experiment.recording`. What is wrong with other outputs alone is not told.
-    """
-    others = results.units.keys() - {output}
-    found = [c for c in recording.get("contradictions", ()) if len(c["times"]) == 2]
-    return tuple(
-        (float(c["times"][0]), float(c["times"][1]))
-        for c in found
-        if not set(c["columns"]) or set(c["columns"]) - others
+        bands(about.recording, results.units.keys() - {output}),
     )
 
 
@@ -180,10 +166,10 @@ class Sheet:
         for axes in (self.top, self.strip):
             if overlay.event is not None:
                 axes.axvline(overlay.event, color=MARK, linewidth=0.8, linestyle=":")
-            for k, (first, last) in enumerate(overlay.bad):
+            for k, band in enumerate(overlay.bad):
                 name = "rows that cannot be right, or were left out" if axes is self.top and k == 0 else "_"
                 axes.axvspan(
-                    first, last, color=GIVEN, alpha=0.25, linewidth=1.5, label=name
+                    band.first, band.last, color=GIVEN, alpha=0.25, linewidth=1.5, label=name
                 )  # the edge shows one row too
             if overlay.window is not None:
                 axes.axvspan(*overlay.window, color=FITTED, alpha=0.05, linewidth=0)

@@ -28,6 +28,7 @@ from hvdc_ident.study import schema
 from hvdc_ident.study.apparent_power import ApparentPower
 from hvdc_ident.study.conversions import STRONG
 from hvdc_ident.study.initial_values import outputs_of
+from hvdc_ident.study.recordings import TIME_SHIFT
 from hvdc_ident.study.terminal_columns import (
     DEGREE,
     FASTEST,
@@ -162,20 +163,38 @@ class _Case:
 
     def power(self) -> Iterator[Contradiction]:
         """Yield a power beyond what the machine delivers."""
-        levels = [self._output_level(o) for o in LEVELS.values() if o in self.experiment.outputs]
-        size = math.hypot(*(v for v in levels if v is not None))
+        size, _ = self._loads(_Mistake())
         if self.about.mva is None or size <= 2.0 * LOADS[1] * self.about.mva:
             return
-        near = [(k, u) for k, u in ((1e-3, "k"), (1e-6, "")) if LOADS[0] <= k * size / self.about.mva <= LOADS[1]]
         what = f"P and Q are {quantity(size, 'MVA')} {self._when}, of a machine of {self.about.mva:g} MVA"
-        if len(near) == 1:
-            k, prefix = near[0]
-            ways = {o: Way(k) for o in LEVELS.values() if o in self.experiment.outputs}
-            yield self._finding(
-                "unit", tuple(ways), f"{what}: they are in {prefix}W and {prefix}var", self._columns(ways)
-            )
+        near = [
+            m for m in self._smaller_units() if all(LOADS[0] <= v / self.about.mva <= LOADS[1] for v in self._loads(m))
+        ]
+        rows = self._soon()
+        if len(near) > 1 and rows is not None:  # the level does not tell whether a small one is right as it is
+            near.sort(key=lambda m: self._misfit(rows, m))
+        if near:
+            yield self._finding("unit", near[0].columns, f"{what}: {near[0].words}", self._columns(near[0].ways))
         else:
             yield self._finding("unit", ("P", "Q"), f"{what}: what is their unit?")
+
+    def _smaller_units(self) -> Iterator[_Mistake]:
+        """Yield the ways in which P and Q, or one of them, are in a smaller unit than the model's: both first."""
+        for group in self._groups():
+            for k, prefix in ((1e-3, "k"), (1e-6, "")):
+                units = " and ".join(self.study.model.outputs[o].unit.replace("M", prefix) for o in group)
+                are = "they are" if len(group) > 1 else f"{group[0]} is"
+                yield _Mistake("unit", f"{are} in {units}", dict.fromkeys(group, k))
+
+    def _groups(self) -> list[list[str]]:
+        """Return the recorded powers: both, and each of them."""
+        powers = [o for o in LEVELS.values() if o in self.experiment.outputs]
+        return [powers, *([o] for o in powers if len(powers) > 1)]
+
+    def _loads(self, mistake: _Mistake) -> tuple[float, float]:
+        """Return the apparent power before the event without a mistake of the record, and that of the columns it is about, MVA."""
+        levels = {o: mistake.of(o) * (self._output_level(o) or 0.0) for o in self._groups()[0]}
+        return math.hypot(*levels.values()), math.hypot(*(levels[o] for o in mistake.columns))
 
     def current(self) -> Iterator[Contradiction]:
         """Yield a power that is another one than the recorded voltage and current make."""
@@ -227,9 +246,13 @@ class _Case:
     def movement(self) -> Iterator[Contradiction]:
         """Yield the mistake without which the model moves as the record does, where as it is it does not."""
         rows = self._soon()
-        if rows is None or (own := self._misfit(rows, _Mistake())) * STRONG <= FOLLOWS:
+        if rows is None:
             return
-        righted = [(self._on_time(rows, m), m) for m in self._mistakes()]
+        if TIME_SHIFT in self.experiment.nuisance:  # a fit finds their clock
+            rows = self._on_time(rows, self._late() or 0.0)
+        if (own := self._misfit(rows, _Mistake())) * STRONG <= FOLLOWS:
+            return
+        righted = [(self._on_time(rows, m.late), m) for m in self._mistakes()]
         tried = [(self._misfit(e, m), m) for e, m in righted if _moves(e)]
         misfit, mistake = min(tried, key=lambda t: t[0], default=(math.inf, _Mistake()))
         if misfit > FOLLOWS or own < STRONG * misfit:
@@ -252,7 +275,7 @@ class _Case:
                 (2.0 * math.pi, "unit", "is in whole turns"),
             ]
             yield from (_Mistake(kind, f"theta {words}", {"theta": k}) for k, kind, words in turns)
-        for group in (powers, *([o] for o in powers if len(powers) > 1)):
+        for group in self._groups():
             units = [self.study.model.outputs[o].unit for o in group]
             have, are = ("have", "are") if len(group) > 1 else ("has", "is")
             factors = [
@@ -276,7 +299,7 @@ class _Case:
                 {one: other, other: one},
                 write=write,
             )
-        if (late := self._late()) is not None:
+        if TIME_SHIFT not in e.nuisance and (late := self._late()) is not None:
             when = f"{abs(late):.4g} s {'later' if late > 0.0 else 'earlier'} than the voltage"
             words = f"{' and '.join(powers)} come {when}, by another clock"
             write = 'nuisance = ["time-shift"]'
@@ -406,14 +429,14 @@ class _Case:
         late = step * (int(np.argmax(summed)) - (grid.size - 1))
         return late if abs(late) > step else None
 
-    def _on_time(self, rows: Experiment, mistake: _Mistake) -> Experiment:
-        """Return some rows of the experiment with the outputs at the time at which they were, whose clock is off."""
+    def _on_time(self, rows: Experiment, late: float) -> Experiment:
+        """Return some rows of the experiment with the outputs at the time at which they were, whose clock is off by some s."""
         e = self.experiment
-        if not mistake.late:
+        if not late:
             return rows
         assert e.measured is not None and rows.measured is not None
         moved = np.column_stack(
-            [np.interp(rows.time + mistake.late, e.time[k := np.isfinite(v)], v[k]) for v in e.measured.values.T]
+            [np.interp(rows.time + late, e.time[k := np.isfinite(v)], v[k]) for v in e.measured.values.T]
         )
         return rows.with_(measured=replace(rows.measured, values=moved))
 

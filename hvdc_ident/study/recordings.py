@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import (
-    FEWEST_QUIET,
     Array,
     Experiment,
     InputSignal,
@@ -22,13 +21,12 @@ from hvdc_ident.data import (
     event_time,
     input_noise,
     input_signal,
-    noise_estimate,
+    noise_before,
     noise_floor,
     same_unit,
     scaled,
     seconds_of,
 )
-from hvdc_ident.data.noise import ESTIMATED
 from hvdc_ident.data.three_phase import (
     PhaseFilter,
     PhasorColumns,
@@ -139,14 +137,7 @@ def with_noise(
     for o in e.outputs:
         recorded = np.flatnonzero(np.isfinite(table[o]))
         rows = recorded[_apart(e.time[recorded], means.get(o, 0.0))]
-        time, values = e.time[rows], table[o][rows]
-        told = o not in stated and int(before_event(time, values, event).sum()) >= FEWEST_QUIET
-        moves = (
-            values.size > 0 and float(np.ptp(values)) > 0.0
-        )  # a column that does not has no scatter to measure others by
-        found = (
-            noise_estimate(time, values, event) if told and moves else NoiseEstimate(source=ESTIMATED if told else "")
-        )
+        found = NoiseEstimate() if o in stated else noise_before(e.time[rows], table[o][rows], event)
         notes[o] = _noise(stated.get(o), found, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
         if notes[o].source == "estimated":
             dof[o], told_by[o] = max(1.0, found.freedom), found.source

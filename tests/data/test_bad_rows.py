@@ -103,3 +103,26 @@ def test_missing_rows_are_a_gap_and_other_rates_are_none():
     assert (gap.kind, gap.first, gap.last) == ("gap", 199, 200)
     fast_then_slow = np.concatenate([TIME[:200], TIME[200::10]])
     assert gaps(fast_then_slow) == ()
+
+
+def test_rows_that_repeat_tell_nothing_where_a_simulation_chose_its_instants():
+    """A solver of variable steps writes a row again where nothing happens; a recorder that misses rows still has a clock."""
+    standing = record()
+    stuck(standing)
+    uneven = np.cumsum(np.random.default_rng(2).uniform(0.2, 1.8, N)) / 60.0
+    assert bad_rows(uneven, standing, angles=ANGLES) == ()
+    kept = np.delete(np.arange(N), [100, 101, 102, 180])
+    assert [b.kind for b in bad_rows(TIME[kept], {n: v[kept] for n, v in standing.items()}, angles=ANGLES)] == ["stuck"]
+
+
+def test_a_number_of_nines_within_the_course_is_no_mark():
+    sound = record()
+    sound["P"] = np.round(999.0 + 5.0 * (sound["P"] - 200.0))
+    assert np.count_nonzero(sound["P"] == 999.0) > 50 and bad_rows(TIME, sound, angles=ANGLES) == ()
+
+
+def test_a_fault_that_clears_within_a_row_is_no_spike():
+    sound = record()
+    for name, size in (("V", -0.4), ("P", -90.0), ("Q", 60.0)):
+        sound[name][60] += size
+    assert bad_rows(TIME, sound, angles=ANGLES) == ()

@@ -10,12 +10,13 @@ import pytest
 from scipy.optimize import curve_fit
 
 from hvdc_ident import load_study
-from hvdc_ident.data import noise_estimate
+from hvdc_ident.data import Experiment, noise_estimate
 from hvdc_ident.errors import InputError, StudyError
 from hvdc_ident.fit import FitResult, Problem, fit
 from hvdc_ident.report.page import write_report
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.pipeline import run_stage
+from hvdc_ident.study.recordings import with_noise
 from hvdc_ident.study.stages import StageOptions
 from hvdc_ident.study.study import Study
 from hvdc_ident.study.summary import Summary
@@ -193,6 +194,38 @@ def test_a_gap_splits_the_rows_that_noise_is_estimated_from() -> None:
     assert noise_estimate(time, values, None).std == pytest.approx(1e-3, rel=0.2)
     sparse = np.where(np.arange(400) % 4 == 0, values, np.nan)
     assert noise_estimate(time, sparse, None).std == pytest.approx(1e-3, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("change", "noise", "shown"),
+    [
+        ({}, 0.01, True),
+        ({"moves": False}, 0.01, False),  # no event: the fit's residual tells
+        ({"at": 3}, 0.01, False),  # too few rows before it
+        ({"holes": True}, 0.01, True),
+        ({}, 1e-9, False),  # below the floor
+        ({"event": 0.2}, 0.01, True),
+        ({"noise": {"w": 0.02}}, 0.01, True),
+    ],
+)
+def test_an_experiment_shows_the_event_and_the_noise_that_are_found(change: dict, noise: float, shown: bool) -> None:
+    more = {k: v for k, v in change.items() if k in ("event", "noise")}
+    v = (
+        np.where(np.arange(TIME.size) < change.get("at", 60), 1.0, 1.5)
+        if change.get("moves", True)
+        else np.ones(TIME.size)
+    )
+    w = exact(TIME)[1] + noise * np.random.default_rng(4).standard_normal(TIME.size)
+    if change.get("holes"):
+        w[[3, 4, 30, 100]] = np.nan
+    e = Experiment(TIME, inputs={"v": v}, outputs={"w": w}, **more)
+    found, _ = with_noise(e)
+    lines = str(e).splitlines()
+    assert lines[0].endswith("no event" if found.event is None else f"event at {found.event:g} s")
+    cells = lines[-1].split()
+    assert ("w" in found.noise) is shown and len(cells) == (5 if shown else 4)
+    if shown:
+        assert float(cells[-2]) == pytest.approx(found.noise["w"], rel=1e-5)
 
 
 def test_units_are_converted_and_said(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 import hvdc_ident as hi
 from hvdc_ident.data import Array, InputSignal
-from hvdc_ident.model import parse_card
+from hvdc_ident.model import Model, parse_card
 from hvdc_ident.plants import UnitPart, unit_card
 from hvdc_ident.study.column_contradictions import column_contradictions
 from hvdc_ident.study.new_study import NewStudy
@@ -39,8 +39,8 @@ Columns = dict[str, Array]
 
 
 @pytest.fixture(scope="module")
-def plant() -> Columns:
-    """A dip of the voltage behind a line, then a course of its frequency: V in pu, theta in rad, f in Hz, MW and Mvar, with noise."""
+def machine() -> Model:
+    """The unit behind a line, at rest; E is the voltage there, and turn its angle."""
     parts = {
         "gen": UnitPart("genrou", {"Sn": MVA, "H": 3.6}),
         "avr": UnitPart("sexs", {"K": 140.0}),
@@ -48,16 +48,21 @@ def plant() -> Columns:
     }
     card = unit_card(parts, R=0.004, X=0.12, f0=F0)
     seen = '[outputs]\nVr = {value = "line.Vr", unit = "pu"}\nVi = {value = "line.Vi", unit = "pu"}'
-    model = parse_card(card.replace("[outputs]", seen))
+    card = card.replace("[outputs]", seen).replace('"grid.theta" = "0"', '"grid.theta" = "turn"')
+    model = parse_card(card.replace("[inputs]", '[inputs]\nturn = {value = 0.0, unit = "rad", settable = false}'))
     point = hi.find_operating_point(model, outputs={"P": 200.0, "Vt": 1.02}, free=["Pref", "Vref"])
+    return model.with_values(point.inputs)
+
+
+def recorded(machine: Model, noise: float = 1.0, **inputs: InputSignal) -> Columns:
+    """What a recorder sees at the terminals: V in pu, theta in rad, f in Hz, MW and Mvar, with so many times the usual noise."""
     time = np.arange(0.0, 4.0, 1.0 / RATE)
-    dip = InputSignal.corners([(1.0, 1.0), (1.1, 0.8), (1.3, 0.97)])
-    run = hi.simulate(model.with_values(point.inputs), time, inputs={"E": dip})
+    run = hi.simulate(machine, time, inputs=inputs)
     angle = np.unwrap(np.arctan2(run["Vi"], run["Vr"]))
     rng = np.random.default_rng(3)
 
     def noisy(values: Array, std: float) -> Array:
-        return np.asarray(values + std * rng.standard_normal(time.size))
+        return np.asarray(values + noise * std * rng.standard_normal(time.size))
 
     f = F0 + np.gradient(angle, time) / (2.0 * np.pi)
     return {
@@ -68,6 +73,19 @@ def plant() -> Columns:
         "P": noisy(run["P"], 0.1),
         "Q": noisy(run["Q"], 0.1),
     }
+
+
+@pytest.fixture(scope="module")
+def plant(machine: Model) -> Columns:
+    """A dip of the voltage behind the line, then a lower one."""
+    return recorded(machine, E=InputSignal.corners([(1.0, 1.0), (1.1, 0.8), (1.3, 0.97)]))
+
+
+@pytest.fixture(scope="module")
+def turning(machine: Model) -> Columns:
+    """The angle behind the line moves by some degrees and the voltage stays; the machine has the inertia that its file states."""
+    course = InputSignal.corners([(1.0, 0.0), (1.2, 0.15), (2.0, -0.1)])
+    return recorded(machine.with_values({"gen.H": 3.0}), turn=course)
 
 
 def written(folder: Path, columns: Mapping[str, Array]) -> Path:
@@ -155,12 +173,62 @@ MISTAKES: dict[str, tuple[str, Mistake]] = {
     "angle and frequency": ("turns twice", lambda p: (p, {"inputs": ["V", "theta", "f"]})),
     "another angle beside the frequency": ("turn", lambda p: (p | {"theta": 3.0 * p["theta"]}, {"beside": True})),
     "angle of the other sign beside the frequency": ("turn", lambda p: (p | {"theta": -p["theta"]}, {"beside": True})),
+    "angle in whole turns": ("unit", lambda p: (p | {"theta": p["theta"] / (2.0 * np.pi)}, {})),
+    "angle in rad that is said to be degrees": ("unit", lambda p: (p, {"columns": {"theta": {"unit": '"deg"'}}})),
+    "P alone into the plant": ("sign", lambda p: (p | {"P": -p["P"]}, {})),
+    "Q alone in kvar": ("unit", lambda p: (p | {"Q": 1e3 * p["Q"]}, {})),
+    "powers in GW": ("unit", lambda p: (p | {"P": 1e-3 * p["P"], "Q": 1e-3 * p["Q"]}, {})),
+    "powers of one phase": ("phase", lambda p: (p | {"P": p["P"] / 3.0, "Q": p["Q"] / 3.0}, {})),
+    "P and Q exchanged": ("exchanged", lambda p: (p | {"P": p["Q"], "Q": p["P"]}, {})),
+    "P and Q late": ("clock", lambda p: (p | {"P": late(p["P"]), "Q": late(p["Q"])}, {})),
+    "powers of one phase beside the current": (
+        "phase",
+        lambda p: (metered(p) | {"P": p["P"] / 3.0, "Q": p["Q"] / 3.0}, IN_KV),
+    ),
+    "powers in GW beside the current": (
+        "unit",
+        lambda p: (metered(p) | {"P": 1e-3 * p["P"], "Q": 1e-3 * p["Q"]}, IN_KV),
+    ),
+    "the current of a plant of another size": ("current", lambda p: (metered(p, 7.0), IN_KV)),
+    "the current of a plant that moves otherwise": (
+        "current",
+        lambda p: (metered(p | {"Q": p["Q"][::-1], "P": p["P"][::-1]}) | {n: p[n] for n in "PQ"}, IN_KV),
+    ),
+    "peak of the voltage of a phase": ("base", lambda p: (p | {"V": (2.0 / 3.0) ** 0.5 * p["V"]}, {})),
+    "a voltage that no base explains": ("base", lambda p: (p | {"V": 3.0 * p["V"]}, {})),
+    "a power that no unit explains": ("unit", lambda p: (p | {"P": 5.0 * p["P"], "Q": 5.0 * p["Q"]}, {})),
 }
+OPEN = {
+    "another angle beside the frequency": "3 times as far",
+    "the current of a plant of another size": "which of them is in another unit, or another plant's",
+    "the current of a plant that moves otherwise": "of the square of the movement; one of them is another plant's",
+    "a voltage that no base explains": "what is its base",
+    "a power that no unit explains": "what is their unit",
+}
+"""Mistakes that no line of the study mends, with what is said of them."""
+OF_TURNING = ("angle in whole turns", "angle in rad that is said to be degrees")
+"""Mistakes that only a record shows in which the angle alone moves."""
+IN_KV = {"columns": {"V": {"name": '"V1 Mag"', "base": KV}}}
+
+
+def late(values: Array) -> Array:
+    """A column that comes 0.4 s late."""
+    return np.concatenate([values[:20], values[:-20]])
+
+
+def metered(p: Columns, times: float = 1.0) -> Columns:
+    """The columns with the voltage in kV and the current in A, times a factor."""
+    current = np.hypot(p["P"], p["Q"]) / (3**0.5 * KV * p["V"])
+    found = {n: v for n, v in p.items() if n != "V"}
+    return found | {"V1 Mag [kV]": KV * p["V"], "I1 Mag [A]": times * 1e3 * current}
 
 
 def stated(folder: Path, keys: Mapping[str, Any]) -> Path:
     """A study as a hand writes it: columns of the signals' names, nothing else stated."""
-    columns = "".join(f"columns = {{{n} = {{base = {line['base']}}}}}\n" for n, line in keys.get("columns", {}).items())
+    columns = "".join(
+        f"columns = {{{n} = {{{', '.join(f'{k} = {v}' for k, v in line.items())}}}}}\n"
+        for n, line in keys.get("columns", {}).items()
+    )
     inputs = ", ".join(f'"{n}"' for n in keys.get("inputs", ["V", "theta"]))
     (folder / "study.toml").write_text(
         f'schema = 1\n[model]\nsource = "unit/unit.toml"\n[[experiment]]\nname = "event"\ndata = "event.csv"\n'
@@ -170,8 +238,11 @@ def stated(folder: Path, keys: Mapping[str, Any]) -> Path:
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_said_and_what_to_write_mends_it(mistake: str, plant: Columns, tmp_path: Path) -> None:
+def test_a_mistake_is_said_and_what_to_write_mends_it(
+    mistake: str, plant: Columns, turning: Columns, tmp_path: Path
+) -> None:
     kind, made = MISTAKES[mistake]
+    plant = turning if mistake in OF_TURNING else plant
     new(tmp_path, plant)
     columns, keys = made(plant)
     written(
@@ -184,13 +255,14 @@ def test_a_mistake_is_said_and_what_to_write_mends_it(mistake: str, plant: Colum
     (found,) = column_contradictions(hi.load_study(path))
     assert found.kind == kind and found.where == "experiment event"
     shown = str(hi.check(path))
-    assert "to be mended" in shown and found.text in shown and shown.count("experiment event: ") <= 3
-    if not found.write:
-        assert mistake == "another angle beside the frequency" and "3 times as far" in found.what
+    assert "to be mended" in shown and found.text in shown
+    assert shown.count("experiment event: ") <= 3
+    if mistake in OPEN:
+        assert not found.write and OPEN[mistake] in found.what
         return
     key = found.write.split(" = ")[0]
     text = re.sub(rf"^{key} = .*\n", "", path.read_text(), flags=re.MULTILINE)
-    path.write_text(text.replace("outputs = ", f"{found.write}\noutputs = "))
+    path.write_text(text.replace("interpolation = ", f"{found.write}\ninterpolation = "))
     assert column_contradictions(hi.load_study(path)) == ()
 
 

@@ -541,6 +541,7 @@ class Explorer:
             if self._draws_recorded:
                 columns.insert(0, setting.recorded(name))
             self._wave.whole(k, thinned(setting.time, *columns))
+            self._wave.shade(k, setting.bad(name))
 
     def _draw_bode(self) -> None:
         given, now = (None if a is None else a.bode for a in self._answers)

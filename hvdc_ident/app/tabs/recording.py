@@ -36,7 +36,7 @@ from hvdc_ident.app.study_folder import (
     safe_name,
     stamp,
 )
-from hvdc_ident.data import Array, Trajectory, event_time
+from hvdc_ident.data import Array, Trajectory, bands, event_time
 from hvdc_ident.errors import HvdcIdentError, StudyError
 from hvdc_ident.model import AnyModel
 from hvdc_ident.models import shipped_models
@@ -565,6 +565,16 @@ class Mapper:
         if self._record is not None and self._plot is not None:
             for k, name in enumerate(self._drawn()):
                 self._plot.whole(k, thinned(self._time, self._record[name]))
+            self._shade()
+
+    def _shade(self) -> None:
+        """Shade each column's rows that cannot be right or were left out, once `check` has found them."""
+        if self._map is None or self._plot is None or self._draft is None:
+            return
+        e = self._draft.experiment
+        for k, name in enumerate(self._drawn()):
+            own = {line.signal for line in self._map.of_column(name)}
+            self._plot.shade(k, bands(e.recording, {*e.inputs, *e.outputs} - own))
 
     def _viewed(self, event: Any) -> None:
         """Draw closely what is looked at."""
@@ -609,6 +619,7 @@ class Mapper:
             self._draft = draft
             self._show_said(draft, text)
             self._show_marks()
+            self._shade()
             await self._show_found(record, draft)
 
     def _show_said(self, draft: Draft | None, text: str) -> None:
