@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hvdc_ident.data.noise import InputNoise, noise_before, noise_floor
+from hvdc_ident.data.signal_table import SignalTable
 from hvdc_ident.data.signals import InputSignal, event_time, input_signal
 from hvdc_ident.data.trajectory import Array, Origin, Trajectory, trajectory
 from hvdc_ident.display import Shown, Table
@@ -23,7 +24,7 @@ SignalLike: TypeAlias = InputSignal | float | ArrayLike | Callable[[Array], Any]
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
-class Experiment(Shown):
+class Experiment(SignalTable, Shown):
     """One experiment: its input signals, the instants at which outputs are wanted, and the recorded outputs.
 
     time: (n,) instants at which outputs are wanted, s; one that stands twice asks for the values before and after a jump.

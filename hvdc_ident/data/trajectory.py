@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hvdc_ident.codec import Coded, read_fields
 from hvdc_ident.data.contradiction import Contradiction
+from hvdc_ident.data.signal_table import SignalTable
 from hvdc_ident.display import Shown, Table, axes_of, data_frame, first_rows, library
 from hvdc_ident.errors import StudyError, WaveformError, unknown_name
 from hvdc_ident.text import with_unit
@@ -58,7 +59,7 @@ class _Columns:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Trajectory(Coded, Shown):
+class Trajectory(SignalTable, Coded, Shown):
     """Signals sampled at the same instants.
 
     time: (n,) in s, non-decreasing; a time that stands twice is a jump, the first row before it and the second after.
@@ -88,23 +89,17 @@ class Trajectory(Coded, Shown):
         for name, value in (("time", time), ("values", values), ("names", names), ("units", units)):
             object.__setattr__(self, name, value)
 
-    def __getitem__(self, name: str) -> Array:
-        """Return the samples of a signal, (n,)."""
-        return self.values[:, self._column(name)]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self.names
-
-    def __len__(self) -> int:
-        return int(self.time.size)
+    def table(self) -> Trajectory:
+        """Return the trajectory itself."""
+        return self
 
     def unit(self, name: str) -> str:
         """Return the unit of a signal."""
-        return self.units[self._column(name)]
+        return self.units[self.column(name)]
 
     def select(self, names: Iterable[str]) -> Trajectory:
         """Return the named signals only, in the order given."""
-        columns = [self._column(n) for n in names]
+        columns = [self.column(n) for n in names]
         return Trajectory(
             self.time,
             self.values[:, columns],
@@ -174,7 +169,8 @@ class Trajectory(Coded, Shown):
         columns = np.reshape(list(table.signals.values()), (len(table.signals), table.time.size)).T
         return cls(table.time, columns, tuple(table.signals), tuple(table.units.get(n, "") for n in table.signals))
 
-    def _column(self, name: str) -> int:
+    def column(self, name: str) -> int:
+        """Return the column of a signal. Raises UnknownNameError, which says which signals there are."""
         try:
             return self.names.index(name)
         except ValueError:

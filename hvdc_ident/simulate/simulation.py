@@ -10,6 +10,7 @@ import numpy as np
 
 from hvdc_ident.codec import Coded, read_fields
 from hvdc_ident.data import Array, Trajectory
+from hvdc_ident.data.signal_table import SignalTable
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import require_known
 from hvdc_ident.immutable import FrozenMap
@@ -56,7 +57,7 @@ class _Beside:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Simulation(Coded, Shown):
+class Simulation(SignalTable, Coded, Shown):
     """Simulated outputs and their exact derivatives.
 
     trajectory: the outputs at the experiment's times. parameters: names of the sensitivity parameters.
@@ -74,9 +75,9 @@ class Simulation(Coded, Shown):
         """ "converged", or "ended" where an FMU ended its run and its rows were asked for; else there is an exception."""
         return self.statistics.status
 
-    def __getitem__(self, output: str) -> Array:
-        """(n_time,) samples of one output."""
-        return self.trajectory[output]
+    def table(self) -> Trajectory:
+        """Return the outputs over time."""
+        return self.trajectory
 
     def gradient(self, output: str) -> Array:
         """(n_time, n_parameters) derivatives of one output."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeGuard, cast
 import numpy as np
 
 from hvdc_ident.data import Experiment, Trajectory
+from hvdc_ident.data.signal_table import SignalTable
 from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model
@@ -124,7 +125,7 @@ def experiments_of(data: DataLike, model: AnyModel) -> tuple[Experiment, ...]:
         data = [data]
     elif isinstance(data, Trajectory) or _is_frame(data):
         data = [_from_table(data, model, "experiment")]
-    elif not isinstance(data, Iterable) or isinstance(data, np.ndarray | Mapping):
+    elif not isinstance(data, Iterable) or isinstance(data, np.ndarray | Mapping | SignalTable):
         raise _no_data(data)
     found = []
     for item in data:

@@ -47,7 +47,7 @@ def courses(name: str, times: np.ndarray) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("name", RECORDED["cases"])
-def test_the_played_course_is_that_of_andes(name: str) -> None:
+def test_playback_is_the_course_of_andes(name: str) -> None:
     course = courses(name, TIMES)
     assert course["V"] == pytest.approx(np.array(RECORDED["cases"][name]["V"]), abs=2e-6)
     assert course["theta"] == pytest.approx(np.array(RECORDED["cases"][name]["theta"]), abs=2e-5)

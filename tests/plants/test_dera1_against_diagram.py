@@ -172,7 +172,7 @@ CASES: dict[str, tuple[dict[str, float], Corners, Corners, float, float]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_follows_its_block_diagram(name: str) -> None:
+def test_dera1_follows_its_block_diagram(name: str) -> None:
     values, V, f, P, Q = CASES[name]
     model = played(values, P, Q)
     p = {n.removeprefix("gen."): v for n, v in model.values.items()}
