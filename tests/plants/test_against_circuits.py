@@ -63,9 +63,21 @@ def test_dc_line_loses_the_power_that_one_end_gives_and_the_other_does_not_take(
 @pytest.mark.parametrize("V", [1.0, 0.9, 0.75])
 def test_load_is_an_admittance_a_current_and_a_power_in_parallel(V: float) -> None:
     """40 % impedance, 30 % current of the angle of the voltage, 30 % power: three currents that add up."""
-    shares = {"P0": 80.0, "Q0": 20.0, "pz": 0.4, "pc": 0.3, "qz": 0.4, "qc": 0.3, "Vbrk": 0.7, "Sb": 100.0}
-    voltage, power = cmath.rect(V, -0.4), 0.8 + 0.2j  # pu, drawn at 1 pu
-    found = at("load", shares, Vr=voltage.real, Vi=voltage.imag)
+    shares = {
+        "P0": 80.0,
+        "Q0": 20.0,
+        "pz": 0.4,
+        "pc": 0.3,
+        "qz": 0.4,
+        "qc": 0.3,
+        "kpf": 2.0,
+        "kqf": -1.5,
+        "Vbrk": 0.7,
+        "Sb": 100.0,
+    }
+    voltage = cmath.rect(V, -0.4)
+    power = complex(0.8 * 1.02, 0.2 * 0.985)  # pu, drawn at 1 pu and 1 % above the nominal frequency
+    found = at("load", shares, Vr=voltage.real, Vi=voltage.imag, dwn=0.01)
     into = (0.4 * voltage + 0.3 * voltage / V) * power.conjugate() + 0.3 * (power / voltage).conjugate()
     assert complex(found["Ir"], found["Ii"]) == pytest.approx(-into), "it counts into the network"
     assert complex(found["P"], found["Q"]) == pytest.approx(100.0 * voltage * into.conjugate())
