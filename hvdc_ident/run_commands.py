@@ -119,7 +119,7 @@ def run_lines(done: Sequence[Done], summary: RunSummary | None, truth: Sequence[
     for d in done:
         state = state_of(d)
         verdict = d.failed or d.stage.verdict(d.data)
-        if "not_tried" in d.data and (known := d.stage.verdict(d.data)):
+        if "not_tried" in d.data and (known := d.stage.verdict(d.data)) and known != verdict:
             verdict = f"{verdict}; {known}"
         lines.append(f"{d.stage.name}: {state}; {verdict}" if verdict else f"{d.stage.name}: {state}")
     if summary is None:

@@ -129,7 +129,7 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
 
 
 def verdict(data: Mapping[str, Any]) -> str:
-    """Return any doubt about the search, the candidates by their verdicts, and that a noise is not known."""
+    """Return any doubt about the search or the model, the candidates by their verdicts, and that a noise is not known."""
     from hvdc_ident.fit.noise import misfit_sentence
     from hvdc_ident.summary.stage_results import identified_of
 
@@ -140,6 +140,8 @@ def verdict(data: Mapping[str, Any]) -> str:
     groups |= {"no verdict": [*report.unsettled]} if report.unsettled else {}
     found = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
     unknown = misfit_sentence(report.pilot.outputs_of_misfit).rstrip(".")
+    if report.misspecified:
+        found = f"the model does not explain these data; if nothing else is missing, {found}"
     return "; ".join(part for part in (report.pilot.search_doubt, found, unknown) if part)
 
 
