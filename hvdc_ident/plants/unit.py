@@ -16,7 +16,7 @@ from hvdc_ident.model import Model, parse_card, read_card
 from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.model.transform import substituted, without_vanished
 from hvdc_ident.parameters import Input
-from hvdc_ident.shelf import card_of, components, record_of, source_of
+from hvdc_ident.shelf import card_of, components, outputs_of, record_of, source_of
 
 UNCONNECTED = FrozenMap(
     {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0"}
@@ -217,7 +217,7 @@ def idle_parts(parts: Mapping[str, UnitPart]) -> list[str]:
 
 def part_name(source: str) -> str:
     """Return the name of a component in a unit."""
-    outputs = shelf_model(source).outputs
+    outputs = outputs_of(source)
     return next((n for o, n in NAMES.items() if o in outputs), source)
 
 
