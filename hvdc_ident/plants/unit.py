@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import Literal
 
 import sympy as sp
@@ -12,11 +11,11 @@ import sympy as sp
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model, parse_card, read_card
+from hvdc_ident.model import Model, parse_card, shelf_model
 from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.model.transform import substituted, without_vanished
 from hvdc_ident.parameters import Input
-from hvdc_ident.shelf import card_of, components, outputs_of, record_of, source_of
+from hvdc_ident.shelf import components, outputs_of, record_of, source_of
 
 UNCONNECTED = FrozenMap(
     {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0"}
@@ -277,12 +276,6 @@ def _network(machine: str, played: bool, step_up: bool) -> dict[str, str]:
     into = {f"line.{i}": f"{STEP_UP}.{i}_far" if step_up else f"{machine}.{i}" for i in ("Ir", "Ii")}
     far = {"grid.V": "E", "grid.theta": "0", "line.Vr_far": "grid.Vr", "line.Vi_far": "grid.Vi"}
     return far | into | through | machine_ends
-
-
-@cache
-def shelf_model(name: str) -> Model:
-    """Return a component of the shelf. Raises UnknownNameError for a name that is not there."""
-    return read_card(card_of(name))
 
 
 def _one_that_gives(models: Mapping[str, Model], output: str) -> str:
