@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import sympy as sp
+from sympy.core.sorting import ordered
 
 
 def symbol(name: str) -> sp.Symbol:
@@ -41,6 +42,51 @@ class clip(sp.Function):
         return {1: inside, 2: sp.Piecewise((1, x < low), (0, True)), 3: sp.Piecewise((1, x > high), (0, True))}[
             argindex
         ]
+
+
+class _Extremum:
+    """Applications of min and max that stand as they are written: flat, their numbers joined, each argument once.
+
+    sympy compares every two arguments to leave out one that is never the extremum, in ms for each pair whenever the expression is
+    rebuilt. The value is the same.
+    """
+
+    def __new__(cls, *arguments: Any, **_options: Any) -> Any:
+        of_sympy: Any = next(kind for kind in (sp.Min, sp.Max) if issubclass(cls, kind))
+        flat = [part for a in map(sp.sympify, arguments) for part in (a.args if isinstance(a, of_sympy) else (a,))]
+        kept = dict.fromkeys(a for a in flat if not a.is_number)
+        numbers = [a for a in flat if a.is_number]
+        if numbers:
+            number = of_sympy(*numbers)
+            if number == of_sympy.zero:
+                return number
+            if number != of_sympy.identity or not kept:
+                kept |= dict.fromkeys(number.args if isinstance(number, of_sympy) else (number,))
+        if len(kept) < 2:
+            return next(iter(kept), of_sympy.identity)
+        made = sp.Expr.__new__(cls, *ordered(kept))
+        made._argset = frozenset(kept)
+        return made
+
+    def __eq__(self, other: object) -> bool:
+        """Return True for the same arguments, in an application of sympy's class too."""
+        return own(type(other)) is type(self) and self.args == other.args  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return super().__hash__()  # of the class's name and the arguments: that of sympy's
+
+
+class Min(_Extremum, sp.Min):
+    """min of the grammar."""
+
+
+class Max(_Extremum, sp.Max):
+    """max of the grammar."""
+
+
+def own(head: Any) -> Any:
+    """Return the class whose applications models hold in place of those of a class of sympy."""
+    return {sp.Min: Min, sp.Max: Max}.get(head, head)
 
 
 def where(condition: Any, a: Any, b: Any) -> sp.Expr:
@@ -137,15 +183,15 @@ _TABLE = (
     GrammarFunction("atan2", sp.atan2, math.atan2, (2, 2), array=np.arctan2, slopes=_atan2_slopes),
     GrammarFunction("where", None, lambda condition, a, b: a if condition else b, (3, 3)),
     GrammarFunction("clip", clip, lambda x, low, high: min(max(x, low), high), (3, 3)),
-    GrammarFunction("min", sp.Min, min, (1, MANY)),
-    GrammarFunction("max", sp.Max, max, (1, MANY)),
+    GrammarFunction("min", Min, min, (1, MANY)),
+    GrammarFunction("max", Max, max, (1, MANY)),
 )
 FUNCTIONS: Mapping[str, GrammarFunction] = {f.name: f for f in _TABLE}
 
 
 def function_of(head: Any) -> GrammarFunction | None:
     """Function of the grammar whose applications are of a class of sympy; None where there is none."""
-    return next((f for f in FUNCTIONS.values() if f.head is head), None)
+    return next((f for f in FUNCTIONS.values() if f.head is own(head)), None)
 
 
 def elementary(head: Any) -> GrammarFunction | None:

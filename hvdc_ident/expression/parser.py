@@ -16,7 +16,7 @@ from sympy.logic.boolalg import And
 
 from hvdc_ident.errors import ExpressionError
 from hvdc_ident.expression.blocks import BLOCKS
-from hvdc_ident.expression.functions import FUNCTIONS, function_of, symbol
+from hvdc_ident.expression.functions import FUNCTIONS, function_of, own, symbol
 from hvdc_ident.expression.grammar import MAX_COMPARISONS, MAX_POINTS, Source, SyntaxTree
 
 EXACT = 2**53
@@ -383,15 +383,15 @@ def normal(value: sp.Expr) -> sp.Expr | None:
     Symbols are the models' real ones, numbers are doubles or integers that a double holds exactly, factors that were
     kept apart are multiplied out as sympy does, and a choice in the last branch of a choice is part of it.
     """
+    parts: list[Any] = []
     if not value.args:
         result: Any = _atom(value)
     else:
         parts = [normal(a) if isinstance(a, sp.Expr) else _condition(a) for a in value.args]
         if isinstance(value, _OUTSIDE) or any(p is None for p in parts):
             return None
-        done = isinstance(value, (sp.Max, sp.Min)) and all(p is a for p, a in zip(parts, value.args, strict=True))
-        result = value if done else _rebuilt(value, parts)  # sympy compares the values of max and min slowly
-    if result == value:
+        result = _rebuilt(value, parts)
+    if result == value and type(result) is type(value) and all(p is a for p, a in zip(parts, value.args, strict=True)):
         result = value
     return result if isinstance(result, sp.Expr) and not result.has(*_UNREAL) else None
 
@@ -428,7 +428,7 @@ def _condition(part: Any) -> Any:
 
 def _rebuilt(value: sp.Expr, parts: list[Any]) -> Any:
     if not isinstance(value, sp.Piecewise):
-        return value.func(*parts)
+        return own(value.func)(*parts)
     last = parts[-1].args[0]
     if isinstance(last, sp.Piecewise) and parts[-1].args[1] == True:  # noqa: E712 - a sympy condition
         parts = [*parts[:-1], *last.args]
