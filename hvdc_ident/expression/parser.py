@@ -17,7 +17,7 @@ from sympy.logic.boolalg import And
 from hvdc_ident.errors import ExpressionError
 from hvdc_ident.expression.blocks import BLOCKS
 from hvdc_ident.expression.functions import FUNCTIONS, function_of, own, symbol
-from hvdc_ident.expression.grammar import MAX_COMPARISONS, MAX_POINTS, Source, SyntaxTree
+from hvdc_ident.expression.grammar import MAX_POINTS, Source, SyntaxTree
 
 EXACT = 2**53
 """Integers up to here are exact, as in a double; beyond it numbers are floats."""
@@ -72,7 +72,6 @@ class _Builder:
 
     def __init__(self, source: Source, tree: SyntaxTree) -> None:
         self.source, self.tree = source, tree
-        self.comparisons = 0
 
     def expression(self) -> sp.Expr:
         """Expression of the whole tree."""
@@ -142,8 +141,6 @@ class _Builder:
         if name == "where":
             return self._where(node)
         arguments = [self.value(child) for child in node.args]
-        if name in ("min", "max"):
-            self._count_comparisons(node, arguments)
         return self._guarded(lambda: checked(call(name, arguments)), node)
 
     def _block(self, node: ast.Call) -> sp.Expr:
@@ -165,14 +162,6 @@ class _Builder:
         for low, high in pairwise(at):
             if low.is_number and high.is_number and not constant(low) < constant(high):
                 self._fail(f"the arguments of a table rise; {high} follows {low}", node)
-
-    def _count_comparisons(self, node: ast.Call, arguments: list[sp.Expr]) -> None:
-        """Refuse more pairs of values than sympy, which compares them slowly, has time for."""
-        count = sum(len(a.args) if isinstance(a, (sp.Min, sp.Max)) else 1 for a in arguments)
-        self.comparisons += count**2
-        if self.comparisons > MAX_COMPARISONS:
-            what = f"too many values in min and max (their numbers' squares sum to over {MAX_COMPARISONS})"
-            self._fail(f"{what}; name parts of it as signals", node)
 
     def _where(self, node: ast.Call) -> sp.Expr:
         condition, yes, no = node.args
