@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Literal
 
 import sympy as sp
@@ -90,7 +91,6 @@ def unit_card(
     powers = _powers(machine, "bus" if played else "line", STEP_UP in parts)
     connections, references = _wired(models, _network(machine, played, STEP_UP in parts), played)
     inputs: dict[str, Input] = {**(shelf_model("playback").inputs if played else {"E": VOLTAGE}), **references}
-    known = {"f": f0} | dict(levels)
     grid = (
         {"bus": UnitPart("playback", {"f0": f0})}
         if played
@@ -102,7 +102,7 @@ def unit_card(
     shared = {n: {"f0": f0} if "f0" in m.parameters else {} for n, m in models.items()}
     components = {n: replace(p, values=shared[n] | dict(p.values)) for n, p in parts.items()} | grid
 
-    def card(references: Mapping[str, tuple[str, str, Input]]) -> str:
+    def card(references: Mapping[str, tuple[str, str, Input]], known: Mapping[str, float] = FrozenMap()) -> str:
         lines = [
             "schema = 1",
             f"name = {toml_string(name)}",
@@ -120,7 +120,7 @@ def unit_card(
         ]
         return "\n".join(lines) + "\n"
 
-    return card(_references(inputs, parts[machine], parse_card(card({}))) if played else {})
+    return card(_references(inputs, parts[machine], _uses(card({}))) if played else {}, {"f": f0} | dict(levels))
 
 
 def _wired(
@@ -220,12 +220,14 @@ def part_name(source: str) -> str:
     return next((n for o, n in NAMES.items() if o in outputs), source)
 
 
-def _references(inputs: dict[str, Input], machine: UnitPart, unit: Model) -> dict[str, tuple[str, str, Input]]:
+def _references(
+    inputs: dict[str, Input], machine: UnitPart, uses: Mapping[str, Set[str]]
+) -> dict[str, tuple[str, str, Input]]:
     """Return by reference its level's name, its output and what it was; the levels take the places of the references among the inputs.
 
-    unit: with the references as inputs.
+    uses: of the unit with the references as inputs.
     """
-    found, uses = {}, _uses(unit)
+    found = {}
     for level, output, unit_of_level, names in REFERENCES:
         acting = _followed(uses, output)
         reference = next((n for n in names if n in inputs and n in acting), None)
@@ -237,18 +239,23 @@ def _references(inputs: dict[str, Input], machine: UnitPart, unit: Model) -> dic
     return found
 
 
-def _uses(model: Model) -> dict[str, set[str]]:
-    """Return by variable the names that its expressions have at the values of the parameters: flags decide which branch counts."""
+@lru_cache(maxsize=16)
+def _uses(card: str) -> FrozenMap[Set[str]]:
+    """Return by variable the names that its expressions have at the values of the parameters: flags decide which branch counts.
+
+    A unit's card is written twice, before and after the levels of its inputs are known, which do not matter here.
+    """
+    model = parse_card(card)
     at = {symbol(n): sp.Float(v) for n, v in model.values.items() if n in model.parameters}
     fields = substituted(without_vanished(model), at)
     found = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in fields["states"].items()}
     found |= {n: [s.value] for n, s in fields["signals"].items()}
     found |= {n: [a.equation] for n, a in fields["algebraic"].items()}
     found |= {n: [o.value] for n, o in fields["outputs"].items() if n not in found}
-    return {n: {s.name for e in expressions for s in e.free_symbols} for n, expressions in found.items()}
+    return FrozenMap({n: {s.name for e in expressions for s in e.free_symbols} for n, expressions in found.items()})
 
 
-def _followed(uses: Mapping[str, set[str]], name: str) -> set[str]:
+def _followed(uses: Mapping[str, Set[str]], name: str) -> set[str]:
     """Return a name and the names of all that it follows."""
     found, new = set[str](), {name}
     while new:
