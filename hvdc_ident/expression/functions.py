@@ -94,6 +94,32 @@ def where(condition: Any, a: Any, b: Any) -> sp.Expr:
     return sp.Piecewise((a, condition), (b, True))
 
 
+def at_values(e: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+    """Return an expression at values of symbols; of a choice the branches that these leave, with `xreplace` all of them.
+
+    A branch that is not taken may give no number there, as a saturation of zeros. A comparison with what is no number stays as it is.
+    """
+    return _at_values(e, values)
+
+
+def _at_values(e: Any, values: Mapping[sp.Symbol, sp.Expr]) -> Any:
+    if not e.args:
+        return values.get(e, e)
+    if not isinstance(e, sp.Piecewise):
+        try:
+            return e.func(*(_at_values(a, values) for a in e.args))
+        except TypeError:
+            return e
+    left = []
+    for value, condition in e.args:
+        holds = _at_values(condition, values)
+        if holds != sp.false:
+            left.append((_at_values(value, values), holds))
+        if holds == sp.true:
+            break
+    return sp.Piecewise(*left)
+
+
 class Algebra(Protocol):
     """Arithmetic on the nodes of a graph, in which derivatives are written."""
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hvdc_ident.errors import ModelError
-from hvdc_ident.next_step import NextStep
 from hvdc_ident.model import shelf_model
+from hvdc_ident.next_step import NextStep
 from hvdc_ident.plants.unit import STEP_UP, UnitPart, part_name, parts_of
 from hvdc_ident.psse import DyrFile, DyrRecord, Generator
 from hvdc_ident.shelf import components, outputs_of, power_flow_of, record_of, source_of

@@ -10,11 +10,11 @@ from typing import Literal
 import sympy as sp
 
 from hvdc_ident.errors import ModelError, unknown_name
-from hvdc_ident.expression import symbol
+from hvdc_ident.expression import at_values, symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model, parse_card, shelf_model
 from hvdc_ident.model.card import toml_key, toml_string
-from hvdc_ident.model.transform import substituted, without_vanished
+from hvdc_ident.model.transform import without_vanished
 from hvdc_ident.parameters import Input
 from hvdc_ident.shelf import components, outputs_of, record_of, source_of
 
@@ -245,14 +245,13 @@ def _uses(card: str) -> FrozenMap[Set[str]]:
 
     A unit's card is written twice, before and after the levels of its inputs are known, which do not matter here.
     """
-    model = parse_card(card)
+    model = without_vanished(parse_card(card))
     at = {symbol(n): sp.Float(v) for n, v in model.values.items() if n in model.parameters}
-    fields = substituted(without_vanished(model), at)
-    found = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in fields["states"].items()}
-    found |= {n: [s.value] for n, s in fields["signals"].items()}
-    found |= {n: [a.equation] for n, a in fields["algebraic"].items()}
-    found |= {n: [o.value] for n, o in fields["outputs"].items() if n not in found}
-    return FrozenMap({n: {s.name for e in expressions for s in e.free_symbols} for n, expressions in found.items()})
+    found = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in model.states.items()}
+    found |= {n: [s.value] for n, s in model.signals.items()}
+    found |= {n: [a.equation] for n, a in model.algebraic.items()}
+    found |= {n: [o.value] for n, o in model.outputs.items() if n not in found}
+    return FrozenMap({n: {s.name for e in of for s in at_values(e, at).free_symbols} for n, of in found.items()})
 
 
 def _followed(uses: Mapping[str, Set[str]], name: str) -> set[str]:

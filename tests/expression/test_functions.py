@@ -11,7 +11,18 @@ import pytest
 import sympy as sp
 
 import hvdc_ident as hi
-from hvdc_ident.expression import FUNCTIONS, GrammarFunction, Max, Min, functions, normal, parse, symbol, to_text
+from hvdc_ident.expression import (
+    FUNCTIONS,
+    GrammarFunction,
+    Max,
+    Min,
+    at_values,
+    functions,
+    normal,
+    parse,
+    symbol,
+    to_text,
+)
 from hvdc_ident.fmu.export.modelica_model import ModelicaPrinter
 from hvdc_ident.linearize.system import evaluate
 from hvdc_ident.simulate import Graph
@@ -102,3 +113,12 @@ def test_an_extremum_has_the_derivatives_of_that_of_sympy(of_models, of_sympy, _
     x, y = symbol("x"), symbol("y")
     for arguments in ((x**2, 3 * y), (x**2, 3 * y, 2)):
         assert of_models(*arguments).diff(x) == of_sympy(*arguments).diff(x)
+
+
+def test_an_expression_at_values_has_the_branches_that_they_leave() -> None:
+    x, y, a, b = (symbol(n) for n in "xyab")
+    e = parse("where(a > 0, where(x > b/a, x, y), 2*y)")
+    assert at_values(e, {a: sp.Float(0.0), b: sp.Float(0.0)}) == 2 * y
+    assert at_values(e, {a: sp.Float(2.0), b: sp.Float(1.0)}) == parse("where(x > 0.5, x, y)")
+    assert at_values(e, {}) == e
+    assert at_values(parse("where(x > b/a, x, y)"), {a: sp.Float(0.0), b: sp.Float(0.0)}).free_symbols == {x, y, a, b}
