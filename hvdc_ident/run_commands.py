@@ -93,7 +93,7 @@ def _tell_run(
 
     truth: lines with the values beside the true ones, in place of the table of values. opens: the report, in the browser.
     """
-    from hvdc_ident.study.pipeline import heading_of
+    from hvdc_ident.study.heading import heading_of
     from hvdc_ident.summary import Results
 
     seed = done[0].data["seed"] if done else 0

@@ -49,12 +49,18 @@ def test_version_is_a_version() -> None:
 
 
 def test_the_package_and_the_command_line_import_nothing_heavy() -> None:
-    code = "import sys, hvdc_ident, hvdc_ident.cli; print(*sorted(sys.modules))"
-    loaded = set(
-        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    )
     heavy = {"numpy", "scipy", "sympy", "llvmlite", "matplotlib", "pydantic", "xarray", "control", "tomlkit"}
-    assert not loaded & heavy
+    assert not imported_with("hvdc_ident, hvdc_ident.cli") & heavy
+
+
+def test_a_check_imports_no_diagnosis_no_identifiability_and_no_statistics() -> None:
+    loaded = imported_with("hvdc_ident.study.study, hvdc_ident.study.summary")
+    assert not loaded & {"hvdc_ident.discrepancy", "hvdc_ident.identifiability", "scipy.stats", "scipy.signal"}
+
+
+def imported_with(modules: str) -> set[str]:
+    code = f"import sys, {modules}; print(*sys.modules)"
+    return set(subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split())
 
 
 @pytest.mark.parametrize("stub", sorted(p.relative_to(PACKAGE) for p in PACKAGE.rglob("__init__.pyi")), ids=str)

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc
-from scipy.stats import chi2
+from scipy.special import chdtrc, fdtrc
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.evidence import left_by, unseen_rows
@@ -128,7 +127,7 @@ def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
     if others is None:  # parts of the fitted records, whose noise is known from before the event
         rows = unseen_rows(last) * last.effective / last.rows
         freedom = freedom_of(last.noise, last.problem.outputs)
-        return float(chi2.sf(square * rows, rows) if np.isinf(freedom) else fdtrc(rows, freedom, square))
+        return float(chdtrc(rows, square * rows) if np.isinf(freedom) else fdtrc(rows, freedom, square))
     held = Nominal(others, last.theta[: len(last.problem.free)], last.noise)
     drawn = draws(others, held.blocks, held.noise, held.fitted(), _least_draws(search), search.seed + 6)
     rows = sum(b.residual.size for b in held.blocks)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import sympy as sp
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.expression import nonwindup
+from hvdc_ident.expression import Max, Min, nonwindup
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -20,8 +20,8 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     x = p["state"]
 
     def held(way: sp.Expr) -> sp.Expr:
-        below = sp.Min(way, p["high"] - x) if "high" in p else way
-        return sp.Max(below, p["low"] - x) if "low" in p else below
+        below = Min(way, p["high"] - x) if "high" in p else way
+        return Max(below, p["low"] - x) if "low" in p else below
 
     add.rest(x, u, held)
     return nonwindup(u, x, p.get("low"), p.get("high"))

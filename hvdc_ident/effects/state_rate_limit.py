@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import sympy as sp
 
 from hvdc_ident.effects.base import Additions, Effect, EffectParameter
-from hvdc_ident.expression import clip
+from hvdc_ident.expression import Max, Min, clip
 from hvdc_ident.immutable import FrozenMap
 
 
@@ -15,7 +15,7 @@ def rewrite(u: sp.Expr, p: Mapping[str, sp.Expr], add: Additions) -> sp.Expr:
     add.rest(p["state"], u)
     if "up" in p and "down" in p:
         return clip(u, -p["down"], p["up"])
-    return sp.Min(u, p["up"]) if "up" in p else sp.Max(u, -p["down"])
+    return Min(u, p["up"]) if "up" in p else Max(u, -p["down"])
 
 
 EFFECT = Effect(

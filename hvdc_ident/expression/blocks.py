@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import sympy as sp
 
-from hvdc_ident.expression.functions import clip, where
+from hvdc_ident.expression.functions import Max, Min, clip, where
 
 TRACKING_TIME = 2e-4
 """Time constant, s, with which a state follows what it is held at."""
@@ -55,10 +55,10 @@ def nonwindup(rate: sp.Expr, x: sp.Expr, low: sp.Expr | None, high: sp.Expr | No
     """
     if high is not None:
         left = high - x
-        rate = where(left <= NEAR * (1 + sp.Abs(high)), sp.Min(rate, left / TRACKING_TIME), rate)
+        rate = where(left <= NEAR * (1 + sp.Abs(high)), Min(rate, left / TRACKING_TIME), rate)
     if low is not None:
         left = low - x
-        rate = where(left >= -NEAR * (1 + sp.Abs(low)), sp.Max(rate, left / TRACKING_TIME), rate)
+        rate = where(left >= -NEAR * (1 + sp.Abs(low)), Max(rate, left / TRACKING_TIME), rate)
     return rate
 
 

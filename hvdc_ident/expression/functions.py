@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import sympy as sp
+from sympy.core.sorting import ordered
 
 
 def symbol(name: str) -> sp.Symbol:
@@ -43,9 +44,80 @@ class clip(sp.Function):
         ]
 
 
+class _Extremum:
+    """Applications of min and max that stand as they are written: flat, their numbers joined, each argument once.
+
+    sympy compares every two arguments to leave out one that is never the extremum, in ms for each pair whenever the expression is
+    rebuilt. The value is the same.
+    """
+
+    def __new__(cls, *arguments: Any, **_options: Any) -> Any:
+        of_sympy: Any = next(kind for kind in (sp.Min, sp.Max) if issubclass(cls, kind))
+        flat = [part for a in map(sp.sympify, arguments) for part in (a.args if isinstance(a, of_sympy) else (a,))]
+        kept = dict.fromkeys(a for a in flat if not a.is_number)
+        numbers = [a for a in flat if a.is_number]
+        if numbers:
+            number = of_sympy(*numbers)
+            if number == of_sympy.zero:
+                return number
+            if number != of_sympy.identity or not kept:
+                kept |= dict.fromkeys(number.args if isinstance(number, of_sympy) else (number,))
+        if len(kept) < 2:
+            return next(iter(kept), of_sympy.identity)
+        made = sp.Expr.__new__(cls, *ordered(kept))
+        made._argset = frozenset(kept)
+        return made
+
+    def __eq__(self, other: object) -> bool:
+        """Return True for the same arguments, in an application of sympy's class too."""
+        return own(type(other)) is type(self) and self.args == other.args  # type: ignore[attr-defined]
+
+    def __hash__(self) -> int:
+        return super().__hash__()  # of the class's name and the arguments: that of sympy's
+
+
+class Min(_Extremum, sp.Min):
+    """min of the grammar."""
+
+
+class Max(_Extremum, sp.Max):
+    """max of the grammar."""
+
+
+def own(head: Any) -> Any:
+    """Return the class whose applications models hold in place of those of a class of sympy."""
+    return {sp.Min: Min, sp.Max: Max}.get(head, head)
+
+
 def where(condition: Any, a: Any, b: Any) -> sp.Expr:
     """Expression that is a where the condition holds, else b."""
     return sp.Piecewise((a, condition), (b, True))
+
+
+def at_values(e: sp.Expr, values: Mapping[sp.Symbol, sp.Expr]) -> sp.Expr:
+    """Return an expression at values of symbols; of a choice the branches that these leave, with `xreplace` all of them.
+
+    A branch that is not taken may give no number there, as a saturation of zeros. A comparison with what is no number stays as it is.
+    """
+    return _at_values(e, values)
+
+
+def _at_values(e: Any, values: Mapping[sp.Symbol, sp.Expr]) -> Any:
+    if not e.args:
+        return values.get(e, e)
+    if not isinstance(e, sp.Piecewise):
+        try:
+            return e.func(*(_at_values(a, values) for a in e.args))
+        except TypeError:
+            return e
+    left = []
+    for value, condition in e.args:
+        holds = _at_values(condition, values)
+        if holds != sp.false:
+            left.append((_at_values(value, values), holds))
+        if holds == sp.true:
+            break
+    return sp.Piecewise(*left)
 
 
 class Algebra(Protocol):
@@ -137,15 +209,15 @@ _TABLE = (
     GrammarFunction("atan2", sp.atan2, math.atan2, (2, 2), array=np.arctan2, slopes=_atan2_slopes),
     GrammarFunction("where", None, lambda condition, a, b: a if condition else b, (3, 3)),
     GrammarFunction("clip", clip, lambda x, low, high: min(max(x, low), high), (3, 3)),
-    GrammarFunction("min", sp.Min, min, (1, MANY)),
-    GrammarFunction("max", sp.Max, max, (1, MANY)),
+    GrammarFunction("min", Min, min, (1, MANY)),
+    GrammarFunction("max", Max, max, (1, MANY)),
 )
 FUNCTIONS: Mapping[str, GrammarFunction] = {f.name: f for f in _TABLE}
 
 
 def function_of(head: Any) -> GrammarFunction | None:
     """Function of the grammar whose applications are of a class of sympy; None where there is none."""
-    return next((f for f in FUNCTIONS.values() if f.head is head), None)
+    return next((f for f in FUNCTIONS.values() if f.head is own(head)), None)
 
 
 def elementary(head: Any) -> GrammarFunction | None:

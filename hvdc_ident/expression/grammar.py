@@ -27,7 +27,6 @@ MAX_LENGTH = 100_000
 MAX_TOKENS = 10_000
 MAX_DEPTH = 100
 MAX_CALLS = 32
-MAX_COMPARISONS = 1024
 MAX_POINTS = 64
 CONSTANTS = ("pi", "time")
 COMPARISONS = ("<", "<=", ">", ">=", "==", "!=")

@@ -16,8 +16,8 @@ from sympy.logic.boolalg import And
 
 from hvdc_ident.errors import ExpressionError
 from hvdc_ident.expression.blocks import BLOCKS
-from hvdc_ident.expression.functions import FUNCTIONS, function_of, symbol
-from hvdc_ident.expression.grammar import MAX_COMPARISONS, MAX_POINTS, Source, SyntaxTree
+from hvdc_ident.expression.functions import FUNCTIONS, function_of, own, symbol
+from hvdc_ident.expression.grammar import MAX_POINTS, Source, SyntaxTree
 
 EXACT = 2**53
 """Integers up to here are exact, as in a double; beyond it numbers are floats."""
@@ -72,7 +72,6 @@ class _Builder:
 
     def __init__(self, source: Source, tree: SyntaxTree) -> None:
         self.source, self.tree = source, tree
-        self.comparisons = 0
 
     def expression(self) -> sp.Expr:
         """Expression of the whole tree."""
@@ -142,8 +141,6 @@ class _Builder:
         if name == "where":
             return self._where(node)
         arguments = [self.value(child) for child in node.args]
-        if name in ("min", "max"):
-            self._count_comparisons(node, arguments)
         return self._guarded(lambda: checked(call(name, arguments)), node)
 
     def _block(self, node: ast.Call) -> sp.Expr:
@@ -165,14 +162,6 @@ class _Builder:
         for low, high in pairwise(at):
             if low.is_number and high.is_number and not constant(low) < constant(high):
                 self._fail(f"the arguments of a table rise; {high} follows {low}", node)
-
-    def _count_comparisons(self, node: ast.Call, arguments: list[sp.Expr]) -> None:
-        """Refuse more pairs of values than sympy, which compares them slowly, has time for."""
-        count = sum(len(a.args) if isinstance(a, (sp.Min, sp.Max)) else 1 for a in arguments)
-        self.comparisons += count**2
-        if self.comparisons > MAX_COMPARISONS:
-            what = f"too many values in min and max (their numbers' squares sum to over {MAX_COMPARISONS})"
-            self._fail(f"{what}; name parts of it as signals", node)
 
     def _where(self, node: ast.Call) -> sp.Expr:
         condition, yes, no = node.args
@@ -383,15 +372,15 @@ def normal(value: sp.Expr) -> sp.Expr | None:
     Symbols are the models' real ones, numbers are doubles or integers that a double holds exactly, factors that were
     kept apart are multiplied out as sympy does, and a choice in the last branch of a choice is part of it.
     """
+    parts: list[Any] = []
     if not value.args:
         result: Any = _atom(value)
     else:
         parts = [normal(a) if isinstance(a, sp.Expr) else _condition(a) for a in value.args]
         if isinstance(value, _OUTSIDE) or any(p is None for p in parts):
             return None
-        done = isinstance(value, (sp.Max, sp.Min)) and all(p is a for p, a in zip(parts, value.args, strict=True))
-        result = value if done else _rebuilt(value, parts)  # sympy compares the values of max and min slowly
-    if result == value:
+        result = _rebuilt(value, parts)
+    if result == value and type(result) is type(value) and all(p is a for p, a in zip(parts, value.args, strict=True)):
         result = value
     return result if isinstance(result, sp.Expr) and not result.has(*_UNREAL) else None
 
@@ -428,7 +417,7 @@ def _condition(part: Any) -> Any:
 
 def _rebuilt(value: sp.Expr, parts: list[Any]) -> Any:
     if not isinstance(value, sp.Piecewise):
-        return value.func(*parts)
+        return own(value.func)(*parts)
     last = parts[-1].args[0]
     if isinstance(last, sp.Piecewise) and parts[-1].args[1] == True:  # noqa: E712 - a sympy condition
         parts = [*parts[:-1], *last.args]

@@ -1,6 +1,6 @@
 """Models, their text form, and models made from models."""
 
-from hvdc_ident.model.card import parse_card, read_card, save_card, write_card
+from hvdc_ident.model.card import parse_card, read_card, save_card, shelf_model, write_card
 from hvdc_ident.model.check import coerced, dependency_order, ordered_signals, reached, used_names
 from hvdc_ident.model.definition import (
     Algebraic,
@@ -53,6 +53,7 @@ __all__ = [
     "recording",
     "rewritten",
     "save_card",
+    "shelf_model",
     "used_names",
     "with_derivative_signal",
     "without_delays",

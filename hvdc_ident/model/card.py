@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, Field, fields
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +51,12 @@ def read_card(path: str | Path, inside: tuple[Path, ...] = ()) -> Model:
         raise ModelError(f"the model card cannot be read: {reason}", where=str(path)) from None
     text = decoded(content, "the model card", str(path), MAX_BYTES, ModelError)
     return parse_card(text, str(path), (*inside, path))
+
+
+@cache
+def shelf_model(name: str) -> Model:
+    """Return a component of the shelf. Raises UnknownNameError for a name that is not there."""
+    return read_card(card_of(name))
 
 
 def parse_card(text: str, where: str = "model card", inside: tuple[Path, ...] = ()) -> Model:
@@ -104,17 +111,23 @@ def _component(name: str, entry: ComponentEntry, inside: tuple[Path, ...]) -> Co
         n: parse(value, where=f"{place}, '{n}'") if isinstance(value, str) else float(value)
         for n, value in entry.parameters.items()
     }
-    path = card_of(entry.source) if is_component(entry.source) else Path(entry.source)
+    try:
+        model = shelf_model(entry.source) if is_component(entry.source) else _beside(entry.source, inside)
+        return Component(model, FrozenMap(given), FrozenMap(entry.names))
+    except InputError as e:
+        raise e.at(place) from None
+
+
+def _beside(source: str, inside: tuple[Path, ...]) -> Model:
+    """Return the model of a card that another one names as its component."""
+    path = Path(source)
     if path.suffix != ".toml":
-        raise unknown_name("shipped component", entry.source, components(), where=place)
+        raise unknown_name("shipped component", source, components())
     if not path.is_absolute() and inside:
         path = inside[-1].parent / path
     if path.resolve() in [p.resolve() for p in inside]:
-        raise ModelError("the card is a component of itself", where=place, got=str(path))
-    try:
-        return Component(read_card(path, inside), FrozenMap(given), FrozenMap(entry.names))
-    except InputError as e:
-        raise e.at(place) from None
+        raise ModelError("the card is a component of itself", got=str(path))
+    return read_card(path, inside)
 
 
 def write_card(model: Model) -> str:

@@ -138,7 +138,7 @@ def without_vanished(model: Model) -> Model:
     A lag of 0 s is a wire. Where the time constant is a parameter, conditions on it are decided and it cannot leave 0: the block
     that it belongs to is gone. Raises ModelError where what is left runs in a circle.
     """
-    gone = {n for n, s in model.states.items() if s.vanishes is not None and _is_zero(model, s.vanishes)}
+    gone = [n for n, s in model.states.items() if s.vanishes is not None and _is_zero(model, s.vanishes)]
     if not gone:
         return model
     times = {s.vanishes for n, s in model.states.items() if n in gone and isinstance(s.vanishes, sp.Symbol)}

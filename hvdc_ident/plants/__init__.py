@@ -1,5 +1,6 @@
 """Plants of standard components: units at an infinite bus or at a recorded voltage, wired by the names of their signals."""
 
+from hvdc_ident.model import shelf_model
 from hvdc_ident.plants.places import block_signals
 from hvdc_ident.plants.records import RecordedUnit, machine_records, recorded_unit, with_unit_values
 from hvdc_ident.plants.unit import (
@@ -13,7 +14,6 @@ from hvdc_ident.plants.unit import (
     idle_parts,
     part_name,
     parts_of,
-    shelf_model,
     unit_card,
 )
 

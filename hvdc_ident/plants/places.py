@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 
 import sympy as sp
 
-from hvdc_ident.expression import symbol
+from hvdc_ident.expression import at_values, symbol
 from hvdc_ident.model import Model, insertion_point, reached
 
 
@@ -52,9 +52,9 @@ class _Diagram:
         size = 0
         while len(constants) > size:  # what is made of constants is one: a flag may hang on several
             size = len(constants)
-            self._own = {n: e.xreplace(constants) for n, e in self._own.items()}
+            self._own = {n: at_values(e, constants) for n, e in self._own.items()}
             constants |= {symbol(n): e for n in model.signals if not (e := self._own[n]).free_symbols}
-        self._own |= {n: e.xreplace(constants) for n, e in outputs.items()}
+        self._own |= {n: at_values(e, constants) for n, e in outputs.items()}
         self._uses = {n: {s.name for s in e.free_symbols} for n, e in self._own.items()}
 
     def reached_from(self, inputs: Iterable[str]) -> set[str]:

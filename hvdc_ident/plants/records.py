@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from hvdc_ident.errors import ModelError
+from hvdc_ident.model import shelf_model
 from hvdc_ident.next_step import NextStep
-from hvdc_ident.plants.unit import STEP_UP, UnitPart, part_name, parts_of, shelf_model
+from hvdc_ident.plants.unit import STEP_UP, UnitPart, part_name, parts_of
 from hvdc_ident.psse import DyrFile, DyrRecord, Generator
-from hvdc_ident.shelf import components, power_flow_of, record_of, source_of
+from hvdc_ident.shelf import components, outputs_of, power_flow_of, record_of, source_of
 from hvdc_ident.text import listed
 
 
@@ -63,8 +64,8 @@ def recorded_unit(
                     hint="make one of them a comment, with // before it on each of its lines",
                 )
             parts[name], lines[name] = part, record
-    if not any("Ir" in shelf_model(p.source).outputs for p in parts.values()):
-        machines = [c.upper() for c in components() if record_of(c) and "Ir" in shelf_model(c).outputs]
+    if not any("Ir" in outputs_of(p.source) for p in parts.values()):
+        machines = [c.upper() for c in components() if record_of(c) and "Ir" in outputs_of(c)]
         raise ModelError(
             "no record of a machine or converter that is on the shelf",
             where=f"{file.path}:{records[0].line}",

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import lru_cache
 from typing import Literal
 
 import sympy as sp
 
 from hvdc_ident.errors import ModelError, unknown_name
-from hvdc_ident.expression import symbol
+from hvdc_ident.expression import at_values, symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model, parse_card, read_card
+from hvdc_ident.model import Model, parse_card, shelf_model
 from hvdc_ident.model.card import toml_key, toml_string
-from hvdc_ident.model.transform import substituted, without_vanished
+from hvdc_ident.model.transform import without_vanished
 from hvdc_ident.parameters import Input
-from hvdc_ident.shelf import card_of, components, record_of, source_of
+from hvdc_ident.shelf import components, outputs_of, record_of, source_of
 
 UNCONNECTED = FrozenMap(
     {"Vs": "0", "Voel": "0", "Vuel": "0", "Voel_gate": "1000", "Vuel_gate": "-1000", "dwn": "0", "Paux": "0"}
@@ -91,7 +91,6 @@ def unit_card(
     powers = _powers(machine, "bus" if played else "line", STEP_UP in parts)
     connections, references = _wired(models, _network(machine, played, STEP_UP in parts), played)
     inputs: dict[str, Input] = {**(shelf_model("playback").inputs if played else {"E": VOLTAGE}), **references}
-    known = {"f": f0} | dict(levels)
     grid = (
         {"bus": UnitPart("playback", {"f0": f0})}
         if played
@@ -103,7 +102,7 @@ def unit_card(
     shared = {n: {"f0": f0} if "f0" in m.parameters else {} for n, m in models.items()}
     components = {n: replace(p, values=shared[n] | dict(p.values)) for n, p in parts.items()} | grid
 
-    def card(references: Mapping[str, tuple[str, str, Input]]) -> str:
+    def card(references: Mapping[str, tuple[str, str, Input]], known: Mapping[str, float] = FrozenMap()) -> str:
         lines = [
             "schema = 1",
             f"name = {toml_string(name)}",
@@ -121,7 +120,7 @@ def unit_card(
         ]
         return "\n".join(lines) + "\n"
 
-    return card(_references(inputs, parts[machine], parse_card(card({}))) if played else {})
+    return card(_references(inputs, parts[machine], _uses(card({}))) if played else {}, {"f": f0} | dict(levels))
 
 
 def _wired(
@@ -217,16 +216,18 @@ def idle_parts(parts: Mapping[str, UnitPart]) -> list[str]:
 
 def part_name(source: str) -> str:
     """Return the name of a component in a unit."""
-    outputs = shelf_model(source).outputs
+    outputs = outputs_of(source)
     return next((n for o, n in NAMES.items() if o in outputs), source)
 
 
-def _references(inputs: dict[str, Input], machine: UnitPart, unit: Model) -> dict[str, tuple[str, str, Input]]:
+def _references(
+    inputs: dict[str, Input], machine: UnitPart, uses: Mapping[str, Set[str]]
+) -> dict[str, tuple[str, str, Input]]:
     """Return by reference its level's name, its output and what it was; the levels take the places of the references among the inputs.
 
-    unit: with the references as inputs.
+    uses: of the unit with the references as inputs.
     """
-    found, uses = {}, _uses(unit)
+    found = {}
     for level, output, unit_of_level, names in REFERENCES:
         acting = _followed(uses, output)
         reference = next((n for n in names if n in inputs and n in acting), None)
@@ -238,18 +239,22 @@ def _references(inputs: dict[str, Input], machine: UnitPart, unit: Model) -> dic
     return found
 
 
-def _uses(model: Model) -> dict[str, set[str]]:
-    """Return by variable the names that its expressions have at the values of the parameters: flags decide which branch counts."""
+@lru_cache(maxsize=16)
+def _uses(card: str) -> FrozenMap[Set[str]]:
+    """Return by variable the names that its expressions have at the values of the parameters: flags decide which branch counts.
+
+    A unit's card is written twice, before and after the levels of its inputs are known, which do not matter here.
+    """
+    model = without_vanished(parse_card(card))
     at = {symbol(n): sp.Float(v) for n, v in model.values.items() if n in model.parameters}
-    fields = substituted(without_vanished(model), at)
-    found = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in fields["states"].items()}
-    found |= {n: [s.value] for n, s in fields["signals"].items()}
-    found |= {n: [a.equation] for n, a in fields["algebraic"].items()}
-    found |= {n: [o.value] for n, o in fields["outputs"].items() if n not in found}
-    return {n: {s.name for e in expressions for s in e.free_symbols} for n, expressions in found.items()}
+    found = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in model.states.items()}
+    found |= {n: [s.value] for n, s in model.signals.items()}
+    found |= {n: [a.equation] for n, a in model.algebraic.items()}
+    found |= {n: [o.value] for n, o in model.outputs.items() if n not in found}
+    return FrozenMap({n: {s.name for e in of for s in at_values(e, at).free_symbols} for n, of in found.items()})
 
 
-def _followed(uses: Mapping[str, set[str]], name: str) -> set[str]:
+def _followed(uses: Mapping[str, Set[str]], name: str) -> set[str]:
     """Return a name and the names of all that it follows."""
     found, new = set[str](), {name}
     while new:
@@ -277,12 +282,6 @@ def _network(machine: str, played: bool, step_up: bool) -> dict[str, str]:
     into = {f"line.{i}": f"{STEP_UP}.{i}_far" if step_up else f"{machine}.{i}" for i in ("Ir", "Ii")}
     far = {"grid.V": "E", "grid.theta": "0", "line.Vr_far": "grid.Vr", "line.Vi_far": "grid.Vi"}
     return far | into | through | machine_ends
-
-
-@cache
-def shelf_model(name: str) -> Model:
-    """Return a component of the shelf. Raises UnknownNameError for a name that is not there."""
-    return read_card(card_of(name))
 
 
 def _one_that_gives(models: Mapping[str, Model], output: str) -> str:

@@ -61,5 +61,12 @@ def asked_of(name: str) -> tuple[str, ...]:
     return tuple(_about(name).get("asked", ()))
 
 
+@cache
+def outputs_of(name: str) -> frozenset[str]:
+    """Return the names of a component's outputs, without its equations being read."""
+    return frozenset(_about(name)["outputs"])
+
+
+@cache
 def _about(name: str) -> dict[str, Any]:
     return tomllib.loads(card_of(name).read_text(encoding="utf-8"))

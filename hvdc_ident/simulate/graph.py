@@ -261,8 +261,8 @@ class Graph:
             return self.select(
                 self.negative(x), self.constant(-1.0), self.select(self.negative(self.neg(x)), self.one, self.zero)
             )
-        if kind in (sp.Min, sp.Max):
-            return self._extremum(kind is sp.Min, [sub(a) for a in e.args])
+        if isinstance(e, sp.Min | sp.Max):
+            return self._extremum(isinstance(e, sp.Min), [sub(a) for a in e.args])
         if kind.__name__ == "clip":
             x, low, high = map(sub, e.args)
             return self.select(

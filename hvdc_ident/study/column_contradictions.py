@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from hvdc_ident.data import Array, Contradiction, Experiment, InputSignal, Trajectory, before_event, conversion
 from hvdc_ident.data.quantities import read_columns
@@ -425,7 +424,7 @@ class _Case:
             known = np.isfinite(e.measured[o])
             before = before_event(e.time, e.measured[o], e.event)
             own, other = (np.interp(grid, e.time[known], _from_rest(v, before)[known]) for v in (e.measured[o], run[o]))
-            summed = summed + correlate(own, other, method="fft")
+            summed = summed + _correlated(own, other)
         late = step * (int(np.argmax(summed)) - (grid.size - 1))
         return late if abs(late) > step else None
 
@@ -493,6 +492,13 @@ def _moves(e: Experiment) -> bool:
         moved += float(np.ptp(values)) ** 2
         noise += scatter(e.time[known], values) ** 2
     return moved > SEEN**2 * noise
+
+
+def _correlated(a: Array, b: Array) -> Array:
+    """Return the correlation of two signals of n rows at the lags -(n - 1) to n - 1 of a behind b; scipy.signal takes 0.3 s to import."""
+    count = 2 * a.size - 1
+    size = 1 << (count - 1).bit_length()
+    return np.asarray(np.fft.irfft(np.fft.rfft(a, size) * np.fft.rfft(b[::-1], size), size)[:count])
 
 
 def _from_rest(values: Array, before: NDArray[np.bool_]) -> Array:

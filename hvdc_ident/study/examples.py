@@ -297,7 +297,7 @@ def write_demo(folder: Path, *, seed: int = 0, progress: Progress = silent) -> P
 def write_truth(folder: Path, study: Study, *, seed: int = 0) -> dict[str, Any]:
     """Return the truth behind the demo's recordings, once it is in the folder for the report."""
     from hvdc_ident.study.demo_truth import FILE, truth_of
-    from hvdc_ident.study.pipeline import heading_of
+    from hvdc_ident.study.heading import heading_of
 
     campaign = demo_campaign(seed)
     moved = [MOVED[kind] for kind in campaign.kinds]

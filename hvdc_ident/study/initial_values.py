@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from hvdc_ident.data import Array, Experiment, InputSignal, before_event, noise_floor, without_line
 from hvdc_ident.errors import ComputationError, HvdcIdentError
@@ -242,7 +242,7 @@ def compare_initial_values(
         comparisons += [Comparison.of(r, run[r.output]) for r in records]
         failures += [f"{e.name}: {line}" for r in records if (line := _run_away(r, run[r.output]))]
     if comparisons:
-        quantile = float(norm.isf(FALSE_ALARMS / 2.0 / len(comparisons)))
+        quantile = -float(ndtri(FALSE_ALARMS / 2.0 / len(comparisons)))
         by_name = {e.name: e for e in experiments}
         for value in _judged(simulator, by_name, candidates, comparisons, quantile):
             values[value.experiment, value.output] = value

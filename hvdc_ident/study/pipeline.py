@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from hvdc_ident.files import digest, json_pieces, json_text, write_text
 from hvdc_ident.model import Model
 from hvdc_ident.study.checks import steady_notes
 from hvdc_ident.study.executors import open_executor
+from hvdc_ident.study.heading import heading_of, version
 from hvdc_ident.study.initial_values import initial_values
 from hvdc_ident.study.plausibility import violations
 from hvdc_ident.study.stages import UNFINISHED, Stage, StageOptions, StageResult, stage, stages
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from hvdc_ident.study.dask_executor import DaskExecutor
 
 
-SCHEMA = 1
 FIRST = "first-answer"
 """Status of a result that an interrupted stage left: it stands under `first`, and the stage has not come to its end."""
 
@@ -300,26 +299,6 @@ def _written(
         write_text(folder / name, text)
     write_text(folder / wanted.file, json_pieces(data))
     return Done(wanted, data, outcome.failed, fresh=True)
-
-
-def heading_of(study: Study, seed: int) -> dict[str, Any]:
-    """Return the heading of every JSON: schema, study, model, software, seed, and the hashes of the files read."""
-    return {
-        "schema": SCHEMA,
-        "study": study.name,
-        "model": study.model.name,
-        "software": f"hvdc_ident {version()}",
-        "seed": seed,
-        "sources": dict(study.sources),
-    }
-
-
-def version() -> str:
-    """The version of the installed package, or "0+unknown"."""
-    try:
-        return metadata.version("hvdc_ident")
-    except metadata.PackageNotFoundError:
-        return "0+unknown"
 
 
 def _kept(study: Study, wanted: Stage, folder: Path, options: StageOptions) -> dict[str, Any] | None:

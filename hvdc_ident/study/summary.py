@@ -13,10 +13,10 @@ from hvdc_ident.codec import INLINE, NOT_STORED, Coded
 from hvdc_ident.data import Experiment, recording_lines
 from hvdc_ident.study.checks import steady_notes
 from hvdc_ident.study.column_contradictions import column_contradictions
+from hvdc_ident.study.heading import heading_of
 from hvdc_ident.study.hindrances import hindrances
 from hvdc_ident.study.initial_values import initial_values
 from hvdc_ident.study.measured_responses import described
-from hvdc_ident.study.pipeline import heading_of
 from hvdc_ident.study.stages import stages
 from hvdc_ident.study.study import Study, candidate_lines
 from hvdc_ident.summary.candidate import Candidate

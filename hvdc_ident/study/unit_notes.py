@@ -9,7 +9,7 @@ from pathlib import Path
 from hvdc_ident.errors import nearest
 from hvdc_ident.plants import AHEAD, SET_POINTS, STEP_UP, UNCONNECTED, RecordedUnit, idle_parts, shelf_model
 from hvdc_ident.psse import Bus, DyrRecord, Generator, RawFile
-from hvdc_ident.shelf import components, power_flow_of, record_of, source_of
+from hvdc_ident.shelf import components, outputs_of, power_flow_of, record_of, source_of
 from hvdc_ident.text import listed, quantity
 
 BUS_TYPES = {
@@ -175,7 +175,7 @@ def _without(unit: RecordedUnit, missing: Mapping[tuple[str, str], str]) -> Iter
 
 def _giving(signals: Collection[str]) -> list[str]:
     """Return the components of .dyr files that give one of the signals."""
-    return [c for c in components() if record_of(c) and not set(signals).isdisjoint(shelf_model(c).outputs)]
+    return [c for c in components() if record_of(c) and not outputs_of(c).isdisjoint(signals)]
 
 
 def _near(record: DyrRecord, missing: Collection[str], open_: Collection[str]) -> str:

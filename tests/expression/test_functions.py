@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import pickle
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,18 @@ import pytest
 import sympy as sp
 
 import hvdc_ident as hi
-from hvdc_ident.expression import FUNCTIONS, GrammarFunction, functions, parse, symbol, to_text
+from hvdc_ident.expression import (
+    FUNCTIONS,
+    GrammarFunction,
+    Max,
+    Min,
+    at_values,
+    functions,
+    normal,
+    parse,
+    symbol,
+    to_text,
+)
 from hvdc_ident.fmu.export.modelica_model import ModelicaPrinter
 from hvdc_ident.linearize.system import evaluate
 from hvdc_ident.simulate import Graph
@@ -69,3 +81,44 @@ x = "x"
         encoding="utf-8",
     )
     return path
+
+
+PAIRS = [(Max, sp.Max, max), (Min, sp.Min, min)]
+
+
+@pytest.mark.parametrize(("of_models", "of_sympy", "number"), PAIRS)
+def test_an_extremum_stands_as_written_and_is_equal_to_that_of_sympy(of_models, of_sympy, number) -> None:
+    x, y = symbol("x"), symbol("y")
+    written = of_models(x, of_models(y, 3, x), 2)
+    assert written.args == of_sympy(number(2, 3), x, y, evaluate=False).args
+    assert written == of_sympy(x, y, number(2, 3)) == written and hash(written) == hash(of_sympy(x, y, number(2, 3)))
+    assert written != next(of_other(*written.args) for of_other, _, _ in PAIRS if of_other is not of_models)
+    for made in (pickle.loads(pickle.dumps(written)), written.xreplace({x: x}), normal(of_sympy(x, y, number(2, 3)))):
+        assert made == written and type(made) is of_models
+    assert to_text(written) == to_text(of_sympy(x, y, number(2, 3)))
+    assert of_models(x, of_sympy.identity, x) == x and of_models(x, of_sympy.zero) == of_sympy.zero
+    assert of_models() == of_sympy() and of_models(2, 3, sp.pi) == of_sympy(2, 3, sp.pi)
+    assert not of_models(x, x + 1).is_Symbol and of_models(x, x + 1).subs(x, 2) == number(2, 3)
+
+
+@pytest.mark.parametrize("of_models", [Max, Min])
+@pytest.mark.parametrize("value", [sp.I, sp.nan, sp.zoo])
+def test_what_cannot_be_compared_has_no_extremum(of_models, value: sp.Expr) -> None:
+    with pytest.raises(ValueError, match="not comparable"):
+        of_models(symbol("x"), value)
+
+
+@pytest.mark.parametrize(("of_models", "of_sympy", "_number"), PAIRS)
+def test_an_extremum_has_the_derivatives_of_that_of_sympy(of_models, of_sympy, _number) -> None:
+    x, y = symbol("x"), symbol("y")
+    for arguments in ((x**2, 3 * y), (x**2, 3 * y, 2)):
+        assert of_models(*arguments).diff(x) == of_sympy(*arguments).diff(x)
+
+
+def test_an_expression_at_values_has_the_branches_that_they_leave() -> None:
+    x, y, a, b = (symbol(n) for n in "xyab")
+    e = parse("where(a > 0, where(x > b/a, x, y), 2*y)")
+    assert at_values(e, {a: sp.Float(0.0), b: sp.Float(0.0)}) == 2 * y
+    assert at_values(e, {a: sp.Float(2.0), b: sp.Float(1.0)}) == parse("where(x > 0.5, x, y)")
+    assert at_values(e, {}) == e
+    assert at_values(parse("where(x > b/a, x, y)"), {a: sp.Float(0.0), b: sp.Float(0.0)}).free_symbols == {x, y, a, b}

@@ -12,6 +12,7 @@ from hvdc_ident.errors import InputError
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.fmu.export.modelica_model import modelica
 from hvdc_ident.model import parse_card, read_card, write_card
+from hvdc_ident.model.transform import without_vanished
 
 REGULATOR = """schema = 1
 name = "regulator"
@@ -239,6 +240,19 @@ def test_a_time_constant_that_is_gone_does_not_come_back(folder) -> None:
     assert "avr.Efd" in unit.signals
     with pytest.raises(InputError, match=r"avr\.TA.*\[0, 0\]"):
         unit.with_values({"avr.TA": 0.1})
+
+
+def test_states_that_are_gone_are_signals_in_their_order() -> None:
+    """So that a card has one text, whatever a process's hashes are."""
+    states = {f"x{k}": f'{{derivative = "(u - x{k})/T", rest = "u", vanishes = "T"}}' for k in range(8)}
+    head = [
+        "schema = 1",
+        'name = "lags"',
+        "parameters = {T = {value = 0.0, min = 0.0}}",
+        "inputs = {u = {value = 1.0}}",
+    ]
+    lines = [*head, 'outputs = {y = "x7"}', "[states]", *(f"{n} = {s}" for n, s in states.items())]
+    assert list(without_vanished(parse_card("\n".join(lines))).signals) == list(states)
 
 
 def test_conditions_that_a_gone_time_constant_decides_open_circles(folder) -> None:

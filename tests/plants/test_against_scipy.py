@@ -7,9 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hvdc_ident as hi
-from hvdc_ident.model import Model, parse_card
+from hvdc_ident.model import Model, parse_card, shelf_model
 from hvdc_ident.plants import UnitPart, parts_of, unit_card
-from hvdc_ident.plants.unit import shelf_model
 
 pytestmark = pytest.mark.nightly
 

@@ -13,9 +13,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hvdc_ident as hi
-from hvdc_ident.model import Model, parse_card
+from hvdc_ident.model import Model, parse_card, shelf_model
 from hvdc_ident.plants import parts_of, unit_card
-from hvdc_ident.plants.unit import shelf_model
 
 TIMES = np.round(np.arange(0.0, 4.001, 0.02), 6)
 OMEGA = np.logspace(-2, 2, 41)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from hvdc_ident.model import parse_card
-from hvdc_ident.plants import UnitPart, block_signals, unit_card
+from hvdc_ident.plants import UnitPart, block_signals, parts_of, unit_card
+from tests.plants.test_against_andes import CASES
 
 CONTROLS = ("avr.*", "gov.*", "elec.*", "plant.*", "gen.Pm", "gen.Efd", "gen.Ipcmd", "gen.Iqcmd", "P", "Q")
 
@@ -42,3 +45,20 @@ def test_flags_choose_the_branches_that_count(flag):
     assert not voltage_loop & set(found)
     assert not {"elec.dip", "plant.Vref", "plant.Plant_pref", "elec.PFaref"} & set(found)
     assert {"elec.Qsel", "elec.Iqcmd", "plant.err", "plant.Vmeas", "P", "Q"} <= set(found)
+
+
+SATURATION = ("S10", "S12", "E1", "SE1", "E2", "SE2")
+
+
+@pytest.mark.parametrize("name", [n for n, records in CASES.items() if {"GENROU", "GENSAL"} & set(records)])
+def test_zeros_for_no_saturation_leave_a_unit_its_references_and_places(name):
+    """The branch of the saturation, which does not count then, has 0/0 in it; the saturation itself is no place."""
+    parts = parts_of(CASES[name])
+    plain = {
+        n: replace(p, values={**p.values, **{k: 0.0 for k in SATURATION if k in p.values}}) for n, p in parts.items()
+    }
+    assert places(**plain) == places(**parts)
+    assert (
+        parse_card(unit_card(plain, network="playback")).inputs
+        == parse_card(unit_card(parts, network="playback")).inputs
+    )

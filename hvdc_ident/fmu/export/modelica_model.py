@@ -234,7 +234,7 @@ class ModelicaPrinter:
         if kind is clip:
             x, low, high = map(self._name, e.args)
             return f"(if {x} < {low} then {low} elseif {x} > {high} then {high} else {x})"
-        if kind in (sp.Min, sp.Max):
+        if isinstance(e, sp.Min | sp.Max):
             return self._extremum(e)
         if kind is sp.Piecewise and e.args[-1].cond == True:  # noqa: E712 - a sympy condition
             pieces = [f"if {self._condition(c)} then {self(v)}" for v, c in e.args[:-1]]
@@ -245,7 +245,7 @@ class ModelicaPrinter:
         )
 
     def _extremum(self, e: Any) -> str:
-        sign = "<" if e.func is sp.Min else ">"
+        sign = "<" if isinstance(e, sp.Min) else ">"
         text = self._name(e.args[0])
         for k, argument in enumerate(e.args[1:]):
             first = text if k == 0 else self._helper(text)
