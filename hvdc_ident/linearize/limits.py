@@ -103,8 +103,12 @@ def _extremum(
 ) -> None:
     """Note the pairwise comparisons of a min or max; a min with a max inside (or the reverse) is a limiter's two ends.
 
-    A single min or max is a choice: which side of it is the limit nobody can tell.
+    A single min or max is a choice: which of two signals is the limit nobody can tell; a number or parameter beside a signal is.
     """
+
+    def fixed(term: sp.Basic) -> bool:
+        return all(str(s) in structure.model.parameters for s in term.free_symbols)
+
     g = structure.graph
     values = [node(a) for a in e.args]
     smallest = isinstance(e, sp.Min)
@@ -118,6 +122,8 @@ def _extremum(
             # The switch's value is so_far - a; the margin is level - moving for min, moving - level for max.
             sign = 1.0 if (level is so_far) == smallest else -1.0
             note(difference, name, "upper" if smallest else "lower", moving, level, sign)
+        elif fixed(so_far) and not fixed(a):
+            note(difference, name, "branch", a, so_far, -1.0)
         else:
             note(difference, name, "branch", so_far, a, 1.0)
         result = g.select(first, result, v) if smallest else g.select(first, v, result)

@@ -168,6 +168,17 @@ def test_a_kink_is_refused_with_the_limiter_named():
     np.testing.assert_array_equal(above.B, [[1.0]])
 
 
+@pytest.mark.parametrize("limit", ["1", "high"])
+@pytest.mark.parametrize(("text", "slopes"), [("min", (1.0, 0.0)), ("max", (0.0, 1.0))])
+def test_below_a_limit_is_where_the_signal_is_below_it(text, slopes, limit):
+    for expression in (f"{text}(u, {limit})", f"{text}({limit}, u)"):
+        model = Model(
+            "m", parameters={"high": 1.0}, inputs={"u": 1.0}, states={"x": f"{expression} - x"}, outputs={"y": "x"}
+        )
+        below, above = one_sided(model, find_operating_point(model))
+        assert (below.B[0, 0], above.B[0, 0]) == slopes
+
+
 def test_a_condition_of_parameters_is_no_kink():
     """An option stands exactly on the number it is compared with; it does not move with the states."""
     option = Model(
