@@ -21,7 +21,7 @@ from hvdc_ident.text import with_unit
 
 COLORS = SERIES[1:6]
 """Colours of the rivals."""
-MOST = len(COLORS)
+CURVES = len(COLORS)
 TALL = 150
 
 
@@ -69,7 +69,7 @@ class NextExperiment:
     ) -> None:
         self._study = study
         self._planned = planned_experiments(study, report)
-        self._models = (fitted or Supposition(WORDS["given"], study.model), *rivals[:MOST])
+        self._models = (fitted or Supposition(WORDS["given"], study.model), *rivals[:CURVES])
 
     def build(self) -> None:
         """Build the choice and the button; nothing where no input can be moved."""

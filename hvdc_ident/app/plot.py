@@ -21,7 +21,7 @@ from hvdc_ident.report.drawing import base_style
 
 RECORDED, GIVEN, NOW, EFFECT = (variable(name) for name in ("measured", "given", "fitted", "effect"))
 """Colours, as the page's style sheet names them; `NOW` is that of the values at hand."""
-MOST = 4000
+ROWS_DRAWN = 4000
 """Rows that are drawn as they are: a screen has fewer columns than half of them."""
 ASSETS = Path(__file__).parent / "static" / "uplot"
 HEAD = f"""<link rel="stylesheet" href="/assets/uPlot.min.css"><script src="/assets/uPlot.iife.min.js"></script>
@@ -132,7 +132,7 @@ def _short(values: Array) -> NDArray[np.float32]:
     return np.ascontiguousarray(values, dtype=np.float32)
 
 
-def thinned(x: Array, *ys: Array, most: int = MOST) -> list[Array]:
+def thinned(x: Array, *ys: Array, most: int = ROWS_DRAWN) -> list[Array]:
     """Return x and curves over it as they are drawn, (n,) each: of every stretch of many rows the least and the largest value.
 
     No peak is lost. x: rising. most: rows that are drawn.
@@ -154,7 +154,7 @@ def focused(x: Array, low: float, high: float, *ys: Array) -> list[Array]:
     ends[1], ends[2] = max(ends[1] - 1, 0), min(ends[2] + 1, x.size)  # lines that go on beyond the edge
     parts = [
         thinned(x[a:b], *(y[a:b] for y in ys), most=most)
-        for a, b, most in zip(ends, ends[1:], (MOST // 8, MOST, MOST // 8), strict=False)
+        for a, b, most in zip(ends, ends[1:], (ROWS_DRAWN // 8, ROWS_DRAWN, ROWS_DRAWN // 8), strict=False)
         if a < b
     ]
     return [np.concatenate(columns) for columns in zip(*parts, strict=True)]

@@ -28,12 +28,12 @@ Band = tuple[float, float]
 
 TELLS = 1e-7
 """Singular value, relative to the largest of columns of length 1, from which a direction counts."""
-LARGEST = 1e100
+SQUARABLE = 1e100
 """Residuals and derivatives beyond this leave the range of floats (1e308) once products of two are scaled and summed: no
 factorisation of them would end."""
 OPEN = 100.0
 """Standard deviation of an output's level before the event, in those of its noise: what is known of the level, the rows tell."""
-MOST = 3000
+ROWS_TOGETHER = 3000
 """Rows that are whitened together; what longer records have in common beyond so many is left in them."""
 
 
@@ -286,11 +286,11 @@ def residual_blocks(
             jacobian, spare = slopes * slope[:, None], quantised.spare
         else:
             scaled = per_deviation(np.column_stack([misfit, slopes]), weight, record.profile)
-            if not np.abs(scaled).max(initial=0.0) < LARGEST:
+            if not np.abs(scaled).max(initial=0.0) < SQUARABLE:
                 raise SimulationError(
                     f"output '{output}' or its sensitivity grows beyond all bounds",
                     where=f"experiment '{experiment.name}'",
-                    expected=f"below {LARGEST:g} standard deviations",
+                    expected=f"below {SQUARABLE:g} standard deviations",
                 )
             treated = treatment.applied(scaled, record.time, output, f"experiment '{experiment.name}'")
             residual, jacobian, slope, spare = np.ascontiguousarray(treated[:, 0]), treated[:, 1:], None, 0.0
@@ -377,7 +377,7 @@ def _parts(blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: T
 def _parts_of(passed: PassedNoise, outputs: _Outputs, treatment: Treatment) -> tuple[_Part, ...]:
     whole, order = _causes(passed, outputs, treatment)
     found = []
-    for at in np.array_split(order, -(-order.size // MOST)):
+    for at in np.array_split(order, -(-order.size // ROWS_TOGETHER)):
         covariance = whole[at] @ whole[at].T
         covariance[np.diag_indices(at.size)] += 1.0
         found.append(_Part(at, cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)))

@@ -14,7 +14,7 @@ from hvdc_ident.immutable import FrozenMap
 
 WINDOWS = ("before", "during", "after")
 DEFAULT = "set-point-step-simulation"
-LARGEST = 1_000_000  # bytes of a file
+FILE_BYTES = 1_000_000  # bytes of a file
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def _profile(content: bytes, where: str) -> ToleranceProfile:
     from hvdc_ident.toml_tables import decoded, parsed, require_schema, validated
 
     what = "the tolerance profile"
-    table = parsed(decoded(content, what, where, LARGEST, StudyError), what, where, StudyError)
+    table = parsed(decoded(content, what, where, FILE_BYTES, StudyError), what, where, StudyError)
     require_schema(table, 1, what, where, StudyError)
     file = validated(ProfileFile, table, where, StudyError)
     return ToleranceProfile(

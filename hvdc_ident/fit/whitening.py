@@ -16,7 +16,7 @@ from hvdc_ident.errors import StudyError
 
 AR = tuple[float, ...]
 
-MOST = 8
+HIGHEST_ORDER = 8
 """The highest AR order that is tried."""
 FEWEST = 20
 """From fewer rows the noise is not whitened: a coefficient would be known to 0.2 at best."""
@@ -46,7 +46,7 @@ def independent_samples(residuals: Sequence[Array], unknowns: float) -> tuple[fl
     return rho, sum(r.size for r in residuals) * (1.0 - rho) / (1.0 + rho)
 
 
-def autoregression(records: Sequence[Array], most: int = MOST) -> AR:
+def autoregression(records: Sequence[Array], most: int = HIGHEST_ORDER) -> AR:
     """Return the AR model of the noise in several records together, its order by BIC; () where it is white.
 
     records: (n,) each, evenly sampled, without trend. One coefficient at most for ten rows: of fewer BIC finds too many in every tenth

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Generic, Protocol, TypeVar
 
-MOST = 64 * 2**20  # bytes
+KEPT_BYTES = 64 * 2**20  # bytes
 
 
 class Sized(Protocol):
@@ -23,7 +23,7 @@ class LastRuns(Generic[Run]):
     Refits of effects at the outputs request the same ones many times.
     """
 
-    def __init__(self, most: int = MOST) -> None:
+    def __init__(self, most: int = KEPT_BYTES) -> None:
         self._most, self._bytes = most, 0
         self._runs: dict[bytes, Run] = {}
 

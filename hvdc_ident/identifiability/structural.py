@@ -38,7 +38,7 @@ SECONDS = 10.0
 METHOD = "numerical, local"
 INSTEAD = "from the sensitivities at random points, because"
 POINTS = 5
-MOST = 12
+COMBINATION_POINTS = 12
 """Number of points from which on no more are drawn for a combination of many parameters."""
 WIDE = 8
 """Number of points of which one lies in each eighth of every parameter's range."""
@@ -222,7 +222,7 @@ class _Runs:
             return (), frozenset()
 
         def more() -> Point | None:
-            for theta in self._drawn(POINTS) if len(self.points) < MOST else ():
+            for theta in self._drawn(POINTS) if len(self.points) < COMBINATION_POINTS else ():
                 if not self._run(theta):
                     point = self._unseen_at(*self.points[-1], members)
                     if point.pattern == points[0].pattern:

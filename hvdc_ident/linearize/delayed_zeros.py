@@ -22,7 +22,7 @@ REACH = 8.0
 """Largest |s| times the longest delay within which none is missing: well inside what the highest order's phase holds for."""
 TURN = 0.5
 """Largest turn, rad, of the determinant's phase from one point of the circle to the next: a sixth of half a turn, which has no sign."""
-MOST = 200_000
+CIRCLE_POINTS = 200_000
 """Points of the circle at most."""
 
 
@@ -129,7 +129,7 @@ def _counted(part: Part, radius: float) -> int:
         wide = np.abs(turned) > TURN
         if not wide.any():
             return round(2.0 * float(turned.sum()) / (2.0 * np.pi))
-        if angle.size > MOST:
+        if angle.size > CIRCLE_POINTS:
             raise LinearizationError(
                 "the zeros cannot be counted", got=f"one on the circle |s| = {radius:.4g}, or too near it"
             )

@@ -14,7 +14,7 @@ from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.model import Model
 
 S = sp.Symbol("s")
-LARGEST = 6
+FORMULA_STATES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,10 +105,10 @@ def symbolic_transfer(
     kept = {symbol(n): symbol((together or {}).get(n, n)) for n in (*parameters, *(together or {}))}
     a, b, c, d = _matrices(model, at, input, output, kept)
     a, b, c = _between(a, b, c)
-    if a.shape[0] > LARGEST:
+    if a.shape[0] > FORMULA_STATES:
         raise LinearizationError(
             f"{a.shape[0]} states lie between '{input}' and '{output}': no formula anyone would read",
-            expected=f"at most {LARGEST}",
+            expected=f"at most {FORMULA_STATES}",
             hint="use transfer_function(), which gives zeros and poles",
         )
     top, bottom = _fraction(a, b, c, d)

@@ -256,7 +256,7 @@ the ends of a step of length h differ by h^2/|(s1 - r)(s2 - r)|. Below 0.5 a roo
 turns the phase by 0.73 rad, far below the half turn at which an angle could be taken the wrong way round."""
 NARROWEST = 1e-9
 """Share of its frequency to which a step is halved: a root nearer to the axis lies on either side of it, as rounding has it."""
-MOST = 200_000
+FREQUENCIES = 200_000
 """Frequencies after which steps are halved no more: what is left then has more turns than anyone looks at, or is rounding noise."""
 
 
@@ -292,7 +292,7 @@ def followed(at: Sloped, s: Array) -> tuple[Array, Array]:
         wide = ((apart > TURN) & known[1:] & known[:-1]).any(axis=(1, 2)) & (
             np.abs(np.diff(s)) > NARROWEST * np.abs(s[1:])
         )
-        if not wide.any() or s.size > MOST:
+        if not wide.any() or s.size > FREQUENCIES:
             return s, change
         k = np.flatnonzero(wide)
         low, high = s[k], s[k + 1]

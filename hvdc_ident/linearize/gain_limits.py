@@ -34,7 +34,7 @@ BESIDE = 1e-4
 """Share of a factor's logarithm by which the roots are counted beside it."""
 FAR = (3.0, 30.0, 1e3)
 """Factors beyond the last crossing, either way, at which the roots are counted once more."""
-LARGEST = 1e9
+UNLIMITED = 1e9
 """Factors beyond this, and below its inverse, are taken for none: L is then below the rounding errors of its terms."""
 
 
@@ -68,7 +68,7 @@ class Closing:
         for omega, complementary in ((0.0, closed.response(np.zeros(1))[0]), (float("inf"), closed.through)):
             t = float(complementary[self.place, self.place].real)
             factor = (t - 1.0) / t if t else float("inf")  # -1/L with L = T/(1 - T)
-            if 1.0 / LARGEST < factor < LARGEST:
+            if 1.0 / UNLIMITED < factor < UNLIMITED:
                 found.append(Crossing(omega, factor))
         return found + self._neutral()
 
@@ -82,7 +82,7 @@ class Closing:
 
         found = []
         for side in (1.0, -1.0):
-            logs = side * np.linspace(0.0, np.log(LARGEST), 200)
+            logs = side * np.linspace(0.0, np.log(UNLIMITED), 200)
             for low, high in pairwise(logs):
                 if excess(low) < 0.0 <= excess(high):
                     found.append(Crossing(float("inf"), float(np.exp(brentq(excess, low, high, xtol=1e-14)))))
@@ -95,7 +95,7 @@ class Closing:
         crossings: those of the loop, at any factor. Without one, a factor infinite or 0. Where the count of the roots
         shows that a crossing was missed, the factor is found by bisection on the count.
         """
-        logs = [(side * float(np.log(c.value)), c) for c in crossings if 1.0 / LARGEST < c.value < LARGEST]
+        logs = [(side * float(np.log(c.value)), c) for c in crossings if 1.0 / UNLIMITED < c.value < UNLIMITED]
         ahead = sorted((x for x in logs if x[0] > 0.0), key=lambda x: x[0])
         passed = 0.0
         for k, (log, crossing) in enumerate(ahead):
@@ -161,12 +161,12 @@ TURN = 0.3
 """Largest change of a curve's logarithm between two frequencies of a refined grid: gain by 35 %, phase by 17 degrees."""
 FLOOR = 1e-3
 """Gain below which a curve need not be followed: it crosses -1 at factors above 1000 only."""
-MOST = 200_000
+LOCUS_POINTS = 200_000
 
 
 def refined(values_at: Callable[[Array], Array], grid: Array, values: Array) -> tuple[Array, Array]:
     """Return frequencies and values of a curve, with points added until it moves little from each to the next."""
-    while grid.size < MOST:
+    while grid.size < LOCUS_POINTS:
         with np.errstate(all="ignore"):
             moved = np.abs(np.log(values[1:] / values[:-1]))
         wide = (moved > TURN) & (np.maximum(np.abs(values[1:]), np.abs(values[:-1])) > FLOOR)

@@ -16,7 +16,7 @@ from hvdc_ident.errors import WaveformError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.system import Array
 
-LARGEST = 50_000_000  # bytes
+FILE_BYTES = 50_000_000  # bytes
 _HERTZ = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
 _PARTS = {
     "re": "re", "real": "re", "im": "im", "imag": "im", "imaginary": "im",
@@ -81,7 +81,7 @@ def read_response(path: str | Path) -> ResponseFile:
     """
     file = Path(path)
     try:
-        if file.stat().st_size > LARGEST:
+        if file.stat().st_size > FILE_BYTES:
             raise WaveformError("the file is too large for a frequency response", where=str(file))
         text = file.read_text(encoding="utf-8-sig", errors="strict")
     except FileNotFoundError:

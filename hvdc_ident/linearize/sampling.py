@@ -17,7 +17,7 @@ import scipy.linalg
 from hvdc_ident.linearize.delays import Channel
 from hvdc_ident.linearize.system import Array
 
-MOST = 1000
+PERIOD_SAMPLES = 1000
 """Samples in a common period up to which the multipliers are computed."""
 
 
@@ -56,15 +56,15 @@ def multipliers(matrix: Array, nx: int, channels: Sequence[Channel]) -> tuple[Ar
 
 
 def _common_period(channels: Sequence[Channel]) -> float | None:
-    """Return the least common multiple of the sampling periods, s; None where there is none of at most MOST samples."""
+    """Return the least common multiple of the sampling periods, s; None where there is none of at most PERIOD_SAMPLES samples."""
     first = channels[0].time
-    shares = [Fraction(c.time / first).limit_denominator(MOST) for c in channels]
+    shares = [Fraction(c.time / first).limit_denominator(PERIOD_SAMPLES) for c in channels]
     if any(abs(float(f) * first - c.time) > 1e-9 * c.time for f, c in zip(shares, channels, strict=True)):
         return None
     below = lcm(*(f.denominator for f in shares))
     whole = lcm(*(f.numerator * (below // f.denominator) for f in shares))
     period = first * whole / below
-    return period if sum(period / c.time for c in channels) <= MOST else None
+    return period if sum(period / c.time for c in channels) <= PERIOD_SAMPLES else None
 
 
 def _events(

@@ -39,7 +39,7 @@ ORDERS = (12, 24, 48, 96, 192)
 """Collocation points of a delay that are tried one after the other until the roots found are as many as are counted."""
 ALIKE = 1e-7
 """Roots nearer to each other than this share of their size are taken for one of several times."""
-LARGEST = 900
+DISCRETISATION_ROWS = 900
 """Rows of the largest discretisation."""
 
 
@@ -381,7 +381,7 @@ def _counted(part: Part) -> tuple[float, int, int]:
 
 
 def _orders(part: Part) -> Sequence[int]:
-    return [k for k in ORDERS if k == ORDERS[0] or part.nx + k * len(part.channels) <= LARGEST]
+    return [k for k in ORDERS if k == ORDERS[0] or part.nx + k * len(part.channels) <= DISCRETISATION_ROWS]
 
 
 def eigenvalues(matrix: Array, error: float = EPS) -> Roots:

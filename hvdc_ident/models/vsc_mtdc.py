@@ -28,7 +28,7 @@ from hvdc_ident.plants import shelf_model
 
 SUMMARY = "multi-terminal grid of phasor stations, 3 states each; vsc-mtdc-N for N terminals, 4 where none is given"
 
-MOST = 400
+STATIONS = 400
 _NAME = re.compile(r"vsc-mtdc-(\d{1,4})")
 _STATES = ("Vdc", "xv", "xp", "xq")
 """The order of the states, by their names without the stations' numbers."""
@@ -47,9 +47,9 @@ def family(name: str) -> Model | None:
 
 def vsc_mtdc(terminals: int) -> Model:
     """Return the grid of so many terminals, 2 to 400; ModelError outside that."""
-    if not 2 <= terminals <= MOST:
+    if not 2 <= terminals <= STATIONS:
         raise ModelError(
-            "a grid of so many terminals is not offered", expected=f"2 to {MOST} terminals", got=str(terminals)
+            "a grid of so many terminals is not offered", expected=f"2 to {STATIONS} terminals", got=str(terminals)
         )
     stations = [str(i) for i in range(1, terminals + 1)]
     own: dict[str, Mapping[str, Any]] = {

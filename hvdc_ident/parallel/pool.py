@@ -33,7 +33,7 @@ from hvdc_ident.parallel.child import Ending
 
 BATCH = 0.02  # s of work that is sent and reported at a time: a kill of the parent loses no more of each worker's
 AHEAD = 2  # batches of quick items that each worker has, so that it works while the last one's outcomes are stored
-MOST = 1000  # items of a batch
+BATCH_ITEMS = 1000  # items of a batch
 LOOK = 1.0  # s between two looks at workers that report nothing
 DEATHS = 2  # of workers at the same item before it is given up
 
@@ -63,7 +63,7 @@ def outcomes_of(workers: Workers, function: Callable[[Any], Any], items: Iterabl
     """
     content = pickle.dumps(function)
     name = hashlib.sha256(content).hexdigest()
-    share = min(-(-operator.length_hint(items) // (2 * workers.count)) or MOST, MOST)
+    share = min(-(-operator.length_hint(items) // (2 * workers.count)) or BATCH_ITEMS, BATCH_ITEMS)
     numbered, waiting = iter(enumerate(items)), deque[Batch]()  # what goes again, before what is new
     running: dict[Future[Any], Batch] = {}
     unknown: set[int] = set()  # first items of the batches whose worker asked for the function

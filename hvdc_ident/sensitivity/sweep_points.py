@@ -28,7 +28,7 @@ from hvdc_ident.model import AnyModel
 from hvdc_ident.simulate import Method, simulate
 
 Complex = NDArray[np.complex128]
-MOST = 10_000_000
+MOST_POINTS = 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +120,11 @@ class Points:
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
             raise StudyError(f"'{twice[0]}' is swept twice", where="sweep", expected="each parameter in one axis")
-        if len(self) > MOST:
+        if len(self) > MOST_POINTS:
             raise StudyError(
                 "the product of the sweep's axes is too large",
                 where="sweep",
-                expected=f"at most {MOST} points",
+                expected=f"at most {MOST_POINTS} points",
                 got=" x ".join(str(len(a)) for a in self.axes),
                 hint="fewer points an axis, or a Latin hypercube",
             )

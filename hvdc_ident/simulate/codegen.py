@@ -274,7 +274,7 @@ class _LanesEmitter(_Emitter):
 
 # --- the linear systems of the Rosenbrock method ---
 
-LARGEST = 20_000  # factors beyond which straight-line code no longer pays
+STRAIGHT_FACTORS = 20_000  # factors beyond which straight-line code no longer pays
 
 
 @dataclass(frozen=True)
@@ -335,7 +335,7 @@ def eliminate(entries: Mapping[tuple[int, int], float | None], n: int, nx: int) 
                 else:
                     matrix[i][j] = graph.neg(product)
                     columns[j].add(i)
-        if len(factors) > LARGEST:
+        if len(factors) > STRAIGHT_FACTORS:
             return None
     places = {(k, k): k for k in range(n)}
     for key in factors:

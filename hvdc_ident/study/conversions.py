@@ -12,7 +12,7 @@ from hvdc_ident.data import PREFIXED, PREFIXES, UNITS, conversion, same_unit
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.parameters import Parameter
 
-LARGEST = 1e6
+LARGEST_FACTOR = 1e6
 """Largest factor between two units of one quantity that are confused."""
 FINEST = 1e-3
 """No model's level or movement is expected nearer to the plant's than this share, so a nearer match proves no more."""
@@ -104,7 +104,7 @@ def _of_unit(unit: str) -> Iterator[tuple[str, float, float]]:
     """Yield what is recorded, factor and shift for the other units of the kind, and for what is confused with it beside them."""
     for name in (*(u for u in UNITS if u != "‰"), *(prefix + base for base in PREFIXED for prefix in PREFIXES)):
         by = conversion(unit, name)
-        if by is not None and 1.0 / LARGEST <= by[0] <= LARGEST:
+        if by is not None and 1.0 / LARGEST_FACTOR <= by[0] <= LARGEST_FACTOR:
             yield f"in {NAMES.get(name, name)}" if name != "pu" else "per unit", *by
     for units, name, factor, shift in RATIOS:
         if any(same_unit(unit, u) or (u in ELECTRICAL and conversion(unit, u)) for u in units):

@@ -30,7 +30,7 @@ from hvdc_ident.model import AnyModel, Model
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.conversions import (
     FINEST,
-    LARGEST,
+    LARGEST_FACTOR,
     POSITIVE,
     SIGN,
     STRONG,
@@ -252,12 +252,12 @@ def compare_initial_values(
 def _run_away(record: Record, simulated: Array) -> str:
     """Return in words that the model grows without bound where the recording does not; empty where it stays near it.
 
-    No two units of one quantity that are confused lie further apart than LARGEST.
+    No two units of one quantity that are confused lie further apart than LARGEST_FACTOR.
     """
     recorded = record.values[np.isfinite(record.values)]
     bound = float(np.abs(recorded).max(initial=0.0))
     largest = float(np.abs(simulated).max(initial=0.0))
-    if not bound or largest <= LARGEST * bound:
+    if not bound or largest <= LARGEST_FACTOR * bound:
         return ""
     unit = f" {record.unit}" if record.unit else ""
     return (

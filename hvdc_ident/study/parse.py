@@ -11,7 +11,7 @@ from hvdc_ident.next_step import NextStep
 from hvdc_ident.study.schema import StudyFile
 from hvdc_ident.toml_tables import decoded, parsed, require_schema, validated
 
-LARGEST = 1_000_000  # bytes; a study of a thousand experiments has a third of it
+FILE_BYTES = 1_000_000  # bytes; a study of a thousand experiments has a third of it
 
 
 def is_study_file(path: Path) -> bool:
@@ -64,5 +64,5 @@ def _lists_signals(path: Path) -> bool:
 
 
 def _toml(content: bytes, where: str) -> dict[str, Any]:
-    text = decoded(content, "the study file", where, LARGEST, StudyError)
+    text = decoded(content, "the study file", where, FILE_BYTES, StudyError)
     return parsed(text, "the study file", where, StudyError, "mend this line")

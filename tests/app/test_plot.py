@@ -9,7 +9,7 @@ pytest.importorskip("nicegui", reason="the workbench needs: pip install 'hvdc_id
 
 from nicegui.json import dumps
 
-from hvdc_ident.app.plot import MOST, _short, focused, scattered, sketch, thinned
+from hvdc_ident.app.plot import ROWS_DRAWN, _short, focused, scattered, sketch, thinned
 
 
 def test_a_short_record_is_drawn_as_it_is() -> None:
@@ -22,16 +22,16 @@ def test_a_long_record_keeps_every_peak() -> None:
     x, y, z = np.arange(1e6), rng.normal(size=10**6), np.zeros(10**6)
     y[123_457], z[999_999] = 50.0, -7.0
     drawn_x, drawn_y, drawn_z = thinned(x, y, z)
-    assert drawn_x.size == drawn_y.size == MOST and (np.diff(drawn_x) > 0).all()
+    assert drawn_x.size == drawn_y.size == ROWS_DRAWN and (np.diff(drawn_x) > 0).all()
     assert drawn_y.max() == 50.0 and drawn_y.min() == y.min() and drawn_z.min() == -7.0
-    assert abs(drawn_x[drawn_y.argmax()] - 123_457) <= 2 * 1e6 / MOST
+    assert abs(drawn_x[drawn_y.argmax()] - 123_457) <= 2 * 1e6 / ROWS_DRAWN
 
 
 def test_rows_that_were_not_recorded_are_no_numbers() -> None:
     x, y = np.arange(1e4), np.full(10**4, np.nan)
     y[:5000] = 1.0
     drawn = thinned(x, y)[1]
-    assert np.isfinite(drawn[: MOST // 2]).all() and np.isnan(drawn[MOST // 2 :]).all()
+    assert np.isfinite(drawn[: ROWS_DRAWN // 2]).all() and np.isnan(drawn[ROWS_DRAWN // 2 :]).all()
     assert dumps({"args": [_short(np.array([0.1, np.nan, np.inf]))]}) == '{"args":[[0.1,null,null]]}'
 
 
@@ -50,8 +50,8 @@ def test_what_is_looked_at_is_drawn_closely_and_the_rest_coarsely() -> None:
     inside = (drawn_x >= 500_000) & (drawn_x <= 502_000)
     np.testing.assert_array_equal(drawn_x[inside], np.arange(500_000.0, 502_001.0))
     np.testing.assert_array_equal(drawn_y[inside], y[500_000:502_001])
-    assert drawn_x.size < 2 * MOST and (np.diff(drawn_x) > 0).all() and drawn_y.min() == -9.0
-    assert drawn_x[0] == 0.0 and drawn_x[-1] > x[-1] * (1.0 - 16.0 / MOST)
+    assert drawn_x.size < 2 * ROWS_DRAWN and (np.diff(drawn_x) > 0).all() and drawn_y.min() == -9.0
+    assert drawn_x[0] == 0.0 and drawn_x[-1] > x[-1] * (1.0 - 16.0 / ROWS_DRAWN)
 
 
 def test_a_view_beside_the_record_draws_it_all_the_same() -> None:

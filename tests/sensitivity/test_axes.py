@@ -7,7 +7,7 @@ import pytest
 
 from hvdc_ident.errors import StudyError
 from hvdc_ident.sensitivity import Points, Samples, grid, latin_hypercube, listed, log_grid
-from hvdc_ident.sensitivity.sweep_points import MOST, points_of
+from hvdc_ident.sensitivity.sweep_points import MOST_POINTS, points_of
 
 
 def test_grids_and_lists():
@@ -52,6 +52,6 @@ def test_the_product_moves_the_last_axis_fastest_and_is_made_in_pieces():
     ],
 )
 def test_what_cannot_be_swept_is_refused(make):
-    assert MOST < 1000**3
+    assert MOST_POINTS < 1000**3
     with pytest.raises(StudyError):
         make()

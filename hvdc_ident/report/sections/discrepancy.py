@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MODELS = {"nominal": "given values", "refitted": "refitted, nothing added", "augmented": "with the effect"}
-MOST = 12
+CANDIDATES_SHOWN = 12
 SHOWN = 5e-3
 """A smaller share of the gap is none."""
 
@@ -91,9 +91,9 @@ def _sets(found: Diagnosis) -> str:
         late = ["" if r.late is None else quantity(r.late, "s", 3) for r in group]
         rows = [
             (r.name, ", ".join(r.at), r.source, delay, r.delta_bic)
-            for r, delay in zip(group[:MOST], late, strict=False)
+            for r, delay in zip(group[:CANDIDATES_SHOWN], late, strict=False)
         ]
-        more = f"<p class='small'>and {len(group) - MOST} more</p>" if len(group) > MOST else ""
+        more = f"<p class='small'>and {len(group) - CANDIDATES_SHOWN} more</p>" if len(group) > CANDIDATES_SHOWN else ""
         shown = rows_of(["effect", "at", "from", "late", "behind the best, BIC"], rows)
         parts.append(f"<h3>As good as what was put in</h3>{shown}{more}")
     return "".join(parts)
@@ -172,7 +172,7 @@ def _shares(found: dict[str, float] | None) -> str:
 
 
 def _candidates(found: Diagnosis) -> str:
-    lines = [c for c in found.candidates if c.delta_bic is not None][:MOST]
+    lines = [c for c in found.candidates if c.delta_bic is not None][:CANDIDATES_SHOWN]
     if not lines:
         return ""
     rows = [(c.effect, ", ".join(c.at), c.source, c.score, c.p, c.delta_bic, c.holdout_rmse) for c in lines]

@@ -13,7 +13,7 @@ from hvdc_ident.summary import Results
 
 ARCHIVE = "results.zip"
 SUFFIXES = (".json", ".csv", ".toml")
-LARGEST = 20_000_000
+PAGE_BYTES = 20_000_000
 """Bytes of numbers that a page carries at most, uncompressed; beyond it says where they lie."""
 
 
@@ -35,7 +35,7 @@ def _numbers(results: Results) -> str:
     files = [results.folder / n for n in dict.fromkeys(paths)]
     files = [f for f in files if f.parent == results.folder and f.is_file() and f.suffix in SUFFIXES]
     names = text(", ".join(f.name for f in files))
-    if sum(f.stat().st_size for f in files) > LARGEST:
+    if sum(f.stat().st_size for f in files) > PAGE_BYTES:
         return f"<p class='small'>Every number of this page lies beside it: {names}.</p>"
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -18,7 +18,7 @@ from hvdc_ident.text import figures, with_unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-MOST = 2000
+ROWS_DRAWN = 2000
 """Rows that are drawn; of more, every so many."""
 CURVES, CHANNELS = 40, 4
 """Frequency responses drawn in one figure, and figures of them."""
@@ -41,7 +41,7 @@ def _render(results: Results) -> str:
     good = np.array([k for k in range(len(found)) if k not in found.failed], dtype=int)
     if not good.size:
         return "".join(lines)
-    rows = good[:: max(1, good.size // MOST)]
+    rows = good[:: max(1, good.size // ROWS_DRAWN)]
     return "\n".join([*lines, _best(found), *(_figures(found, name, rows) for name in found.parameters)])
 
 

@@ -12,7 +12,7 @@ from hvdc_ident.report.overlay import Overlay, Sheet, overlay_of
 from hvdc_ident.summary import Results
 from hvdc_ident.text import listed
 
-MOST = 60
+FIGURES = 60
 CHANCE = 0.01
 """Chance that a record of nothing but Gaussian noise is drawn all the same."""
 
@@ -28,7 +28,7 @@ def _render(results: Results) -> str:
                 continue
             if _only_noise(results, overlay):
                 quiet.append(f"{output} in {name}")
-            elif len(drawn) < MOST:
+            elif len(drawn) < FIGURES:
                 drawn.append(overlay.figure(sheet, _caption(results, overlay)))
             else:
                 more = True
@@ -40,7 +40,9 @@ def _render(results: Results) -> str:
         [f"<p class='small'>Not drawn, for they show nothing but noise: {text(listed(quiet))}.</p>"] if quiet else []
     )
     parts += (
-        [f"<p>Only the first {MOST} waveforms are drawn; the CSV files beside this page hold all.</p>"] if more else []
+        [f"<p>Only the first {FIGURES} waveforms are drawn; the CSV files beside this page hold all.</p>"]
+        if more
+        else []
     )
     return "".join(parts) + _recordings(results)
 

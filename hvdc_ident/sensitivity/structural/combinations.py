@@ -55,11 +55,11 @@ def only_seen(members: Sequence[str], seen: Sequence[str]) -> str:
     return f"only {listed(seen)} {'is' if len(seen) == 1 else 'are'} seen"
 
 
-MOST = 2000
+SUBSETS = 2000
 """Subsets tried when a simpler basis is looked for."""
 SPARE = 2
 """Conditions beyond the number of coefficients, so that no combination passes by chance."""
-LARGEST = 12
+SIMPLE_NUMBER = 12
 """The largest exponent or coefficient that counts as simple."""
 FEW = 8
 """Members of a combination up to which polynomials are looked for."""
@@ -285,7 +285,7 @@ def _constant(conditions: Array, error: float) -> list[Exponents]:
     _, s, vt = np.linalg.svd(rows / size)
     space = _reduced(vt[int((s > error * s[0]).sum()) :] / size)
     found, k = [_whole(row, error) for row in space], len(space)
-    if k > 1 and math.comb(n, k - 1) <= MOST:
+    if k > 1 and math.comb(n, k - 1) <= SUBSETS:
         for zero in combinations(range(n), k - 1):
             _, s, vt = np.linalg.svd(space[:, list(zero)].T)
             if s[-1] > np.sqrt(error) * s[0]:
@@ -312,10 +312,10 @@ def _whole(row: Array, error: float) -> Exponents | None:
     near = np.sqrt(error)
     row = np.where(np.abs(row) > near * np.abs(row).max(), row, 0.0)
     row = row / row[np.flatnonzero(row)[0]]
-    parts = [Fraction(x).limit_denominator(LARGEST) for x in row.tolist()]
+    parts = [Fraction(x).limit_denominator(SIMPLE_NUMBER) for x in row.tolist()]
     if any(abs(float(f) - x) > near * max(1.0, abs(x)) for f, x in zip(parts, row, strict=True)):
         return None
     scale = math.lcm(*(f.denominator for f in parts))
     whole = [int(f * scale) for f in parts]
     whole = [x // math.gcd(*whole) for x in whole]
-    return tuple(whole) if max(map(abs, whole)) <= LARGEST else None
+    return tuple(whole) if max(map(abs, whole)) <= SIMPLE_NUMBER else None
