@@ -560,7 +560,9 @@ def _in_order(table: Array) -> tuple[Array, tuple[str, ...]]:
         False, ((ranked[1:] == ranked[:-1]) | (np.isnan(ranked[1:]) & np.isnan(ranked[:-1]))).all(axis=1)
     )
     kept = ranked[~twice]
-    if (again & ~twice).any() or len(kept) < FEWEST or not has_clock(kept[:, 0]) or gaps(kept[:, 0]):
+    steps = np.diff(kept[:, 0])
+    between = steps[steps > 0].min(initial=np.inf) < 0.5 * np.median(steps)
+    if (again & ~twice).any() or len(kept) < FEWEST or between or not has_clock(kept[:, 0]) or gaps(kept[:, 0]):
         return table, ()
     done = ["the rows do not stand in the order of their instants: they are sorted"]
     if number := int(twice.sum()):

@@ -318,6 +318,7 @@ def test_rows_that_are_no_single_record_stay_refused(tmp_path: Path) -> None:
         rows[:40] + other + rows[40:],  # an hour twice, as of a clock that is set back
         rows[:40] + rows_of(instants[20:40] + 0.01),  # between others
         rows[30:] + rows_of(instants[:10]),  # a gap between
+        [*rows[:9], "0.001,0.3", *rows[10:]],  # one whose time is wrong
     ):
         with pytest.raises(WaveformError, match="the time goes back"):
             read_waveforms(written_as(tmp_path, wrong))
