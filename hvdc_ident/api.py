@@ -417,13 +417,13 @@ def sensitivities(
     import numpy as np
 
     from hvdc_ident.errors import InputError
-    from hvdc_ident.model import Model
+    from hvdc_ident.model import is_white_box
     from hvdc_ident.sensitivity import sensitivities as derivatives
     from hvdc_ident.study.assemble import experiments_of, is_study, model_of, names_of, subject_of, values_of
 
     subject = subject_of(model)
     plant = model_of(subject)
-    if not isinstance(plant, Model):
+    if not is_white_box(plant):
         hint = "simulate(..., sensitivities=[...]) gives an FMU's derivatives"
         raise InputError(
             "exact sensitivities need the model's equations", where=f"model '{plant.name}'", got="an FMU", hint=hint

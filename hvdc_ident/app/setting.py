@@ -15,7 +15,7 @@ from hvdc_ident.data import Array, Band, Experiment, SignalLike, bands
 from hvdc_ident.effects import EffectUse
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import FrequencyResponse, LinearModel
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, Model, is_white_box
 from hvdc_ident.simulate import Simulation
 from hvdc_ident.text import listed
 
@@ -154,7 +154,7 @@ class Setting:
 
     def linear(self, point: hi.OperatingPoint) -> LinearModel:
         """Return the linear model of the chosen channel, or of the opened loop. Raises as `hvdc_ident.linearize` and `loop`."""
-        if self.opened and isinstance(self.model, Model):
+        if self.opened and is_white_box(self.model):
             return hi.linear.loop(self.model, self.opened, point).open
         return hi.linearize(self.model, point, inputs=self.channel[0], outputs=self.channel[1])
 
@@ -163,7 +163,7 @@ class Setting:
 
         omega: (n,), rad/s; default, around the poles.
         """
-        if self.port is not None and isinstance(self.model, Model):
+        if self.port is not None and is_white_box(self.model):
             if omega is None:
                 omega = hi.bode(self.model, point=point).omega
             return hi.linear.port_impedance(self.model, self.port, omega, point)
@@ -271,7 +271,7 @@ def span_of(model: AnyModel, name: str, stated: Mapping[str, tuple[float, float]
 
 def equations_of(model: AnyModel) -> Model | None:
     """Return the model where it has equations, so that a loop can be opened and poles followed; None for an FMU."""
-    return model if isinstance(model, Model) else None
+    return model if is_white_box(model) else None
 
 
 def near(poles: NDArray[Any]) -> NDArray[Any]:

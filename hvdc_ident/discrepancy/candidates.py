@@ -24,7 +24,7 @@ from hvdc_ident.effects import (
 )
 from hvdc_ident.errors import unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model, insertion_point, reached
+from hvdc_ident.model import AnyModel, insertion_point, is_white_box, reached
 
 Signals = Mapping[str, tuple[Array, ...]]
 """By place: the signal in each fitted experiment."""
@@ -114,7 +114,7 @@ def candidates(
     groups = places_of(model, live, places)
     about = {p: SignalScales.of(times, signals[p], tones) for p in live}
     brought = source_signals(model, signals)
-    if not isinstance(model, Model):
+    if not is_white_box(model):
         brought += tuple(p for p in live if kind_of(model, p) == "output")
     tried = entries(names)
     doubled, leaky = (any(e.name == n for e in tried) for n in ("coupling", "conductance"))
@@ -155,7 +155,7 @@ def _at(
     brought: Sequence[str],
 ) -> list[CandidateEffect]:
     if effect.resistance:
-        found = list(resistance_parameters(model, at[0])) if len(at) == 1 and isinstance(model, Model) else []
+        found = list(resistance_parameters(model, at[0])) if len(at) == 1 and is_white_box(model) else []
         return [
             CandidateEffect(
                 effect.name, at, probes(effect, signal, given={effect.resistance: model.parameters[n].value}),
@@ -267,7 +267,7 @@ def kind_of(model: AnyModel, place: str) -> str:
 
     Raises UnknownNameError for a place that is no slot.
     """
-    if isinstance(model, Model):
+    if is_white_box(model):
         return insertion_point(model, place)[0]
     if place in model.inputs:
         return "input"
@@ -281,7 +281,7 @@ def kind_of(model: AnyModel, place: str) -> str:
 def _open_to(model: AnyModel, place: str, brought: Sequence[str]) -> set[str]:
     """Signals that an effect at a place may bring in: none that would close a circle. At an end of a closed model signals of its
     own side: an output at an input would close a loop around it, and what comes out does not see what goes in."""
-    if isinstance(model, Model):
+    if is_white_box(model):
         return {*admissible_sources(model, place)} - {place}
     return {s for s in brought if s != place and kind_of(model, s) == kind_of(model, place)}
 
@@ -289,7 +289,7 @@ def _open_to(model: AnyModel, place: str, brought: Sequence[str]) -> set[str]:
 def _moves(model: AnyModel, place: str) -> bool:
     """Return True where a slot's signal depends on states or inputs; what is made of parameters alone is no signal."""
     kind, name = kind_of(model, place), place
-    if kind in ("input", "state", "output", "algebraic") or not isinstance(model, Model):
+    if kind in ("input", "state", "output", "algebraic") or not is_white_box(model):
         return True
     signals = model.signals
     found = reached([name], lambda n: [s.name for s in signals[n].value.free_symbols] if n in signals else [])

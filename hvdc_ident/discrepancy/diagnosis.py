@@ -49,7 +49,7 @@ from hvdc_ident.fit import FitParameter, Simulator
 from hvdc_ident.fit.noise import LOUDER, QUIETER, OutputNoise, misfit_sentence, of_misfit
 from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model, recording
+from hvdc_ident.model import AnyModel, is_white_box, recording
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.text import figures, quantity
 
@@ -118,7 +118,7 @@ def diagnose(
         judgement, notes = unfinished(search, first, outcome), (*notes, UNTESTED)
     else:
         judgement = judge(search, first, outcome)
-    inside = isinstance(model, Model)
+    inside = is_white_box(model)
     other = None
     if judgement.instead is not None:
         other = described(judgement.instead)
@@ -177,7 +177,7 @@ def _model_of(subject: AnyModel | Simulator) -> AnyModel:
     """The model behind the subject. Raises StudyError for something that effects cannot be put on."""
     if isinstance(subject, ModelSimulator):
         return subject.model
-    if isinstance(subject, Model) or hasattr(subject, "with_effects"):
+    if is_white_box(subject) or hasattr(subject, "with_effects"):
         return cast("AnyModel", subject)
     raise StudyError(
         "effects cannot be put on it",
@@ -261,7 +261,7 @@ def _assembled(
         parameters_refitted=FrozenMap({f.name: first.values.get(f.name, f.given) for f in free}),
         parameters_after=FrozenMap({f.name: last.values.get(f.name, f.given) for f in free}),
         augmented=augmented,
-        augmented_model=AUGMENTED if isinstance(augmented, Model) else None,
+        augmented_model=AUGMENTED if is_white_box(augmented) else None,
         fallback=None if other is None else other.to_dict(),
         noise={o: noise_told(n) for o, n in noise.items()},
         notes=notes,

@@ -35,7 +35,7 @@ from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.effects import effects
 from hvdc_ident.expression import parse, symbol, to_text
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model
+from hvdc_ident.model import is_white_box
 from hvdc_ident.text import listed
 
 FORM_PLACES = 12
@@ -75,7 +75,7 @@ def refitted_forms(
     that their first step is the linear regression on it: curves are not screened.
     """
     before = opened.before
-    if not isinstance(before.model, Model):
+    if not is_white_box(before.model):
         return ()
     places = _promising(opened) if at is None else at
     times = [e.time for e in before.problem.fitted_experiments]

@@ -26,7 +26,7 @@ from hvdc_ident.fit.optimisers.trust_region import TrustRegion
 from hvdc_ident.fit.residual import ResidualBlock
 from hvdc_ident.fit.uncertainty import SINGULAR, Uncertainty, uncertainty
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model, insertion_point
+from hvdc_ident.model import AnyModel, Model, insertion_point, is_white_box
 from hvdc_ident.simulate import Method, ModelSimulator, Statistics, Tolerance, equilibria, simulate
 
 REFIT_TOLERANCE = Tolerance(rtol=1e-6, atol=1e-9, brief=True)
@@ -67,7 +67,7 @@ def begins_anywhere(model: AnyModel, without: AnyModel, uses: Sequence[EffectUse
     entries = [effects()[u.effect] for u in uses]
     if any(e.self_exciting for e in entries):
         return True
-    if not (any(e.holds for e in entries) and isinstance(model, Model) and isinstance(without, Model)):
+    if not (any(e.holds for e in entries) and is_white_box(model) and is_white_box(without)):
         return False
     return _determinant(model) == 0.0 and _determinant(without) not in (None, 0.0)
 
@@ -204,7 +204,7 @@ class Refit:
 
     def _runs_with(self, tolerance: Tolerance) -> list[Statistics]:
         """Return the statistics of a run of each fitted experiment; none of a model that is closed inside and steps as it likes."""
-        if not isinstance(self.model, Model):
+        if not is_white_box(self.model):
             return []
         plain = [e.with_(measured=None) for e in self.problem.fitted_experiments]
         return [simulate(self.model, e, self.values, tolerance=tolerance).statistics for e in plain]
@@ -428,7 +428,7 @@ def signal(refit: Refit, place: str) -> dict[str, Array]:
     """
     name = place.removeprefix("outputs.")
     model, experiments = refit.model, refit.problem.fitted_experiments
-    if not isinstance(model, Model) and name == place and name in model.inputs:
+    if not is_white_box(model) and name == place and name in model.inputs:
         at_rest = {**{n: i.value for n, i in model.inputs.items()}, **refit.values}
         return {e.name: _input(e, name, e.values.get(name, at_rest[name])) for e in experiments}
     runs = {e.name: e.with_(measured=None) for e in experiments}
@@ -575,7 +575,7 @@ def slot_signals(before: Refit) -> dict[str, tuple[Array, ...]]:
     """
     model, experiments = before.model, before.problem.fitted_experiments
     slots = [p for p in model.insertion_points if not any(one.use.made(p) for one in before.placed)]
-    if not isinstance(model, Model):
+    if not is_white_box(model):
         inputs = {p: tuple(signal(before, p).values()) for p in slots if p in model.inputs}
         outputs = [o for o in experiments[0].outputs if all(o in e.outputs for e in experiments)]
         runs = [simulate(model, e.with_(measured=None), before.values, outputs=outputs) for e in experiments]

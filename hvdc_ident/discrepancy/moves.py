@@ -23,7 +23,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.fit.simulator import TIME_SHIFT, unknown_of
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, is_white_box
 from hvdc_ident.text import listed, quantity
 
 STATED_ERROR = 0.02
@@ -39,7 +39,7 @@ def stated(model: AnyModel, candidates: Sequence[FitParameter]) -> tuple[FitPara
 
     None of a model that is closed inside: each derivative would be a run.
     """
-    if not isinstance(model, Model):
+    if not is_white_box(model):
         return ()
     others = {n: p.value for n, p in model.parameters.items() if p.value and n not in {f.name for f in candidates}}
     return tuple(FitParameter(n, v, v - STATED_ERROR * abs(v), v + STATED_ERROR * abs(v)) for n, v in others.items())

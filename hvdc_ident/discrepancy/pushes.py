@@ -23,7 +23,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.expression import symbol
 from hvdc_ident.fit.residual import ResidualBlock, Treatment, whitened_together
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model, fresh, rewritten
+from hvdc_ident.model import Model, fresh, is_white_box, rewritten
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate import simulate
 
@@ -86,7 +86,7 @@ def pushed(before: Refit, signals: Mapping[str, Sequence[Array]]) -> dict[str, P
 
     Raises SimulationError where the model cannot be run.
     """
-    assert isinstance(before.model, Model)
+    assert is_white_box(before.model)
     model, weights, push = _with_push(before.model, tuple(signals))
     found = {}
     for k, e in enumerate(before.problem.fitted_experiments):

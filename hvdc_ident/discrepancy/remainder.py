@@ -29,7 +29,7 @@ from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit.noise import freedom_of
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model
+from hvdc_ident.model import is_white_box
 
 PROPORTIONAL = 1e-5
 """Of one less the cosine between two answers that are in proportion: runs give them to a few parts in a thousand."""
@@ -158,7 +158,7 @@ def _beyond(tolerance: Mapping[str, float], last: Refit, floor: float) -> Frozen
 def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     """The remainder with the test for a latent input; as it is for a model that is closed inside, or cannot be linearised."""
     nominal = last.nominal()
-    if not isinstance(last.model, Model) or search.spent:
+    if not is_white_box(last.model) or search.spent:
         return found
     try:
         signals = slot_signals(last)

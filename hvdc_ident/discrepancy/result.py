@@ -298,10 +298,10 @@ class Diagnosis(Coded, Shown):
 
         Its description says that the values are the fitted ones, and which were given.
         """
-        from hvdc_ident.model import Model, write_card
+        from hvdc_ident.model import is_white_box, write_card
         from hvdc_ident.simulate import with_guesses
 
-        if self.augmented_model is None or not isinstance(self.augmented, Model):
+        if self.augmented_model is None or not is_white_box(self.augmented):
             return {}
         try:
             card = with_guesses(self.augmented)

@@ -24,7 +24,7 @@ from hvdc_ident.discrepancy.screen import NOT_TRIED, Score, Screen, ScreenSetup,
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit import Problem
-from hvdc_ident.model import Model
+from hvdc_ident.model import is_white_box
 
 REFITS_PER_BATCH = 6
 """Refits in one piece of work, of one model where they share it: a model takes longer to send than some steps of a refit."""
@@ -173,7 +173,7 @@ class Round:
 
     def answers(self) -> Mapping[str, Pushed]:
         """Return the model's runs with their answers to pushes, by experiment; none of a model that is closed inside."""
-        return pushed(self.before, self.signals) if isinstance(self.before.model, Model) else {}
+        return pushed(self.before, self.signals) if is_white_box(self.before.model) else {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +244,7 @@ class RoundModel:
     def movable(self, candidate: CandidateEffect, probe: int) -> Movable | None:
         """Return the model with the candidate's effect to be moved; None where it is put in: at several places, or in a closed model."""
         model = self.setup.model
-        if not isinstance(model, Model) or len(candidate.at) > 1:
+        if not is_white_box(model) or len(candidate.at) > 1:
             return None
         return self.setup.movable(Form.of(model, candidate, candidate.probes[probe].values))
 

@@ -27,7 +27,7 @@ from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.problem import stacked
 from hvdc_ident.fit.residual import unknown_initial_states, with_steady_start
-from hvdc_ident.model import AnyModel, Model, insertion_point
+from hvdc_ident.model import AnyModel, insertion_point, is_white_box
 from hvdc_ident.simulate import Method, ModelSimulator, Tolerance
 
 SCREEN_TOLERANCE = Tolerance(rtol=1e-5, atol=1e-8, search=False, brief=True)
@@ -228,7 +228,7 @@ class ScreenSetup:
 
     def movable(self, form: Form) -> Movable:
         """Return the model with an effect of this form, at one place, to be moved. It has to be one with equations."""
-        assert isinstance(self.model, Model)
+        assert is_white_box(self.model)
         model, kinds = self.model, effects()[form.effect].insertion_kinds
         places = tuple(
             p for p in self.places if insertion_point(model, p)[0] in kinds and on_loop(model, p) == form.loop
@@ -320,12 +320,12 @@ def _batches(
     model = setup.model
     groups: dict[Form | int, list[tuple[int, int]]] = {}
     for k, n in asked:
-        form = Form.of(model, candidates[k], candidates[k].probes[n].values) if isinstance(model, Model) else None
+        form = Form.of(model, candidates[k], candidates[k].probes[n].values) if is_white_box(model) else None
         groups.setdefault(k if form is None else replace(form, copies=1, loop=False), []).append((k, n))
     for key, columns in groups.items():
         own = sorted(columns, key=lambda c: len(candidates[c[0]].at))
         moved: dict[bool, Movable] = {}
-        if isinstance(key, Form) and isinstance(model, Model):
+        if isinstance(key, Form) and is_white_box(model):
             moved = {
                 x: setup.movable(replace(key, loop=x)) for x in {on_loop(model, candidates[k].at[0]) for k, _ in own}
             }
@@ -446,7 +446,7 @@ class _Runner:
         """Return (N,) the whitened residual with a candidate in the size of a probe."""
         setup, candidate = self.batch.setup, self.batch.candidates[column[0]]
         own, theta, probe = setup.nominal.problem, setup.point, candidate.probes[column[1]]
-        if not self.batch.movable or not isinstance(setup.model, Model):
+        if not self.batch.movable or not is_white_box(setup.model):
             larger = apply_effects(setup.model, [candidate.use(probe)])
             return _residual(replace(own, simulator=ModelSimulator(larger, setup.patience)), theta, {})
         loop = on_loop(setup.model, candidate.at[0])

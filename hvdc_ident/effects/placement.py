@@ -26,6 +26,7 @@ from hvdc_ident.model import (
     fresh,
     insertion_point,
     insertion_point_of,
+    is_white_box,
     reached,
     rewritten,
     with_derivative_signal,
@@ -180,7 +181,7 @@ def apply_effects(model: AnyModel, uses: Iterable[EffectUse | Mapping[str, Any]]
     >>> [name for name in lagging.parameters if "Ir1" in name]
     ['lag_Ir1_T']
     """
-    if not isinstance(model, Model):
+    if not is_white_box(model):
         return model.with_effects(uses)
     catalogue = effects()
     for given in uses:

@@ -23,7 +23,7 @@ from hvdc_ident.fit.problem import Problem
 from hvdc_ident.fit.simulator import TIME_SHIFT, unknown_of
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize.system import evaluate
-from hvdc_ident.model import Model, used_names
+from hvdc_ident.model import Model, is_white_box, used_names
 from hvdc_ident.simulate import ModelEquations, by_structure, with_recording
 
 MOST_STRETCHES = 80
@@ -160,7 +160,7 @@ _instants_of = by_structure(_instants, room=32)
 def _of_experiment(problem: Problem, e: Experiment) -> JumpInstants | None:
     """Return the instants of an experiment's run; None of a simulator without equations, of a response, and where nothing moves one."""
     model = getattr(problem.simulator, "model", None)
-    if not isinstance(model, Model) or e.domain != "time" or not (model.delays or "time" in used_names(model)):
+    if not is_white_box(model) or e.domain != "time" or not (model.delays or "time" in used_names(model)):
         return None
     found: JumpInstants = _instants_of(with_recording(model, e), tuple(e.outputs))
     return found

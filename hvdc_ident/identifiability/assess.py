@@ -46,7 +46,7 @@ from hvdc_ident.identifiability.structural import StructuralAnalysis, structural
 from hvdc_ident.identifiability.unfinished import joined_so_far, report_so_far
 from hvdc_ident.identifiability.verdicts import HIDDEN_BY_MISFIT, WIDE, scale_of, unjudged_verdict, with_misfit_remark
 from hvdc_ident.immutable import FrozenMap, joined
-from hvdc_ident.model import Model
+from hvdc_ident.model import Model, is_white_box
 from hvdc_ident.sensitivity import collinear_subsets
 from hvdc_ident.simulate import ModelSimulator
 
@@ -73,13 +73,13 @@ def identifiability(
     Raises StudyError where there is nothing to judge, SimulationError where an experiment cannot be simulated. Where a budget ends it,
     `ReportSoFar` is what is known.
     """
-    simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
+    simulator: Simulator = ModelSimulator(subject) if is_white_box(subject) else subject
     problem = Problem(simulator, tuple(experiments), tuple(candidates), held=FrozenMap(held or {}))
     assessment = Assessment(problem, seed, profile_options or ProfileOptions(), progress)
     _check(assessment)
     model = subject.model if isinstance(subject, WithResponses) else subject
     try:
-        return _assessed(assessment, model if isinstance(model, Model) else None, starts, pair, executor)
+        return _assessed(assessment, model if is_white_box(model) else None, starts, pair, executor)
     except BudgetSpent as end:
         end.known[:] = [report_so_far(assessment, end.known)]
         raise
@@ -291,7 +291,7 @@ def identifiability_by_group(
     given value. Every verdict is its group's; the others' values are taken as known in it, and a note says so. Other arguments
     as in `identifiability`. Raises StudyError where a candidate stands in no group, or in two.
     """
-    simulator: Simulator = ModelSimulator(subject) if isinstance(subject, Model) else subject
+    simulator: Simulator = ModelSimulator(subject) if is_white_box(subject) else subject
     problem = Problem(simulator, tuple(experiments), tuple(candidates))
     check_groups(problem, groups)
     at = {f.name: f.given for f in problem.free}

@@ -23,7 +23,7 @@ from hvdc_ident.linearize.linearisation import linearize
 from hvdc_ident.linearize.operating_point import find_operating_point
 from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.system import Array
-from hvdc_ident.model import AnyModel, Model, Output, fresh, rewritten
+from hvdc_ident.model import AnyModel, Model, Output, fresh, is_white_box, rewritten
 from hvdc_ident.parameters import Input
 
 Names = tuple[str, ...] | str
@@ -294,7 +294,7 @@ class MeasuredResponse:
             outputs, inputs = (list(dict.fromkeys(c[k] for c in self.channels)) for k in (0, 1))
             point = self.point(model, values)
             return linearize(model, point, inputs=inputs, outputs=outputs, sensitivities=tuple(names))
-        if not isinstance(model, Model):
+        if not is_white_box(model):
             raise LinearizationError("an impedance needs the model's equations", where=f"model '{model.name}'")
         disturbed, inputs, outputs = self._disturbed(model)
         point = self.point(disturbed, values)

@@ -28,7 +28,7 @@ from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.realisation import whole
 from hvdc_ident.linearize.stability import Characteristic, Stability, sliding_means, stability
 from hvdc_ident.linearize.system import Array
-from hvdc_ident.model import Model, Output, State, driven, fresh
+from hvdc_ident.model import Model, Output, State, driven, fresh, is_white_box
 from hvdc_ident.parameters import Input
 
 
@@ -454,7 +454,7 @@ def margins_of(model: LinearModel, break_at: str | Sequence[str] | None = None) 
     """
     if break_at is None:
         return margins(model) if model.B.shape[1] == model.C.shape[0] == 1 else loop_margins(model)
-    if model.point is None or not isinstance(model.point.model, Model):
+    if model.point is None or not is_white_box(model.point.model):
         raise LinearizationError(
             "a loop can be opened only in a model with equations",
             where=f"linear model '{model.name}'",

@@ -12,14 +12,14 @@ from hvdc_ident.linearize.jacobian import EquationModel
 from hvdc_ident.linearize.kinds import Kind, LinearOptions
 from hvdc_ident.linearize.point import OperatingPoint
 from hvdc_ident.linearize.system import Array, system
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, Model, is_white_box
 
 Bounds = Mapping[str, tuple[float, float]]
 
 
 def kind_of(model: AnyModel) -> Kind:
     """Return what finds a model's points and linearises it there. Raises ModelError for one that shows no derivatives."""
-    if isinstance(model, Model):
+    if is_white_box(model):
         return EquationModel(model)
     from hvdc_ident.linearize.fmu_linear import LinearFmu
 

@@ -14,6 +14,7 @@ from hvdc_ident.model.definition import (
     Sampled,
     Signal,
     State,
+    is_white_box,
     recording,
 )
 from hvdc_ident.model.transform import (
@@ -46,6 +47,7 @@ __all__ = [
     "fresh",
     "insertion_point",
     "insertion_point_of",
+    "is_white_box",
     "ordered_signals",
     "parse_card",
     "reached",

@@ -9,6 +9,7 @@ from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import sympy as sp
+from typing_extensions import TypeIs
 
 from hvdc_ident.display import Shown, Table
 from hvdc_ident.errors import unknown_name
@@ -366,6 +367,14 @@ def _exact(value: Any) -> str:
 AnyModel: TypeAlias = Model | External
 
 
+def is_white_box(model: object) -> TypeIs[Model]:
+    """Return whether a model is known by its equations: derivatives are taken of them, and effects put in anywhere.
+
+    Of a black box, as an FMU is, only what goes in and comes out is known.
+    """
+    return isinstance(model, Model)
+
+
 def recording(model: AnyModel, names: Iterable[str]) -> AnyModel:
     """Return the model with the names among its outputs; equations have what they declare, and stay as they are."""
-    return model if isinstance(model, Model) else model.recording(names)
+    return model if is_white_box(model) else model.recording(names)

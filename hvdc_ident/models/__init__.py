@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from hvdc_ident.errors import ModelError, in_python, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, Model, is_white_box
 from hvdc_ident.next_step import NextStep
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def _of_a_family(name: str) -> Model | None:
     for module_name in (m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")):
         module: Any = importlib.import_module(f"{__name__}.{module_name}")
         found = module.family(name) if hasattr(module, "family") else None
-        if isinstance(found, Model):
+        if is_white_box(found):
             return found
     return None
 
@@ -164,7 +164,7 @@ def _from_python(path: Path, trust: bool) -> Model:
     exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), namespace)
     found = namespace.get("model")
     result = found() if callable(found) else found
-    if not isinstance(result, Model):
+    if not is_white_box(result):
         raise ModelError(
             "the file defines no model",
             where=str(path),

@@ -18,7 +18,7 @@ from hvdc_ident.data import Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, TimingError, require_known
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model, State, fresh, rewritten
+from hvdc_ident.model import AnyModel, Model, State, fresh, is_white_box, rewritten
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Method, Tolerance
 from hvdc_ident.simulate.short_delays import run
@@ -110,7 +110,7 @@ class ModelSimulator:
     @property
     def states(self) -> Mapping[str, State]:
         """The states by name; each may stand among the sensitivities, for its start. An FMU shows none."""
-        return self.model.states if isinstance(self.model, Model) else {}
+        return self.model.states if is_white_box(self.model) else {}
 
     def simulate(
         self, experiment: Experiment, values: Mapping[str, float], sensitivities: Sequence[str] = ()
@@ -158,7 +158,7 @@ def simulate(
     Raises SteadyStateError where there is no steady start, SimulationError where the run does not reach its end.
     """
     tol = tolerance or (Tolerance() if rtol is None else Tolerance(rtol, rtol / 100))
-    if not isinstance(model, Model):
+    if not is_white_box(model):
         chosen = tuple(model.outputs) if outputs is None else outputs
         ending = {"partial": True} if partial else {}
         own: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol, **ending)

@@ -17,7 +17,7 @@ from hvdc_ident.data import Experiment, Trajectory
 from hvdc_ident.data.signal_table import SignalTable
 from hvdc_ident.errors import InputError, StudyError, require_known, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, is_white_box
 from hvdc_ident.models import is_shipped, load_model
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.toml_tables import validated
@@ -58,7 +58,7 @@ def subject_of(source: ModelLike) -> AnyModel | Study:
     if is_study(source):
         return source
     for found in (source, getattr(source, "model", None)):
-        if isinstance(found, Model) or (hasattr(found, "with_effects") and hasattr(found, "simulate")):
+        if is_white_box(found) or (hasattr(found, "with_effects") and hasattr(found, "simulate")):
             return cast("AnyModel", found)
     raise InputError(
         "no model",

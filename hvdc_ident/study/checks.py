@@ -18,7 +18,7 @@ from hvdc_ident.errors import (
     located,
     require_known,
 )
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, Model, is_white_box
 from hvdc_ident.study import schema
 from hvdc_ident.toml_tables import check_names
 
@@ -90,7 +90,7 @@ def names_of_model(model: AnyModel) -> dict[str, Collection[str]]:
         "parameter": model.parameters,
         "input or parameter": [*model.inputs, *model.parameters],
         "signal": signals,
-        "output or signal": [*model.outputs, *(signals if isinstance(model, Model) else ())],
+        "output or signal": [*model.outputs, *(signals if is_white_box(model) else ())],
     }
 
 
@@ -127,7 +127,7 @@ def _free_line(name: str, lines: Mapping[str, schema.ParameterTable], where: str
 def _check_kind_of_model(asked: schema.LinearizeTable, model: AnyModel, place: str) -> None:
     """Raise StudyError where [linearize] asks for what only equations tell."""
     of_equations = (asked.break_at, asked.plant, asked.port, asked.formula, asked.locus, asked.side != "refuse")
-    if not isinstance(model, Model) and any(of_equations):
+    if not is_white_box(model) and any(of_equations):
         raise StudyError(
             "loops, ports, loci, formulas and a side of a limit need the model's equations",
             where=place,
@@ -264,7 +264,7 @@ def steady_notes(study: Study, *, searches: bool = False) -> list[str]:
     Empty where every start is the model's own stable steady state, and for an FMU, which begins where it says.
     """
     model = study.model
-    if not isinstance(model, Model) or any(s.start is not None for s in model.states.values()):
+    if not is_white_box(model) or any(s.start is not None for s in model.states.values()):
         return []
     begins: dict[str, Mapping[str, float]] = {"model": {}}
     for e in (e for e in study.experiments if not e.drive):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.linearize import loop, margins
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, Model, is_white_box
 
 FILE = "truth.json"
 """Name of the file in the folder of results; the report reads it there."""
@@ -27,7 +27,7 @@ def truth_of(plant: AnyModel, model: AnyModel, parameters: list[str], orders: li
     """
     lacking: list[str] = []
     delays: list[dict[str, Any]] = []
-    if isinstance(plant, Model) and isinstance(model, Model):
+    if is_white_box(plant) and is_white_box(model):
         parts = (s.description.rstrip(" 0123456789") for n, s in plant.states.items() if n not in model.states)
         lacking = list(dict.fromkeys(part for part in parts if part))
         delays = [d for order in orders if (d := equivalent_delay(plant, model, order)) is not None]

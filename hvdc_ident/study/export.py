@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 from hvdc_ident.errors import ComputationError, LinearizationError, StudyError
-from hvdc_ident.model import Model, read_card
+from hvdc_ident.model import Model, is_white_box, read_card
 from hvdc_ident.next_step import NextStep
 from hvdc_ident.report.letter import STAGE, Letterhead, write_letter
 from hvdc_ident.study.pipeline import Done, have_stage
@@ -256,11 +256,11 @@ _WRITERS: dict[str, Callable[[Study | Model, ValueSet | None, Path, FmuOptions],
 
 def _model(source: Study | Model, selected: ValueSet | None) -> Model:
     """The model with the selected values, and with the effect that they hold with."""
-    if isinstance(source, Model):
+    if is_white_box(source):
         return source
-    if not isinstance(source.model, Model):
+    if not is_white_box(source.model):
         raise StudyError("the model's equations are not here to be written", where=source.path.name, got="an FMU")
-    if selected is not None and isinstance(selected.model, Model):
+    if selected is not None and is_white_box(selected.model):
         return selected.model
     return source.model.with_values(dict(selected.values)) if selected and selected.values else source.model
 
@@ -291,7 +291,7 @@ def _linear(source: Study | Model | LinearModel, selected: ValueSet | None) -> L
                 got=e.got,
                 next=(NextStep("values", "fit"),),
             ) from None
-    return linearize(source) if isinstance(source, Model) else source
+    return linearize(source) if is_white_box(source) else source
 
 
 def letter(study: Study, folder: Path, options: StageOptions) -> tuple[Path, Done]:

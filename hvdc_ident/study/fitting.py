@@ -22,7 +22,7 @@ from hvdc_ident.fit.result import EachSoFar, FitSoFar
 from hvdc_ident.fit.search import outcome_lines
 from hvdc_ident.fit.tolerance_profile import tolerance
 from hvdc_ident.identifiability import gated_fit
-from hvdc_ident.model import Model
+from hvdc_ident.model import Model, is_white_box
 from hvdc_ident.simulate import simulate
 from hvdc_ident.study.checks import need_candidates, need_experiments, need_start
 from hvdc_ident.study.recorded_inputs import fitted_records
@@ -282,7 +282,7 @@ def derived(study: Study, result: FitResult) -> dict[str, Derived]:
     std by the derivative of the expression and the covariance of the estimates; None where one of them has none.
     """
     model = study.model
-    if not isinstance(model, Model):
+    if not is_white_box(model):
         return {}
     names = [n for n, line in study.settings.parameters.items() if line.tie is not None]
     if study.settings.model.parameterisation is not None:
@@ -290,7 +290,7 @@ def derived(study: Study, result: FitResult) -> dict[str, Derived]:
 
         source = study.settings.model.source
         plain = load_model(source) if "/" not in source and not source.endswith((".toml", ".py")) else None
-        if isinstance(plain, Model):
+        if is_white_box(plain):
             names += [n for n in plain.parameters if n in model.signals and n not in names]
     table = {}
     for name in names:

@@ -26,7 +26,7 @@ from hvdc_ident.fit.noise import MISFIT, source_of
 from hvdc_ident.fit.simulator import observe, unknowns
 from hvdc_ident.fit.whitening import autocorrelation
 from hvdc_ident.linearize import find_operating_point, linearize
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, is_white_box
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study.conversions import (
     FINEST,
@@ -514,7 +514,7 @@ def _input_after_failure(simulator: ModelSimulator, e: Experiment) -> list[str]:
 def _time_mistakes(model: AnyModel, e: Experiment) -> list[Undone]:
     """Return the experiment in the units of time other than s in which a mode of the model would lie between a row and the record's
     length: empty where one does as it is, for a model that cannot show in the record is no model of it. An FMU does not tell its modes."""
-    if not isinstance(model, Model) or not model.states or e.drive:
+    if not is_white_box(model) or not model.states or e.drive:
         return []
     starts = {n: float(s.values[0]) for n, s in e.inputs.items()}
     try:

@@ -30,7 +30,7 @@ from hvdc_ident.linearize.distance import ModelDistance
 from hvdc_ident.linearize.export import csv_of_response
 from hvdc_ident.linearize.gain_limits import Crossing
 from hvdc_ident.linearize.modal import NamedMode
-from hvdc_ident.model import AnyModel, Model
+from hvdc_ident.model import AnyModel, Model, is_white_box
 from hvdc_ident.study import schema
 from hvdc_ident.study.measured_responses import port_of
 from hvdc_ident.summary.linear import CoprimeMargin, Formula, PortImpedance, StudyMargins, StudyReduction, Trim
@@ -75,7 +75,7 @@ def operating_point(study: Study, values: Mapping[str, float] | None = None) -> 
 
 def modes_of(study: Study, linear: LinearModel) -> list[NamedMode]:
     """Return every mode, with a name from the parts of the plant that take part in it where these are known."""
-    if not isinstance(study.model, Model):
+    if not is_white_box(study.model):
         return [NamedMode(m, "", FrozenMap()) for m in linear.modes()]
     parts = parts_of(study.model)
     return [named(m, parts) for m in linear.modes()]
@@ -124,7 +124,7 @@ def _trimmed(model: AnyModel, trim: schema.TrimTable, linear: LinearModel) -> Tr
 def _equations(linear: LinearModel) -> tuple[Model, OperatingPoint]:
     """Return the model with equations that was linearised, and its point."""
     point = linear.point
-    assert point is not None and isinstance(point.model, Model)
+    assert point is not None and is_white_box(point.model)
     return point.model, point
 
 
@@ -159,7 +159,7 @@ def _compared(study: Study, linear: LinearModel) -> ModelDistance:
 def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> tuple[Formula, ...]:
     """Each transfer function with some parameters as symbols; where there is none, the reason."""
     model = study.model
-    assert isinstance(model, Model)
+    assert is_white_box(model)
     found = []
     for o in linear.output_names:
         for i in linear.input_names:

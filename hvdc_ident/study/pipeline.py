@@ -15,7 +15,7 @@ from hvdc_ident.codec import plain
 from hvdc_ident.errors import ComputationError, HvdcIdentError, InputError
 from hvdc_ident.executor import Progress, StageProgress
 from hvdc_ident.files import digest, json_pieces, json_text, write_text
-from hvdc_ident.model import Model
+from hvdc_ident.model import is_white_box
 from hvdc_ident.study.checks import steady_notes
 from hvdc_ident.study.executors import open_executor
 from hvdc_ident.study.heading import heading_of, version
@@ -375,7 +375,7 @@ def workers_of(study: Study, options: StageOptions) -> Iterator[OpenPool | Patie
     An FMU has processes of its own, which share the cores; some FMUs run in one process only. More are started where they
     are asked for.
     """
-    workers = 1 if options.workers is None and not isinstance(study.model, Model) else options.workers
+    workers = 1 if options.workers is None and not is_white_box(study.model) else options.workers
     with open_executor(options.executor, workers) as pool:
         yield pool
 

@@ -19,7 +19,7 @@ from hvdc_ident.files import digest
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.linearize import MeasuredResponse
-from hvdc_ident.model import AnyModel, Model, recording
+from hvdc_ident.model import AnyModel, is_white_box, recording
 from hvdc_ident.models import is_shipped, load_model, shipped_models
 from hvdc_ident.next_step import NextStep
 from hvdc_ident.study import schema
@@ -284,7 +284,7 @@ def _other_model(
     source, sources = _source(name, file, place)
     with located(f"{file.name}, {place}"):
         model = load_model(source, trust=trust, limits=_limits(settings.model) if name.endswith(".fmu") else None)
-    if not isinstance(model, Model):  # it is compared where it has the same variables
+    if not is_white_box(model):  # it is compared where it has the same variables
         model = model.recording([n for _, names in _recorded(settings) for n in names if model.records(n)])
     return model, sources
 
@@ -334,7 +334,7 @@ def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> An
     require_known("parameter", (*ties, *local), model.parameters, f"{where}, parameters")
     if not ties and not local:
         return model
-    if not isinstance(model, Model):
+    if not is_white_box(model):
         first = [*ties, *local][0]
         raise StudyError(
             f"'{first}' cannot be tied or given to each experiment",
@@ -365,7 +365,7 @@ def with_nuisances(
     where the bounds of one do not hold its start.
     """
     local = [n for n, line in settings.parameters.items() if line.per_experiment]
-    if isinstance(model, Model):
+    if is_white_box(model):
         free = [f"{n}_start" for n, s in model.states.items() if s.start == "free"]
         local += [n for n in free if n not in candidates and n not in local]
     if not local:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from hvdc_ident.effects import EffectUse, effects
 from hvdc_ident.files import csv_text
 from hvdc_ident.fit import Estimate
-from hvdc_ident.model import Model
+from hvdc_ident.model import is_white_box
 from hvdc_ident.model.card import toml_key
 from hvdc_ident.study.augmented import augmented_model, use_of
 from hvdc_ident.summary.decisions import counting_of, estimates_that_count
@@ -150,7 +150,7 @@ def _toml(
 
 def _derived(study: Study, names: Iterable[str], values: Mapping[str, float]) -> list[str]:
     """Return a comment for each quantity that follows from the values."""
-    if not isinstance(study.model, Model):
+    if not is_white_box(study.model):
         return []
     known = {**study.model.values, **values}
     found = []

@@ -28,7 +28,7 @@ class NothingIdentified(ComputationError):
 def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> StageResult:
     """Return the verdict with its evidence, the gap before and after, and the augmented model as a card."""
     from hvdc_ident.identifiability import IdentifiabilityReport
-    from hvdc_ident.model import Model
+    from hvdc_ident.model import is_white_box
     from hvdc_ident.study.augmented import compared
     from hvdc_ident.study.pipeline import executor_of
     from hvdc_ident.study.size_curves import size_curves
@@ -50,7 +50,7 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
             )
         except NothingIdentified as e:
             return StageResult({"status": "failed", "message": str(e)}, failed=str(e))
-    sizes = size_curves(study.model, study.experiments, found) if isinstance(study.model, Model) else None
+    sizes = size_curves(study.model, study.experiments, found) if is_white_box(study.model) else None
     beside, curves = compared(study, found)
     asked = {"budget": None if options.budget is None else options.budget.seconds}
     data = {**found.to_dict(), "sizes": sizes, "options": asked, **beside}
