@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "hvdc_ident"
 
 ROOMS = """
-next_step errors lazy aliases text immutable codec toml_tables executor budget files parallel psse colours display data
+next_step errors aliases text immutable codec toml_tables executor budget files parallel psse colours display data
 parameters axes expression shelf model plants effects
 models formats simulate
 fmu linearize sensitivity linear fit identifiability discrepancy summary report study api app command run_commands cli
@@ -43,9 +43,18 @@ ALLOWED = {
 }
 
 
-def _imports(path: Path) -> Iterator[str]:
+METHODS = {
+    # file of a class: why its methods may import what stands above it in its room
+    "linearize/linear_model.py": "a linear model's analysis is a function of another module, imported when its method is called",
+}
+
+
+def _imports(path: Path, *, of_methods: bool = True) -> Iterator[str]:
     """Every module of the package that a file imports, anywhere in it; what only type checkers see is left out."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
+    if not of_methods:
+        for kind in (n for n in tree.body if isinstance(n, ast.ClassDef)):
+            kind.body = [n for n in kind.body if not isinstance(n, ast.FunctionDef)]
     typing_only = {
         id(inner)
         for node in ast.walk(tree)
@@ -105,7 +114,7 @@ def test_imports_run_down_within_a_room(room: str) -> None:
     upward = [
         f"{path.relative_to(PACKAGE)} imports {module}"
         for path in files
-        for module in _imports(path)
+        for module in _imports(path, of_methods=path.relative_to(PACKAGE).as_posix() not in METHODS)
         if inner[path] != "__init__" and module.startswith(f"hvdc_ident.{room}.")
         if order.index(module.split(".")[2]) > order.index(inner[path])
     ]

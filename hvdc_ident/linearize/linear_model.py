@@ -12,7 +12,6 @@ import numpy as np
 from hvdc_ident.display import Shown, Table, first_rows
 from hvdc_ident.errors import LinearizationError, ModelError, unknown_name
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.lazy import method
 from hvdc_ident.linearize.delays import EPS, eliminate
 from hvdc_ident.linearize.descriptor import Descriptor
 from hvdc_ident.linearize.point import OperatingPoint
@@ -20,19 +19,17 @@ from hvdc_ident.linearize.stability import Change, Characteristic
 from hvdc_ident.linearize.system import Array
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
     import control
 
-    from hvdc_ident.linearize import (
-        delayed_zeros,
-        export,
-        frequency,
-        loops,
-        modal,
-        norms,
-        plot,
-        reduction,
-        transfer_function,
-    )
+    from hvdc_ident.linearize.frequency import FrequencyResponse
+    from hvdc_ident.linearize.loops import LoopMargins, Margins
+    from hvdc_ident.linearize.mode import Mode
+    from hvdc_ident.linearize.reduction import Reduction
+    from hvdc_ident.linearize.stability import Stability
+    from hvdc_ident.linearize.transfer_function import TransferFunction
 
 
 Exact = TypeVar("Exact", Change, Characteristic)
@@ -268,36 +265,115 @@ class LinearModel(Shown):
         """The equation without delays of 0 s; poles, modes and stability rest on one search for its roots."""
         return self.approximate if self.exact is None else self.exact.without_zero_delays()
 
-    # --- analysis: functions of other modules, bound when they are first asked for ---
+    # --- analysis: functions of other modules, imported when they are first asked for ---
 
-    if TYPE_CHECKING:
-        poles = modal.poles
-        stability = modal.stability_of
-        zeros = delayed_zeros.zeros_of
-        modes = modal.modes
-        transfer_function = transfer_function.transfer_function
-        response = frequency.response
-        bode = frequency.frequency_response
-        sigma = frequency.sigma
-        margins = loops.margins_of
-        norms = norms.norms
-        reduce = reduction.reduced
-        save = export.write
-        plot = plot.draw
-    else:
-        poles = method("hvdc_ident.linearize.modal.poles")
-        stability = method("hvdc_ident.linearize.modal.stability_of")
-        zeros = method("hvdc_ident.linearize.delayed_zeros.zeros_of")
-        modes = method("hvdc_ident.linearize.modal.modes")
-        transfer_function = method("hvdc_ident.linearize.transfer_function.transfer_function")
-        response = method("hvdc_ident.linearize.frequency.response")
-        bode = method("hvdc_ident.linearize.frequency.frequency_response")
-        sigma = method("hvdc_ident.linearize.frequency.sigma")
-        margins = method("hvdc_ident.linearize.loops.margins_of")
-        norms = method("hvdc_ident.linearize.norms.norms")
-        reduce = method("hvdc_ident.linearize.reduction.reduced")
-        save = method("hvdc_ident.linearize.export.write")
-        plot = method("hvdc_ident.linearize.plot.draw")
+    def poles(self) -> Array:
+        """Return (n,) complex poles by falling real part, rad/s, hidden ones among them; for a descriptor the finite eigenvalues.
+
+        Of a model with delays the rightmost roots of its exact characteristic equation.
+        """
+        from hvdc_ident.linearize.modal import poles as poles_of
+
+        return poles_of(self)
+
+    def stability(self) -> Stability:
+        """Return whether a model is stable: with delays by its characteristic equation, else by its eigenvalues."""
+        from hvdc_ident.linearize.modal import stability_of
+
+        return stability_of(self)
+
+    def zeros(self) -> Array:
+        """Return the complex invariant zeros of a whole model, rad/s; delays are exact, see `exact_zeros`.
+
+        A model read from a file has its delays in their Pade form, and the zeros of that.
+        """
+        from hvdc_ident.linearize.delayed_zeros import zeros_of
+
+        return zeros_of(self)
+
+    def modes(self) -> tuple[Mode, ...]:
+        """Return every mode of a model, by falling real part; conjugates follow each other, the upper one first.
+
+        A model with delays has infinitely many; these are the rightmost ones, at least as many as it has states.
+        """
+        from hvdc_ident.linearize.modal import modes as modes_of
+
+        return modes_of(self)
+
+    def transfer_function(self, input: str | None = None, output: str | None = None) -> TransferFunction:
+        """Return zeros, poles and gain from an input to an output; stable pole-zero pairs that cancel are left out and listed.
+
+        The names may be left out where there is only one. An unstable pair is never cancelled. A channel without a path is 0: no
+        zeros, no poles, gain 0.
+        """
+        from hvdc_ident.linearize.transfer_function import transfer_function as transfer_function_of
+
+        return transfer_function_of(self, input, output)
+
+    def response(self, omega: Array | Sequence[float]) -> Array:
+        """Return (frequencies, outputs, inputs) complex transfer matrix at omega in rad/s, delays exact."""
+        from hvdc_ident.linearize.frequency import response as response_of
+
+        return response_of(self, omega)
+
+    def bode(
+        self,
+        omega: Array | Sequence[float] | None = None,
+        *,
+        covariance: Array | None = None,
+        parameters: Sequence[str] = (),
+    ) -> FrequencyResponse:
+        """Return the response of every channel at omega in rad/s (default: around the poles), with units; it draws itself.
+
+        covariance: (k, k) of parameters in their units, in the order of `parameters`, whose derivatives the model must
+        have (`linearize(..., sensitivities=...)`): the response then has, as std, the first-order standard deviation of its error.
+        """
+        from hvdc_ident.linearize.frequency import frequency_response
+
+        return frequency_response(self, omega, covariance=covariance, parameters=parameters)
+
+    def sigma(self, omega: Array | Sequence[float] | None = None) -> tuple[Array, Array]:
+        """Return (omega, (n, k) singular values, largest first) of the transfer matrix."""
+        from hvdc_ident.linearize.frequency import sigma as sigma_of
+
+        return sigma_of(self, omega)
+
+    def margins(self, break_at: str | Sequence[str] | None = None) -> Margins | LoopMargins:
+        """Return gain, phase, delay, modulus and disk margins; of several loops together with their common disk margin.
+
+        break_at: the signal (or signals) of the model at which its closed loops are opened. Without it this linear model
+        is taken for an open loop L with negative unit feedback. Raises LinearizationError where it is neither.
+        """
+        from hvdc_ident.linearize.loops import margins_of
+
+        return margins_of(self, break_at)
+
+    def norms(self) -> dict[str, Any]:
+        """Return H2, H-infinity and L-infinity norms as plain numbers; of one that does not exist, None and the reason."""
+        from hvdc_ident.linearize.norms import norms as norms_of
+
+        return norms_of(self)
+
+    def reduce(self, order: int | None = None, tolerance: float | None = None, *, match_dc: bool = False) -> Reduction:
+        """Return a balanced model of fewer states: so many, or as few as keep the error within the tolerance. See `balanced`."""
+        from hvdc_ident.linearize.reduction import reduced
+
+        return reduced(self, order, tolerance, match_dc=match_dc)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the model in the format of the path's ending, and return the path. Raises ModelError for an ending that has none."""
+        from hvdc_ident.linearize.export import write
+
+        return write(self, path)
+
+    def plot(self, kind: str = "bode", ax: Any = None) -> Any:
+        """Return the axes of a drawing: "bode" (two: gain and phase, as is `ax`), "nyquist", "poles" or "participation".
+
+        Raises UnknownNameError for another kind.
+        """
+        from hvdc_ident.linearize.plot import draw
+
+        return draw(self, kind, ax)
 
     def _screen(self) -> Iterator[str | Table]:
         def listed(names: tuple[str, ...]) -> str:
