@@ -17,6 +17,8 @@ import hvdc_ident as hi
 from tests.app.small_study import CARD, write_small_study
 from tests.app.test_mapping import recording
 
+pytestmark = pytest.mark.nightly
+
 LONG = 120_000  # ms that something may take on a busy machine before a test gives up
 STAGES = """[fit]
 starts = 1

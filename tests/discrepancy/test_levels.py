@@ -72,6 +72,7 @@ def _rounded(inputs: dict[str, InputSignal]) -> Array:
     return rows
 
 
+@pytest.mark.nightly
 def test_a_step_is_met_among_hundreds(levels: tuple[Experiment, ...]) -> None:
     found = diagnose(
         model(), levels, FREE, effects=["quantisation", "deadband", "backlash", "lag", "gain"], seed=0,

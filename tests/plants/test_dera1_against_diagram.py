@@ -186,6 +186,7 @@ RECORDS = {"DERA1": "7 'DERA1' 1 {} / resources\n", "DERAU1": "7 'USRMDL' 1 'DER
 """The two forms in which PSS/E has it: its own model, and the user-written one of earlier versions."""
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("form", RECORDS)
 def test_from_its_record_and_an_event_to_the_fitted_record(form: str, tmp_path: Path) -> None:
     """A gain of 3 where the record says 5, from a dip in which shares trip."""

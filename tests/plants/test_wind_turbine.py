@@ -59,6 +59,7 @@ def test_a_wind_turbine_follows_the_power_reference_of_its_plant(Tflag) -> None:
     assert run["drive.Pm"][-1] == pytest.approx(0.7 + 0.5 * (speed - before) * speed, abs=1e-4)
 
 
+@pytest.mark.nightly
 def test_from_its_records_and_an_event_to_the_fitted_inertia(tmp_path: Path) -> None:
     """An inertia of 4 s where the record says 5 s, from a voltage dip; torque and pitch control act."""
     records = {m: list(v) for m, v in CASES["type3-plant"].items()} | {"WTPTA1": TURBINE["WTPTA1"]}

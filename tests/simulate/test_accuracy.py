@@ -10,6 +10,8 @@ from hvdc_ident.models import load_model
 from hvdc_ident.simulate import simulate
 from tests.simulate.reference import Reference, sided
 
+pytestmark = pytest.mark.nightly
+
 RTOL = 1e-8
 LINK = load_model("vsc-hvdc-link")
 LAGGED = apply_effects(
