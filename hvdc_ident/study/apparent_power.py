@@ -18,6 +18,8 @@ NEAR = math.sqrt(math.sqrt(1.5))
 value for an rms one beside another way to count the voltage, is off by the square of this."""
 MOVES = 10.0
 """Times its scatter by which a power has to move before that tells anything."""
+APART = math.radians(5.0)
+"""Error of an angle between voltage and current: transformers of class 6P and 5P are off by 240 and 60 minutes (IEC 61869-3 and -2)."""
 LEFT = 0.5
 """Share of the square of a movement that windows and filters of different lengths leave at most; two plants have nothing in common."""
 
@@ -74,3 +76,17 @@ def _left(time: Array, own: Array, other: Array) -> float:
     """Return the share of the square of a movement that another one leaves, 0 where it is no more than its scatter."""
     moved, seen = float(np.mean(own**2)), MOVES * scatter(time, own)
     return float(np.mean((own - other) ** 2)) / moved if moved > seen**2 else 0.0
+
+
+def exchanged(power: Array, lead: Array) -> bool:
+    """Return whether the angle of a power is that of its conjugate: voltage and current are exchanged, or Q has the other sign.
+
+    power: (n,) P + jQ of rows at rest. lead: (n,) rad, by which the voltage's recorded angle is ahead of the current's. False too where
+    the power has no angle to tell it by.
+    """
+    known = np.isfinite(power) & np.isfinite(lead) & (power != 0.0)
+    if not known.any():
+        return False
+    turn = np.exp(1j * lead[known]) * np.abs(power[known])
+    right, wrong = (abs(float(np.angle(np.mean(turn * p)))) for p in (power[known].conj(), power[known]))
+    return wrong <= APART < right

@@ -24,7 +24,7 @@ from hvdc_ident.model.card import toml_table
 from hvdc_ident.plants import LEVELS
 from hvdc_ident.simulate import ModelSimulator
 from hvdc_ident.study import schema
-from hvdc_ident.study.apparent_power import ApparentPower
+from hvdc_ident.study.apparent_power import ApparentPower, exchanged
 from hvdc_ident.study.conversions import STRONG
 from hvdc_ident.study.initial_values import outputs_of
 from hvdc_ident.study.recordings import TIME_SHIFT
@@ -74,7 +74,7 @@ def column_contradictions(study: Study) -> tuple[Contradiction, ...]:
     for e in (e for e in study.experiments if e.name in tables and e.measured is not None):
         case = _Case(study, e, tables[e.name], about)
         by_level = [*case.voltage(), *case.frequency(), *case.turns_twice(), *case.power(), *case.current()]
-        by_turn = [] if by_level else [*case.turn()]
+        by_turn = [] if by_level else [*case.angles(), *case.turn()]
         found += by_level or by_turn or [*case.movement()]
     return tuple(found)
 
@@ -214,6 +214,31 @@ class _Case:
             yield self._finding(kind, tuple(powers), f"{what}: {words}", self._columns(powers))
         else:
             yield self._finding("current", ("P", "Q"), f"{what}: which of them is in another unit, or another plant's?")
+
+    def angles(self) -> Iterator[Contradiction]:
+        """Yield an angle that is the current's, where the file's only angle of a current is that of the voltage."""
+        e, outputs = self.experiment, list(LEVELS.values())
+        if "theta" not in e.inputs or not set(outputs) <= set(e.outputs):
+            return
+        column, data = self._column("theta"), self._file
+        readings = dict(zip(data.names, read_columns(data.names, data.units), strict=True))
+        currents = [n for n, r in readings.items() if r.measured == "current angle"]
+        if column not in data or len(currents) != 1:
+            return
+        (current,) = currents
+        line = self.table.columns.get("theta")
+        played = (line.unit if line and line.unit else "") or data.unit(column) or readings[column].unit or "rad"
+        units = [played, data.unit(current) or readings[current].unit]
+        by = [conversion(u, "rad") if u else None for u in units]
+        if by[0] is None or by[1] is None or data.time.size != e.time.size or e.measured is None:
+            return
+        power = e.measured[outputs[0]] + 1j * e.measured[outputs[1]]
+        rows = before_event(e.time, np.abs(power), e.event)
+        if exchanged(power[rows], (by[0][0] * data[column] - by[1][0] * data[current])[rows]):
+            what = f"{column} and {current} are exchanged, or Q has the other sign: they turn the power the other way"
+            yield self._finding(
+                "exchanged", ("theta",), what, f"inputs = {toml_table(self.table.inputs | {'theta': current})}"
+            )
 
     def turn(self) -> Iterator[Contradiction]:
         """Yield an angle that turns otherwise than the recorded frequency of the same voltage, or as no network does."""

@@ -179,6 +179,13 @@ MISTAKES: dict[str, tuple[str, Mistake]] = {
     "Q alone in kvar": ("unit", lambda p: (p | {"Q": 1e3 * p["Q"]}, {})),
     "powers in GW": ("unit", lambda p: (p | {"P": 1e-3 * p["P"], "Q": 1e-3 * p["Q"]}, {})),
     "powers of one phase": ("phase", lambda p: (p | {"P": p["P"] / 3.0, "Q": p["Q"] / 3.0}, {})),
+    "angles of voltage and current exchanged": (
+        "exchanged",
+        lambda p: (
+            p | {"theta": np.degrees(p["theta"] - np.arctan2(p["Q"], p["P"])), "I1 Ang [deg]": np.degrees(p["theta"])},
+            {"columns": {"theta": {"unit": '"deg"'}}},
+        ),
+    ),
     "P and Q exchanged": ("exchanged", lambda p: (p | {"P": p["Q"], "Q": p["P"]}, {})),
     "P and Q late": ("clock", lambda p: (p | {"P": late(p["P"]), "Q": late(p["Q"])}, {})),
     "powers of one phase beside the current": (
