@@ -19,16 +19,16 @@ import control
 import numpy as np
 import slycot
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "linearize"))
-from helpers import linear
+sys.path.insert(0, str(Path(__file__).parents[1]))
 from scipy.optimize import linear_sum_assignment
-from test_badly_scaled import random_system
 
 from hvdc_ident.linearize import LinearModel, balanced, h2_norm, linf_norm
 from hvdc_ident.linearize.loops import structured_singular_value
 from hvdc_ident.linearize.realisation import scaled_states
 from hvdc_ident.linearize.reduction import hankel
 from hvdc_ident.linearize.zeros import zeros
+from tests.linearize.helpers import linear
+from tests.linearize.test_badly_scaled import random_system
 
 Array = Any
 W = np.logspace(-3, 5, 200)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from cases import EVENT, RUNS, SIGMA, TIME, corners, experiments
 from scipy.signal import TransferFunction, lsim
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
 from hvdc_ident.immutable import FrozenMap
+from tests.discrepancy.cases import EVENT, RUNS, SIGMA, TIME, corners, experiments
 
 
 def filtered(numerator: list[float], denominator: list[float]) -> tuple[Experiment, ...]:

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from cases import FREE, SIGMA, TRUE, model
 
 from hvdc_ident import Experiment, Model, simulate
 from hvdc_ident.discrepancy.candidates import CandidateEffect
@@ -15,6 +14,7 @@ from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
+from tests.discrepancy.cases import FREE, SIGMA, TRUE, model
 
 
 def plain(records: Sequence[Experiment]) -> Refit:

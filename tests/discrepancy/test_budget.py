@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import FREE, experiments, model
 
 from hvdc_ident import Experiment
 from hvdc_ident.budget import Budget
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, hypothesis, search
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob
+from tests.discrepancy.cases import FREE, experiments, model
 
 NAMES = ["lag", "gain", "limit", "deadband"]
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 
 import pytest
-from cases import FREE, TRUE, experiments, model
-from refits import plain
 
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, hypothesis
 from hvdc_ident.discrepancy.hypothesis import Refit
@@ -14,6 +12,8 @@ from hvdc_ident.discrepancy.moves import _moved, _refitted, as_recorded, clocks,
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
+from tests.discrepancy.cases import FREE, TRUE, experiments, model
+from tests.discrepancy.refits import plain
 
 LATE = {"fit-1": 1.5e-3, "fit-2": -1.2e-3, "held": 1e-3}
 """Of rows every 4 ms."""

@@ -107,9 +107,8 @@ def test_outputs_that_agree_are_told_together_and_others_apart() -> None:
 
 
 def test_drawn_noise_keeps_its_steps_where_no_deviation_is_given() -> None:
-    from cases import FREE, experiments, model
-
     from hvdc_ident.simulate import ModelSimulator
+    from tests.discrepancy.cases import FREE, experiments, model
 
     problem = Problem(ModelSimulator(model()), experiments(), FREE, rho=FrozenMap({"w": 0.9, "torque": 0.9}))
     blocks = problem.blocks(problem.start, derivatives=False)
@@ -127,9 +126,8 @@ def test_drawn_noise_keeps_its_steps_where_no_deviation_is_given() -> None:
 
 def test_drawn_noise_is_as_uncertain_as_the_rows_that_tell_of_it() -> None:
     """A standard deviation from 46 degrees of freedom is known to 1/sqrt(2 x 46), in every record of its output alike."""
-    from cases import FREE, experiments, model
-
     from hvdc_ident.simulate import ModelSimulator
+    from tests.discrepancy.cases import FREE, experiments, model
 
     problem = Problem(ModelSimulator(model()), experiments(), FREE)
     blocks = problem.blocks(problem.start, derivatives=False)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import FREE, TRUE, experiments, model
 
 import hvdc_ident
 from hvdc_ident import Experiment, InputSignal, Trajectory, load_model, simulate
@@ -17,6 +16,7 @@ from hvdc_ident.errors import StudyError, UnknownNameError
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import percentage
+from tests.discrepancy.cases import FREE, TRUE, experiments, model
 
 FEW = ["lag", "delay", "limit", "gain", "offset", "deadband", "second-order"]
 

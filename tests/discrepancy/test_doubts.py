@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import FREE, TRUE, corners, experiments, model
-from refits import answered, beside, plain
 from scipy.stats import kstest
 
 from hvdc_ident import InputSignal
@@ -17,6 +15,8 @@ from hvdc_ident.discrepancy.residual_checks import constancy
 from hvdc_ident.discrepancy.verdict import Doubt, _turned, doubt_of_direction, doubt_of_size
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
+from tests.discrepancy.cases import FREE, TRUE, corners, experiments, model
+from tests.discrepancy.refits import answered, beside, plain
 
 
 def chance(refit: Refit) -> float:

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cases import FREE, SIGMA, TRUE, experiments, model
-from refits import beside, plain
 
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy import findings as told_as
@@ -22,6 +20,8 @@ from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
 from hvdc_ident.discrepancy.verdict import Conclusion, headline, keeps_tolerance, leaves_more_than_noise
 from hvdc_ident.immutable import FrozenMap
+from tests.discrepancy.cases import FREE, SIGMA, TRUE, experiments, model
+from tests.discrepancy.refits import beside, plain
 
 GIVEN = {"Kp": 2.6, "Ki": 9.0}
 SEARCH = SearchContext("all", None, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)

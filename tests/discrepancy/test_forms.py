@@ -10,9 +10,6 @@ from typing import cast
 
 import numpy as np
 import pytest
-from cases import FREE, SIGMA, TIME, TRUE, corners, experiments, model
-from meters import filtered
-from refits import answered, beside, plain
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Model, Trajectory, simulate
@@ -29,6 +26,9 @@ from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card, write_card
+from tests.discrepancy.cases import FREE, SIGMA, TIME, TRUE, corners, experiments, model
+from tests.discrepancy.meters import filtered
+from tests.discrepancy.refits import answered, beside, plain
 
 Meter = Callable[[dict[str, Array]], Array]
 

@@ -6,14 +6,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import FREE, TIME, TRUE, experiments, model
-from meters import records
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import InputSignal
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.candidates import entries
+from tests.discrepancy.cases import FREE, TIME, TRUE, experiments, model
+from tests.discrepancy.meters import records
 
 WN, ZETA = 60.0, 0.6
 

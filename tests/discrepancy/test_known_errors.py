@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import FREE, TRUE, experiments, model
 
 from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
@@ -16,6 +15,7 @@ from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import Model
 from hvdc_ident.simulate import ModelSimulator
+from tests.discrepancy.cases import FREE, TRUE, experiments, model
 
 QUIETER = 20.0
 """Times that the noise is smaller than in the other tests: half a per cent of a range is seen in it."""

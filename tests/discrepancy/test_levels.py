@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, model
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
@@ -14,6 +13,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.effects import SignalScales, effects, size_grid
 from hvdc_ident.immutable import FrozenMap
+from tests.discrepancy.cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, model
 
 STEP = 0.11
 

@@ -8,8 +8,6 @@ from functools import cache
 
 import numpy as np
 import pytest
-from cases import experiments as of_drive
-from cases import model as drive
 
 from hvdc_ident import Experiment, InputSignal, Model, load_model
 from hvdc_ident.data import Array
@@ -20,6 +18,8 @@ from hvdc_ident.errors import SimulationError, SteadyStateError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import Simulation, Tolerance, simulate
+from tests.discrepancy.cases import experiments as of_drive
+from tests.discrepancy.cases import model as drive
 
 CIRCLE = """
 schema = 1

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from cases import SIGMA, TIME, experiments
 from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
@@ -16,6 +15,7 @@ from hvdc_ident.fit.noise import ESTIMATED, MOVING, SCATTER, OutputNoise, freedo
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 from hvdc_ident.study.recordings import with_noise
+from tests.discrepancy.cases import SIGMA, TIME, experiments
 
 
 def test_white_noise_stands_as_given() -> None:

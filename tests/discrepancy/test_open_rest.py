@@ -7,8 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, model
-from refits import beside, plain
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import Experiment, InputSignal, Trajectory
@@ -16,6 +14,8 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.hypothesis import refitted
 from hvdc_ident.immutable import FrozenMap
+from tests.discrepancy.cases import EVENT, FREE, RUNS, SIGMA, TIME, TRUE, corners, model
+from tests.discrepancy.refits import beside, plain
 
 WIDTH = 0.08
 LEFT_AT = {"fit-1": 0.9, "fit-2": -0.7, "held": 0.5}

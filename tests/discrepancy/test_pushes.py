@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import CARD, TIME, TRUE, experiments, model
-from refits import plain
 from scipy.linalg import block_diag
 from scipy.signal import StateSpace, lsim
 from scipy.stats import norm
@@ -20,6 +18,8 @@ from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import Tolerance
+from tests.discrepancy.cases import CARD, TIME, TRUE, experiments, model
+from tests.discrepancy.refits import plain
 
 EXACT = Tolerance(rtol=1e-11, atol=1e-13)
 READERS = {

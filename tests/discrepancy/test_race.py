@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import FREE, experiments, model
-from refits import beside, plain
 
 from hvdc_ident.discrepancy import diagnose, hypothesis
 from hvdc_ident.discrepancy.candidates import CandidateEffect
@@ -19,6 +17,8 @@ from hvdc_ident.discrepancy.screen import _Runner
 from hvdc_ident.errors import ComputationError, InputError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
+from tests.discrepancy.cases import FREE, experiments, model
+from tests.discrepancy.refits import beside, plain
 
 SEARCH = SearchContext("all", None, FrozenMap(), DiagnosisOptions(), 0)
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import pytest
-from cases import FREE, experiments, model
-from refits import beside
 
 from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
@@ -16,6 +14,8 @@ from hvdc_ident.fit import FitParameter
 from hvdc_ident.identifiability import IdentifiabilityReport
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
+from tests.discrepancy.cases import FREE, experiments, model
+from tests.discrepancy.refits import beside
 
 FRICTION = 0.45
 CANDIDATES = (*FREE, FitParameter("b", 0.3, 0.01, 2.0))

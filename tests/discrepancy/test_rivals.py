@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import FREE, SIGMA, TRUE, experiments, model
-from refits import answered, beside, plain
 
 from hvdc_ident import Experiment, InputSignal, simulate
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
@@ -33,6 +31,8 @@ from hvdc_ident.discrepancy.search import SearchOutcome, objection, one_round
 from hvdc_ident.discrepancy.verdict import Conclusion, _weighed
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
+from tests.discrepancy.cases import FREE, SIGMA, TRUE, experiments, model
+from tests.discrepancy.refits import answered, beside, plain
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import FREE, SIGMA, experiments, model
 
 from hvdc_ident import Experiment, Trajectory
 from hvdc_ident.discrepancy.hypothesis import OPTIMISER
@@ -15,6 +14,7 @@ from hvdc_ident.effects import EffectUse, apply_effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
+from tests.discrepancy.cases import FREE, SIGMA, experiments, model
 
 LAG = 0.03
 STEP = {n: 8.0 * s for n, s in SIGMA.items()}

@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import experiments, model
-from refits import plain
 from scipy.optimize import lsq_linear
 from scipy.stats import chi2, kstest
 
@@ -23,6 +21,8 @@ from hvdc_ident.discrepancy.screen import ANY_FACTOR, SKETCHED, UP_TO_ONE, Linea
 from hvdc_ident.effects import apply_effects, effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator, Tolerance
+from tests.discrepancy.cases import experiments, model
+from tests.discrepancy.refits import plain
 
 
 def test_what_runs_away_is_none_of_it() -> None:

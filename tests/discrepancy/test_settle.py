@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import experiments
-from refits import beside, plain
 
 from hvdc_ident.discrepancy import search as searching
 from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, is_clear
@@ -19,6 +17,8 @@ from hvdc_ident.discrepancy.search import _last, backward_elimination, forward_s
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import insertion_point_of
+from tests.discrepancy.cases import experiments
+from tests.discrepancy.refits import beside, plain
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from cases import FREE, SIGMA, TIME, experiments, model
 
 from hvdc_ident import Experiment, Trajectory
 from hvdc_ident.discrepancy import Diagnosis, diagnose
 from hvdc_ident.fit.noise import AT_FLOOR, MISFIT, misfit_sentence
+from tests.discrepancy.cases import FREE, SIGMA, TIME, experiments, model
 
 LAG = 0.03
 SPARSE = slice(None, None, 8)

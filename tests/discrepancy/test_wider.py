@@ -7,9 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from cases import EVENT, FREE, SIGMA, TIME, TRUE, experiments, model
-from meters import noisy, records
-from refits import answered, beside, plain
 from scipy.integrate import solve_ivp
 
 from hvdc_ident import InputSignal, simulate
@@ -24,6 +21,9 @@ from hvdc_ident.discrepancy.residual_checks import is_louder_after_breaks
 from hvdc_ident.discrepancy.search import one_round
 from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
+from tests.discrepancy.cases import EVENT, FREE, SIGMA, TIME, TRUE, experiments, model
+from tests.discrepancy.meters import noisy, records
+from tests.discrepancy.refits import answered, beside, plain
 
 pytestmark = pytest.mark.nightly
 

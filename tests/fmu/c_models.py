@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from c_fmu import CModel, Var
 
 from hvdc_ident import Model
+from tests.fmu.c_fmu import CModel, Var
 
 HEAD = "#include <math.h>\n#ifndef NOMINAL\n#define NOMINAL 1.0\n#endif\n"
 PLAIN = HEAD + "#define INITIALIZE(r)\n"

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from c_fmu import COMPILER, build
 
 from hvdc_ident.fmu import Limits, read_fmu
+from tests.fmu.c_fmu import COMPILER, build
 
 
 @pytest.fixture(scope="module")

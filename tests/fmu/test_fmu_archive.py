@@ -8,7 +8,6 @@ import zipfile
 from itertools import pairwise
 
 import pytest
-from c_fmu import CModel, Var, description
 from fmpy import platform, platform_tuple, sharedLibraryExtension
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,6 +17,7 @@ from hvdc_ident.errors import InputError, ModelError
 from hvdc_ident.fmu import archive as checks
 from hvdc_ident.fmu import compile_fmu, read_capabilities, read_description
 from hvdc_ident.fmu import description as read
+from tests.fmu.c_fmu import CModel, Var, description
 
 PLAIN = CModel(
     "lag",

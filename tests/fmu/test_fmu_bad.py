@@ -10,15 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from c_fmu import COMPILER, FOLDER, build, needs_compiler
-from c_models import FAULTS, FAULTY, FAULTY_CODE, FAULTY_VARIABLES, broken
-from fmu_limits import PATIENT, QUICK
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import ComputationError, InputError, ModelError, SimulationError
 from hvdc_ident.fmu import read_fmu
 from hvdc_ident.sensitivity import sweep
+from tests.fmu.c_fmu import COMPILER, FOLDER, build, needs_compiler
+from tests.fmu.c_models import FAULTS, FAULTY, FAULTY_CODE, FAULTY_VARIABLES, broken
+from tests.fmu.fmu_limits import PATIENT, QUICK
 
 pytestmark = needs_compiler
 
@@ -100,7 +100,7 @@ def bad_files(folder: Path) -> dict[str, tuple[Path, str]]:
         return build(model, folder, 2, **files)
 
     good = broken("whole")
-    from c_fmu import library as compiled
+    from tests.fmu.c_fmu import library as compiled
 
     code = compiled(good.code, 2, 1, 0, ())
     return {

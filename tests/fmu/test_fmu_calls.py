@@ -8,13 +8,13 @@ from itertools import pairwise
 import fmpy
 import numpy as np
 import pytest
-from c_fmu import Var, build, description, needs_compiler
-from c_models import LATCH_CODE, latch
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fmu import read_fmu
+from tests.fmu.c_fmu import Var, build, description, needs_compiler
+from tests.fmu.c_models import LATCH_CODE, latch
 
 pytestmark = needs_compiler
 

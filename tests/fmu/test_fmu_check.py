@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from c_fmu import SOURCE, Var, build, description, needs_compiler
-from c_models import BALL, CLOCK, begun, response, spring
 from typer.testing import CliRunner
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.fmu import Capabilities, read_capabilities, read_fmu
+from tests.fmu.c_fmu import SOURCE, Var, build, description, needs_compiler
+from tests.fmu.c_models import BALL, CLOCK, begun, response, spring
 
 pytestmark = needs_compiler
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from c_fmu import needs_compiler
-from c_models import BALL, COUNTER, FAULTY, response, spring
 
 from hvdc_ident import find_operating_point, linearize, simulate
 from hvdc_ident.data import InputSignal, experiment
@@ -22,6 +20,8 @@ from hvdc_ident.fmu.differences import (
     together,
 )
 from hvdc_ident.linearize import continuation, jacobian_error, point_at
+from tests.fmu.c_fmu import needs_compiler
+from tests.fmu.c_models import BALL, COUNTER, FAULTY, response, spring
 
 TIME = np.linspace(0.0, 5.0, 251)
 STEP = experiment("step", TIME, {"u": InputSignal.step(1.0, 0.0, 1.0)})
@@ -140,7 +140,7 @@ def test_a_bounce_is_too_much_for_directional_derivatives(fmu):
 def test_there_is_no_derivative_by_a_whole_number(fmu):
     from dataclasses import replace
 
-    from c_fmu import Var
+    from tests.fmu.c_fmu import Var
 
     counted = replace(
         FAULTY,

@@ -8,8 +8,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from c_fmu import CModel, Var, needs_compiler
-from c_models import DECAY, PLAIN, RELEASED, spring
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, Trajectory, experiment
@@ -17,6 +15,8 @@ from hvdc_ident.discrepancy import diagnose
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.fmu import Limits
+from tests.fmu.c_fmu import CModel, Var, needs_compiler
+from tests.fmu.c_models import DECAY, PLAIN, RELEASED, spring
 
 pytestmark = needs_compiler
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from c_fmu import build, needs_compiler
-from c_models import response, spring
 from typer.testing import CliRunner
 
 from hvdc_ident import simulate
 from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
+from tests.fmu.c_fmu import build, needs_compiler
+from tests.fmu.c_models import response, spring
 
 pytestmark = needs_compiler
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import fmpy
 import numpy as np
 import pytest
-from c_fmu import CModel, Var, build, description, needs_compiler
-from c_models import BALL, COUNTER, PLAIN, response, spring
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.fmu import at_point, read_fmu
+from tests.fmu.c_fmu import CModel, Var, build, description, needs_compiler
+from tests.fmu.c_models import BALL, COUNTER, PLAIN, response, spring
 
 pytestmark = needs_compiler
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from c_fmu import build, needs_compiler
-from c_models import CLOCK, begun, response, spring
-from fmu_limits import PATIENT
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fmu import at_point, read_fmu
+from tests.fmu.c_fmu import build, needs_compiler
+from tests.fmu.c_models import CLOCK, begun, response, spring
+from tests.fmu.fmu_limits import PATIENT
 
 pytestmark = needs_compiler
 

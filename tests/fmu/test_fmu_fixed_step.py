@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from c_fmu import build, description, needs_compiler
-from c_models import response, spring
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fmu import read_fmu
+from tests.fmu.c_fmu import build, description, needs_compiler
+from tests.fmu.c_models import response, spring
 
 pytestmark = needs_compiler
 

@@ -14,9 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from c_fmu import build, needs_compiler
-from c_models import FAULTY, FAULTY_CODE, FOUR
-from fmu_limits import PATIENT
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment
@@ -25,6 +22,9 @@ from hvdc_ident.fmu import read_fmu
 from hvdc_ident.fmu.archive import LOCK, remove_abandoned_folders, shared_folder, unpacked_folder
 from hvdc_ident.fmu.worker_pool import MIB, Budget, Limits, crash, idle_cores, overdue
 from hvdc_ident.parallel import Ending
+from tests.fmu.c_fmu import build, needs_compiler
+from tests.fmu.c_models import FAULTY, FAULTY_CODE, FOUR
+from tests.fmu.fmu_limits import PATIENT
 
 pytestmark = needs_compiler
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from c_fmu import needs_compiler
-from c_models import OTHERWISE
 
 from hvdc_ident import simulate
 from hvdc_ident.data import experiment
+from tests.fmu.c_fmu import needs_compiler
+from tests.fmu.c_models import OTHERWISE
 
 pytestmark = needs_compiler
 

@@ -8,8 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from c_fmu import CModel, Var, build, needs_compiler
-from c_models import SPRING_CODE, TWIN, spring
 from typer.testing import CliRunner
 
 from hvdc_ident import find_operating_point, linearize, load_model, simulate
@@ -17,6 +15,8 @@ from hvdc_ident.cli import app
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import ModelError, UnknownNameError
+from tests.fmu.c_fmu import CModel, Var, build, needs_compiler
+from tests.fmu.c_models import SPRING_CODE, TWIN, spring
 
 pytestmark = needs_compiler
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import fmpy
 import numpy as np
 import pytest
-from c_fmu import build, needs_compiler
-from c_models import BALL, COUNTER, DECAY, FAULTY, TRIANGLE, response, spring
 from scipy.signal import lsim
 
 from hvdc_ident import load_model, simulate
 from hvdc_ident.data import InputSignal, experiment
 from hvdc_ident.fmu import Limits, read_fmu
+from tests.fmu.c_fmu import build, needs_compiler
+from tests.fmu.c_models import BALL, COUNTER, DECAY, FAULTY, TRIANGLE, response, spring
 
 pytestmark = needs_compiler
 

@@ -6,8 +6,6 @@ import json
 
 import numpy as np
 import pytest
-from c_fmu import CModel, Var, build, needs_compiler
-from c_models import PLAIN, TWIN, spring
 from typer.testing import CliRunner
 
 from hvdc_ident import simulate
@@ -15,6 +13,8 @@ from hvdc_ident.cli import app
 from hvdc_ident.data import experiment
 from hvdc_ident.fmu import read_fmu
 from hvdc_ident.model import save_card
+from tests.fmu.c_fmu import CModel, Var, build, needs_compiler
+from tests.fmu.c_models import PLAIN, TWIN, spring
 
 pytestmark = needs_compiler
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from c_fmu import needs_compiler
-from c_models import DECAY, FAULTY, TWIN, spring
 
 from hvdc_ident import simulate
 from hvdc_ident.data import InputSignal, Trajectory, experiment
@@ -16,6 +14,8 @@ from hvdc_ident.errors import ModelError, UnknownNameError
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.fmu import Limits
 from hvdc_ident.immutable import FrozenMap
+from tests.fmu.c_fmu import needs_compiler
+from tests.fmu.c_models import DECAY, FAULTY, TWIN, spring
 
 pytestmark = needs_compiler
 

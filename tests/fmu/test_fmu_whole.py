@@ -7,7 +7,6 @@ import re
 
 import numpy as np
 import pytest
-from c_fmu import needs_compiler
 from typer.testing import CliRunner
 
 from hvdc_ident import load_model, simulate
@@ -18,6 +17,7 @@ from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.fmu.export import export_fmu
 from hvdc_ident.model import parse_card
+from tests.fmu.c_fmu import needs_compiler
 
 pytestmark = needs_compiler
 

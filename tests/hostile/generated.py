@@ -26,8 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from plants import Array, Draw, Plant, Seeded, chance, plant, recorded
 from typer.testing import CliRunner
+
+from tests.hostile.plants import Array, Draw, Plant, Seeded, chance, plant, recorded
 
 LONGEST = 120  # s of processor time a command may take
 COMMANDS = (

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from plants import Plant, Seeded, recorded
+
+from tests.hostile.plants import Plant, Seeded, recorded
 
 pytestmark = pytest.mark.nightly
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import linear
 from scipy.optimize import linear_sum_assignment, minimize_scalar
 
 from hvdc_ident.linearize import balanced, h2_norm, linf_norm
 from hvdc_ident.linearize.zeros import zeros
+from tests.linearize.helpers import linear
 
 
 def random_system(seed):

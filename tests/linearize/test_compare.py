@@ -5,7 +5,6 @@ from dataclasses import replace
 import control
 import numpy as np
 import pytest
-from helpers import linear, stable
 
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError
@@ -24,6 +23,7 @@ from hvdc_ident.linearize.realisation import difference
 from hvdc_ident.linearize.reduction import minimal
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
+from tests.linearize.helpers import linear, stable
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -7,7 +7,6 @@ from dataclasses import replace
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from helpers import linear
 from scipy.io import loadmat
 
 from hvdc_ident.effects import apply_effects
@@ -15,6 +14,7 @@ from hvdc_ident.errors import InputError, UnknownNameError
 from hvdc_ident.linearize import LinearModel, find_operating_point, linearize, root_locus
 from hvdc_ident.linearize.export import write
 from hvdc_ident.models import load_model
+from tests.linearize.helpers import linear
 
 NAMES = [f"{k}_{w}" for k in ("state", "input", "output") for w in ("names", "units")]
 DELAY = [{"effect": "delay", "at": "Ir1", "parameters": {"T": 0.002}}]

@@ -4,7 +4,6 @@ import control
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from helpers import linear, stable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -29,6 +28,7 @@ from hvdc_ident.linearize.frequency import sensitivity, sigma
 from hvdc_ident.linearize.zeros import zeros
 from hvdc_ident.model import Model
 from hvdc_ident.models import load_model
+from tests.linearize.helpers import linear, stable
 
 DELAY = [{"effect": "delay", "at": "Ir1", "parameters": {"T": 0.002}}]
 W = np.logspace(-1, 3, 15)

@@ -3,10 +3,10 @@
 import control
 import numpy as np
 import pytest
-from helpers import linear
 
 import hvdc_ident as hi
 from hvdc_ident.linearize import loop_margins, margins
+from tests.linearize.helpers import linear
 
 
 def rational(top, bottom):

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import linear, stable
 
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError, SteadyStateError, UnknownNameError
@@ -17,6 +16,7 @@ from hvdc_ident.model import Model, Output, State
 from hvdc_ident.models import load_model
 from hvdc_ident.parameters import Input, Parameter
 from tests.effort import calls
+from tests.linearize.helpers import linear, stable
 
 
 @pytest.fixture(scope="module")

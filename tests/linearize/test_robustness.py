@@ -3,7 +3,6 @@
 import control
 import numpy as np
 import pytest
-from helpers import linear, stable
 
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.errors import LinearizationError
@@ -24,6 +23,7 @@ from hvdc_ident.linearize.loops import structured_singular_value
 from hvdc_ident.linearize.norms import norms
 from hvdc_ident.linearize.realisation import difference
 from hvdc_ident.models import load_model
+from tests.linearize.helpers import linear, stable
 
 
 def tf(top, bottom):

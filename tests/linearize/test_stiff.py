@@ -4,12 +4,12 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from helpers import linear
 
 from hvdc_ident.errors import LinearizationError
 from hvdc_ident.linearize import balanced, h2_norm, hinf_norm
 from hvdc_ident.linearize.reduction import minimal
 from hvdc_ident.linearize.transfer_function import transfer_function
+from tests.linearize.helpers import linear
 
 RATES = [(1e-6, 1e6), (1e-3, 1e9), (1.0, 1e12), (1e-6, 1e12), (1e-9, 1e-3), (1e6, 1e12)]
 
