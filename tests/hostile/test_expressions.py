@@ -100,8 +100,6 @@ REFUSED = [
     "(" * 20_000,
     "max(" + ",".join(f"a{i}" for i in range(3000)) + ")",
     "where(x > 0, 1",
-    "+".join(f"max({','.join(f'a{i}_{j}' for j in range(16))})" for i in range(100)),
-    "max(" * 20 + "x" + "".join(f",{','.join(f'a{i}_{j}' for j in range(30))})" for i in range(20)),
     "import os",
     "nan(",
 ]
@@ -117,6 +115,8 @@ HARMLESS = [
     "1/(1 + " * 30 + "x" + ")" * 30,
     "tanh(1 + " * 30 + "x" + ")" * 30,
     "max(" + ",".join(f"a{i}" for i in range(16)) + ")",
+    "+".join(f"max({','.join(f'a{i}_{j}' for j in range(16))})" for i in range(100)),
+    "max(" * 20 + "x" + "".join(f",{','.join(f'a{i}_{j}' for j in range(30))})" for i in range(20)),
     "+".join(f"a{i}*b{i}" for i in range(1000)),
     "0.1e-5000",
     "1" + "0" * 300,
