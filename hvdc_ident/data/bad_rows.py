@@ -43,8 +43,7 @@ _FEWEST_REPEATED = 3  # steps in a row that are equal, from which a stretch is l
 @dataclass(frozen=True)
 class BadRows:
     """A stretch of rows that cannot be right. kind: "mark", "zeros", "stuck", "saturated", "filled", "repeated", "spike", "angle step",
-    "gap", "constant" or, of an input, "not recorded". columns: those it is about. first, last: indices of rows. what: a sentence
-    without rows and full stop.
+    "gap" or "constant". columns: those it is about. first, last: indices of rows. what: a sentence without rows and full stop.
     """
 
     kind: str

@@ -126,15 +126,13 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
         table = _careful(layout, columns, clock)
     if len(table) < 2:
         raise WaveformError("too few rows", where=str(path), expected="at least 2 rows of numbers", got=f"{len(table)}")
-    table, ordered = _in_order(table)
-    _check_times(layout, table[:, 0])
+    _check_times(layout, table)
     names = tuple(signals) if signals is not None else tuple(layout.names[i] for i in known)
     dated = layout.absolute or layout.since is not None
     unit = "date" if dated else layout.units[layout.time]
     notes = (
         *layout.notes,
         *clock.notes,
-        *ordered,
         *([_MAYBE_SERIAL] if not unit and _may_be_serial(table[:, 0]) else []),
     )
     origin = Origin(time_unit=unit, time_column=layout.labels[layout.time] if layout.time else "", notes=notes)
@@ -543,37 +541,36 @@ def _number(cell: str, layout: _Layout, line: int, column: int) -> float:
     )
 
 
-def _in_order(table: Array) -> tuple[Array, tuple[str, ...]]:
-    """Return rows in the order of their instants, those that stand twice to the last digit once, and what was done in words.
+def _how_to_order(table: Array) -> str:
+    """Return what makes one record of rows whose time goes back.
 
-    table: (n, k), instants first. They are left as they are where that does not make one record of even steps of them, as where a
-    clock was set back: too few rows to tell, two different rows of one instant that stand apart, rows that come between others or
-    leave a gap.
+    table: (n, k), instants first. Rows that stand twice to the last digit are taken out, and the others sorted, where that gives one
+    record of even steps: enough rows to tell, no two different ones of one instant that stand apart, none between others and no gap.
+    Else a clock was set back, or an instant is wrong.
     """
-    time = table[:, 0]
-    if not (np.diff(time) < 0).any():
-        return table, ()
-    order = np.argsort(time, kind="stable")
+    order = np.argsort(table[:, 0], kind="stable")
     ranked = table[order]
-    again = (np.append(False, np.diff(order) != 1)) & (np.append(False, np.diff(ranked[:, 0]) == 0))
-    twice = again & np.append(
-        False, ((ranked[1:] == ranked[:-1]) | (np.isnan(ranked[1:]) & np.isnan(ranked[:-1]))).all(axis=1)
-    )
-    kept = ranked[~twice]
-    steps = np.diff(kept[:, 0])
+    apart = (np.append(False, np.diff(order) != 1)) & (np.append(False, np.diff(ranked[:, 0]) == 0))
+    alike = (ranked[1:] == ranked[:-1]) | (np.isnan(ranked[1:]) & np.isnan(ranked[:-1]))
+    twice = apart & np.append(False, alike.all(axis=1))
+    time = ranked[~twice, 0]
+    steps = np.diff(time)
     between = steps[steps > 0].min(initial=np.inf) < 0.5 * np.median(steps)
-    if (again & ~twice).any() or len(kept) < FEWEST or between or not has_clock(kept[:, 0]) or gaps(kept[:, 0]):
-        return table, ()
-    done = ["the rows do not stand in the order of their instants: they are sorted"]
-    if number := int(twice.sum()):
-        done.append(
-            f"{number} row{'s' if number > 1 else ''} that stand{'' if number > 1 else 's'} twice, to the last digit, taken once"
-        )
-    return kept, ("; ".join(done),)
+    if (apart & ~twice).any() or time.size < FEWEST or between or not has_clock(time) or gaps(time):
+        return "sort the rows by time, or cut the record where its time begins again"
+    if not (number := int(twice.sum())):
+        return "sort the rows by time: they are those of one record in another order"
+    first = int(order[twice].min())
+    sorted_else = bool((np.diff(np.delete(table[:, 0], order[twice])) >= 0).all())
+    then = "" if sorted_else else ", and sort the others by time"
+    return (
+        f"take out the {number} rows that stand twice to the last digit, the first of them data row {first + 1}{then}"
+    )
 
 
-def _check_times(layout: _Layout, time: Array) -> None:
-    """WaveformError where the time goes back or stands still. time: (n,) in the file's unit."""
+def _check_times(layout: _Layout, table: Array) -> None:
+    """WaveformError where the time goes back or stands still. table: (n, k), instants in the file's unit first."""
+    time = table[:, 0]
     back = np.flatnonzero(np.diff(time) < 0)
     unit = "s" if layout.absolute else layout.units[layout.time] or "s"
     if back.size:
@@ -583,7 +580,7 @@ def _check_times(layout: _Layout, time: Array) -> None:
             where=f"{layout.path}, line {_line_of(layout, row)}, {layout.column(layout.time)}",
             expected=f"at least {time[row - 1]:.12g} {unit}, the time of the row before",
             got=f"{time[row]:.12g} {unit}",
-            hint="sort the rows by time",
+            hint=_how_to_order(table),
         )
     if event_rows(time).all():
         return

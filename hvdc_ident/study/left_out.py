@@ -17,7 +17,8 @@ from hvdc_ident.study import schema
 class RowsLeftOut:
     """The rows of one experiment that are left out, by signal, and the contradictions that were found in the others.
 
-    rows: (n,) by signal. contradictions: of the recording, each with what to write.
+    rows: (n,) by signal. contradictions: of the recording, each with what to write. unrecorded: (n,) by input the rows in which it has
+    no number although the study does not leave them out. write: the line that leaves out all that can be.
     """
 
     def __init__(
@@ -41,18 +42,16 @@ class RowsLeftOut:
             for s, v in columns.items()
         }
         bad = list(bad_rows(time, asked, table.event, angles))
+        self.unrecorded = {s: open_ for s, rows in unrecorded.items() if (open_ := rows & ~self.rows[s] & needed).any()}
         for signal, rows in unrecorded.items():
-            bad += [
-                BadRows("not recorded", (signal,), first, last, f"{signal} is not recorded")
-                for first, last in stretches(rows & ~self.rows[signal] & needed)
-            ]
-            self.rows[signal] = self.rows[signal] | rows  # stated or not: there is no number to use
+            self.rows[signal] = self.rows[signal] | (rows & ~needed)
+        self.write = leave_out_line(_all_spans(bad, self.unrecorded, table, time))
         inputs = [asked[s] for s in (*table.inputs, *table.drive)]
         if any(
             np.mean(v[1:] == v[:-1]) < HOLD_SHARE for v in inputs if v.size > 1
         ):  # one that is held is known in a gap too
             bad += [b for b in gaps(time) if needed[b.last]]
-        found = (_contradiction(b, bad, table, time, asked, applied=stated is None) for b in bad)
+        found = (_contradiction(b, self.write, table, time, asked, applied=stated is None) for b in bad)
         self.contradictions = (*found, *_stated(table, time, columns))
         if stated is None:
             for b in (b for b in bad if b.can_be_left_out):
@@ -94,15 +93,15 @@ def _between_kept(out: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np
 
 def _contradiction(
     b: BadRows,
-    bad: Sequence[BadRows],
+    leave_out: str,
     table: schema.ExperimentTable,
     time: Array,
     columns: Mapping[str, Array],
     *,
     applied: bool,
 ) -> Contradiction:
-    """Return what is said of a stretch. columns: (n,) by signal; applied: whether its rows are left out already, without the study
-    saying so.
+    """Return what is said of a stretch. leave_out: the line that leaves out all that can be; columns: (n,) by signal; applied: whether
+    its rows are left out already, without the study saying so.
     """
     first, last = float(time[b.first]), float(time[b.last])
     if b.kind == "constant":
@@ -111,9 +110,9 @@ def _contradiction(
     if b.kind == "spike" and applied:  # one to three rows less: nothing that the reader has to decide
         rows = (b.first + 1, b.last + 1)
         return Contradiction(b.kind, table.name, what, b.columns, rows, (first, last), done="left out")
-    if b.kind == "not recorded" or (b.can_be_left_out and applied):
+    if b.can_be_left_out and applied:
         what += "; left out here, though the study does not say so"
-    write = _window(b, table, time, columns) if b.cuts else _spans(bad, table, time)
+    write = _window(b, table, time, columns) if b.cuts else leave_out
     return Contradiction(b.kind, table.name, what, b.columns, (b.first + 1, b.last + 1), (first, last), write)
 
 
@@ -138,17 +137,31 @@ def _where(first: int, last: int, time: Array) -> str:
     return f"rows {first + 1} to {last + 1} ({float(time[first]):.6g} to {float(time[last]):.6g} s)"
 
 
-def _spans(bad: Sequence[BadRows], table: schema.ExperimentTable, time: Array) -> str:
-    """Return the line that leaves out every stretch of the experiment that can be."""
-    spans: dict[str, list[tuple[float, float]]] = {
-        s: [(v[0], v[1]) for v in spans] for s, spans in (table.leave_out or {}).items()
-    }
-    for b in bad:
-        if b.can_be_left_out:
-            for s in b.columns:
-                spans.setdefault(s, []).append((float(time[b.first]), float(time[b.last])))
+Spans = dict[str, list[tuple[float, float]]]
+
+
+def spans_of(rows: NDArray[np.bool_], time: Array) -> list[tuple[float, float]]:
+    """Return the first and the last instant of each stretch of rows."""
+    return [(float(time[first]), float(time[last])) for first, last in stretches(rows)]
+
+
+def leave_out_line(spans: Mapping[str, Iterable[tuple[float, float]]]) -> str:
+    """Return the line of a study that leaves out spans of time in s, by signal."""
     lines = (f"{toml_key(s)} = [{', '.join(f'[{a:.12g}, {b:.12g}]' for a, b in found)}]" for s, found in spans.items())
     return f"leave_out = {{{', '.join(lines)}}}"
+
+
+def _all_spans(
+    bad: Sequence[BadRows], unrecorded: Mapping[str, NDArray[np.bool_]], table: schema.ExperimentTable, time: Array
+) -> Spans:
+    """Return what the study leaves out, and every other stretch that can be."""
+    spans: Spans = {s: [(v[0], v[1]) for v in spans] for s, spans in (table.leave_out or {}).items()}
+    for b in (b for b in bad if b.can_be_left_out):
+        for s in b.columns:
+            spans.setdefault(s, []).append((float(time[b.first]), float(time[b.last])))
+    for s, rows in unrecorded.items():
+        spans.setdefault(s, []).extend(spans_of(rows, time))
+    return spans
 
 
 def _window(b: BadRows, table: schema.ExperimentTable, time: Array, columns: Mapping[str, Array]) -> str:

@@ -45,6 +45,7 @@ from hvdc_ident.study.column_matching import (
     usable,
 )
 from hvdc_ident.study.json_schema import SCHEMA_LINE, write_schemas
+from hvdc_ident.study.left_out import leave_out_line, spans_of
 from hvdc_ident.study.phase_columns import of_use, phases_text, proposed_phases, ways_to_count, without_phases
 from hvdc_ident.study.recordings import Recordings, level_before, read_experiments, smoothed, with_derived
 from hvdc_ident.study.terminal_columns import Settled, Terminals, settled, steadied, terminals_of, unit_of_match
@@ -85,7 +86,7 @@ class Mapped:
 
     levels: why the model's levels are not known; empty where they are. experiment: None where no output is mapped. phases: what
     columns made of three phases are made of. values: inputs constant at other than the model's value. notes: what was decided between
-    columns. measured: inputs that move from row to row, as nobody sets them.
+    columns. measured: inputs that move from row to row, as nobody sets them. leave_out: spans in s by input in which it is not recorded.
     """
 
     name: str
@@ -99,6 +100,7 @@ class Mapped:
     values: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     measured: tuple[str, ...] = ()
+    leave_out: Mapping[str, list[tuple[float, float]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -294,7 +296,8 @@ def _event(record: Trajectory, moved: Sequence[Match], means: Mapping[str, float
 
 
 def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Terminals | None) -> Mapped:
-    found = proposal(read_waveforms(file), model, name, about)
+    record = read_waveforms(file)
+    found = proposal(record, model, name, about)
     data = _relative(file, folder)
     by_kind = {
         kind: {m.target.name: m.column.name for m in found.columns.mapped if m.target.kind == kind}
@@ -304,6 +307,8 @@ def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Termina
     if not by_kind["output"]:
         return Mapped(name, file, data, found.columns, found.levels, None, {}, *rest)
     lines = {m.target.name: schema.ColumnTable(**m.line.keys) for m in found.columns.mapped if m.line.keys}
+    lost = {s: record.own_rows(c) & np.isnan(record[c]) for s, c in by_kind["input"].items() if c in record}
+    leave_out = {s: spans_of(rows, record.time) for s, rows in lost.items() if rows.any()}
     table = schema.ExperimentTable(
         name=name,
         data=file.name,
@@ -312,6 +317,7 @@ def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Termina
         columns=lines,
         values=dict(found.values),
         phases=list(found.phases),
+        leave_out={s: [list(span) for span in spans] for s, spans in leave_out.items()} or None,
     )
     recordings = Recordings(file.parent)
     (experiment,), notes = read_experiments([table], model, recordings, str(file))
@@ -319,7 +325,7 @@ def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Termina
     if measured:
         table = table.model_copy(update={"interpolation": dict.fromkeys(measured, "linear")})
         (experiment,), notes = read_experiments([table], model, recordings, str(file))
-    return Mapped(name, file, data, found.columns, found.levels, experiment, notes[name], *rest, measured)
+    return Mapped(name, file, data, found.columns, found.levels, experiment, notes[name], *rest, measured, leave_out)
 
 
 def _values(record: Trajectory, match: Match) -> tuple[Array, Array]:
@@ -501,6 +507,8 @@ def _experiment_text(r: Mapped) -> Iterator[str]:
     yield '# role = "holdout"   # not fitted: validates the estimates'
     if r.experiment is not None and r.experiment.event is not None:
         yield f"# event = {r.experiment.event!r}   # s, as found from the inputs"
+    if r.leave_out:
+        yield f"{mark}{leave_out_line(r.leave_out)}   # not recorded there: bridged by a line, and no output compared"
     if r.levels:
         yield f"# {_comment(r.levels)}"
     trim = _trim(r)

@@ -216,6 +216,13 @@ def _experiment(
     own = {s: data.own_rows(columns[s]) for s in played}
     unrecorded = {s: rows for s in played if 0 < (rows := own[s] & np.isnan(mapped[s])).sum() < own[s].sum()}
     out = RowsLeftOut(table, time, raw, _turns(model, mappings), own, unrecorded)
+    for s, rows in out.unrecorded.items():
+        raise StudyError(
+            f"column '{columns[s]}' is not recorded in {rows.sum()} of {own[s].sum()} rows, the first at {time[rows][0]:g} s",
+            where=f"{place}, {table.data}",
+            expected=f"a number in every row: the model needs its '{s}' all along",
+            hint=f"to bridge them by a line, and to compare no output there, write: {out.write}",
+        )
     mapped = {s: out.without(s, time, v, bridged=s not in table.outputs) for s, v in mapped.items()}
     inputs = {}
     for s in played:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import re
 from fractions import Fraction
 from pathlib import Path
 
@@ -294,23 +295,31 @@ def written_as(tmp_path: Path, rows: list[str]) -> Path:
     return tmp_path / "r.csv"
 
 
-@pytest.mark.parametrize("order", ["reversed", "in two parts", "a block twice"])
-def test_rows_of_one_record_are_sorted_and_said(tmp_path: Path, order: str) -> None:
-    instants = np.arange(60) * 0.02
-    rows = rows_of(instants)
+@pytest.mark.parametrize(
+    ("order", "hint"),
+    [
+        ("reversed", "sort the rows by time: they are those of one record in another order"),
+        ("in two parts", "sort the rows by time: they are those of one record in another order"),
+        ("a block twice", "take out the 20 rows that stand twice to the last digit, the first of them data row 41"),
+        (
+            "a block twice, at the end",
+            "take out the 20 rows that stand twice to the last digit, the first of them data row 61",
+        ),
+    ],
+)
+def test_what_makes_one_record_of_rows_out_of_order_is_said(tmp_path: Path, order: str, hint: str) -> None:
+    rows = rows_of(np.arange(60) * 0.02)
     shuffled = {
         "reversed": rows[::-1],
         "in two parts": rows[25:] + rows[:25],
         "a block twice": rows[:40] + rows[20:40] + rows[40:],
+        "a block twice, at the end": rows + rows[20:40],
     }[order]
-    found = read_waveforms(written_as(tmp_path, shuffled))
-    np.testing.assert_allclose(found.time, instants)
-    np.testing.assert_allclose(found["V"], np.sin(instants), atol=1e-6)
-    (note,) = found.origin.notes
-    assert "sorted" in note and ("20 rows that stand twice" in note) == (order == "a block twice")
+    with pytest.raises(WaveformError, match=f"the time goes back.*{re.escape(hint)}$"):
+        read_waveforms(written_as(tmp_path, shuffled))
 
 
-def test_rows_that_are_no_single_record_stay_refused(tmp_path: Path) -> None:
+def test_rows_that_are_no_single_record_are_not_to_be_sorted_alone(tmp_path: Path) -> None:
     instants = np.arange(60) * 0.02
     rows = rows_of(instants)
     other = [f"{t:.2f},5" for t in instants[20:40]]
@@ -320,5 +329,5 @@ def test_rows_that_are_no_single_record_stay_refused(tmp_path: Path) -> None:
         rows[30:] + rows_of(instants[:10]),  # a gap between
         [*rows[:9], "0.001,0.3", *rows[10:]],  # one whose time is wrong
     ):
-        with pytest.raises(WaveformError, match="the time goes back"):
+        with pytest.raises(WaveformError, match=r"the time goes back.*where its time begins again$"):
             read_waveforms(written_as(tmp_path, wrong))

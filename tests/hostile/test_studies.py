@@ -175,6 +175,7 @@ CASES = {
     "empty file": Case(("d.csv", "empty"), data=lambda rows: ""),
     "header alone": Case(("d.csv",), data=lambda rows: HEADER + "\n"),
     "binary file": Case(("d.csv",), data=lambda rows: b"\x00\x01\x02" * 50),
+    "nan in an input": Case(("d.csv", "'Pref2' is not recorded in 1 of"), data=_row(9, "0.045,nan,0.4")),
     "no number in an input": Case(
         ("d.csv", "'Pref2' is not recorded in any row"),
         data=lambda rows: "\n".join([HEADER, *(f"{r.split(',')[0]},nan,0.4" for r in rows)]) + "\n",

@@ -51,7 +51,7 @@ BAD_CSV: dict[str, bytes] = {
     "extra cell": replaced(300, "0.3,1,2,3"),
     "missing cell": replaced(300, "0.3,1"),
     "balanced ragged rows": "\n".join([*LINES[:300], "0.299,1", "0.3,1,2,3", *LINES[302:]]).encode(),
-    "time goes back": "\n".join([*LINES, *(f"{0.2 + 0.001 * i:.3f},9,9" for i in range(100))]).encode(),
+    "time backwards": "\n".join([LINES[0], *LINES[:0:-1]]).encode(),
     "time without end": replaced(999, "inf,1,2"),
     "time stands still": b"time,a\n" + b"0,1\n" * 1000,
     "no header": "\n".join(LINES[1:]).encode(),

@@ -98,7 +98,6 @@ ALL = ("V", "theta", "P", "Q")
 SPOILT = {
     "a mark in an output": Spoilt("mark", put(101, 104, lambda v: -9999.0, "P"), ("P",), (101, 104)),
     "a mark in an input": Spoilt("mark", put(101, 101, lambda v: 32767.0, "V"), ("V",), (101, 101)),
-    "an input that is not recorded": Spoilt("not recorded", put(101, 104, lambda v: np.nan, "V"), ("V",), (101, 104)),
     "zeros": Spoilt("zeros", put(121, 122, np.zeros_like, "V", "P", "Q"), ("V", "P", "Q"), (121, 122)),
     "zeros in one output": Spoilt("zeros", put(121, 125, np.zeros_like, "Q"), ("Q",), (121, 125)),
     "a recorder that stands": Spoilt("stuck", put(150, 200, lambda v: v[0], *ALL), ALL, (151, 200)),
@@ -145,8 +144,7 @@ def test_bad_rows_are_said_left_out_and_mended(name: str, unit: AnyModel, plant:
         bridge = np.interp(columns["time"][rows], time, values)
         np.testing.assert_allclose(experiment.inputs[n](columns["time"][rows]), bridge, atol=1e-6)
     asked = read(unit, tmp_path, columns, "leave_out = {}")
-    unknown = bad if spoilt.kind == "not recorded" else set()  # there is no number to use
-    assert [c.kind for c in said(asked)] == [spoilt.kind] and not_compared(asked) == {"P": unknown, "Q": unknown}
+    assert [c.kind for c in said(asked)] == [spoilt.kind] and not_compared(asked) == {"P": set(), "Q": set()}
 
 
 def test_a_column_that_does_not_move_is_taken_out(unit: AnyModel, plant: Columns, tmp_path: Path) -> None:

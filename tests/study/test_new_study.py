@@ -200,13 +200,10 @@ def test_an_input_with_gaps_is_mapped_and_its_gaps_are_left_out(motor: Path, tmp
     (experiment,) = hi.load_study(found.path).experiments
     line = np.interp(r["time"][7], r["time"][[6, 8]], r["v"][[6, 8]])
     assert experiment.inputs["v"](r["time"][7]) == pytest.approx(line) and np.isnan(experiment.measured["w"][7])
-    (said,) = experiment.measured.origin.contradictions
-    assert said.rows == (8, 8) and "v is not recorded" in said.what
     at = f"{r['time'][7]:.12g}"
-    assert said.write == f"leave_out = {{v = [[{at}, {at}]]}}"
-    found.path.write_text(found.path.read_text().replace("[[experiment]]", f"[[experiment]]\n{said.write}"))
-    (mended,) = hi.load_study(found.path).experiments
-    assert all(c.done for c in mended.measured.origin.contradictions)
+    assert f"leave_out = {{v = [[{at}, {at}]]}}" in found.path.read_text()
+    (said,) = experiment.measured.origin.contradictions
+    assert said.rows == (8, 8) and said.done
 
 
 @pytest.mark.parametrize(
