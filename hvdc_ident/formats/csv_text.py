@@ -563,6 +563,8 @@ def _how_to_order(table: Array) -> str:
     first = int(order[twice].min())
     sorted_else = bool((np.diff(np.delete(table[:, 0], order[twice])) >= 0).all())
     then = "" if sorted_else else ", and sort the others by time"
+    if number == 1:
+        return f"take out data row {first + 1}, which stands twice to the last digit{then}"
     return (
         f"take out the {number} rows that stand twice to the last digit, the first of them data row {first + 1}{then}"
     )

@@ -122,6 +122,11 @@ def use(page: Any, name: str, kind: str) -> None:
         control.click()
 
 
+def check_told(page: Any, name: str) -> None:
+    told = [t for t in page.locator(".q-notification").all_inner_texts() if FAILED in t]
+    assert not told, f"after {name!r}: {told}"
+
+
 def use_all(page: Any) -> set[str]:
     """Use every control once, those that others bring along too, and return their names; parts are opened first, and closed last."""
     done: set[str] = set()
@@ -138,6 +143,7 @@ def use_all(page: Any) -> set[str]:
         try:
             use(page, name, kind)
         except sync_api.TimeoutError as error:
+            check_told(page, name)  # what was told late may lie over the control
             tries[name] = tries.get(name, 0) + 1
             control = page.locator(f'[data-control="{name}"]').first
             if (control.count() and control.is_visible()) or tries[name] > 3:
@@ -146,8 +152,7 @@ def use_all(page: Any) -> set[str]:
                 name
             )  # it was taken away or built anew meanwhile: where it is in sight again, it is listed again
         page.wait_for_timeout(REST)
-        told = [t for t in page.locator(".q-notification").all_inner_texts() if FAILED in t]
-        assert not told, f"after {name!r}: {told}"
+        check_told(page, name)
 
 
 def a_study(request: pytest.FixtureRequest) -> tuple[str, ...]:
