@@ -53,6 +53,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} follows with a play of {width}",
+    asked="the play of the mechanism",
     excited_by="slow ramps both ways, with turns at several levels",
     example=FrozenMap({"width": 0.02}),
     states="y, one per insertion point",

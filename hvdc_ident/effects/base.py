@@ -190,7 +190,8 @@ class Effect:
 
     insertion_kinds: kinds of insertion point where it may sit. states: those it adds, as part of a sentence. sentence: for
     the report, with {at}, {from}, {equivalent_delay} and the parameters by name; summands of optional ones, and a part that falls
-    away with a fixed one at 0, stand in brackets. excited_by: the experiment that makes it visible. example: values that show on
+    away with a fixed one at 0, stand in brackets. asked: what the model's owner knows of it, for the letter ("the limit"); empty: its
+    name is asked for. excited_by: the experiment that makes it visible. example: values that show on
     a per-unit signal of some tenths, as the list of effects and the tests use them.
     confusable: other effects that may explain the same data, each with what separates them.
     needs_source: True where it brings in another signal (`from`). needs_expression: True where its form is given with it,
@@ -217,6 +218,7 @@ class Effect:
     sentence: str
     excited_by: str
     example: FrozenMap[float]
+    asked: str = ""
     insertion_kinds: tuple[str, ...] = INSERTION_POINT_KINDS
     states: str = "none"
     confusable: FrozenMap[str] = field(default_factory=FrozenMap)

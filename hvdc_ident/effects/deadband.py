@@ -32,6 +32,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     holds=True,
     sentence="{at} is 0 within +-{width} and smaller by that beyond",
+    asked="the width of the dead band",
     excited_by="slow ramps both ways through 0",
     example=FrozenMap({"width": 0.02}),
     confusable=FrozenMap(

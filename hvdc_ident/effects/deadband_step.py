@@ -42,6 +42,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     holds=True,
     sentence="{at} is 0 within +-{width} and acts in full beyond",
+    asked="the width of the dead band, and whether its output jumps at the edge",
     excited_by="slow ramps both ways through 0 and well beyond the band",
     example=FrozenMap({"width": 0.45}),
     confusable=FrozenMap(

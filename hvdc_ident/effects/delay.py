@@ -26,6 +26,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     equivalent_delay=lambda p: p["T"],
     sentence="{at} arrives {T} late",
+    asked="the dead time of sampling, computation and communication",
     excited_by="a step of the signal, recorded at several samples per delay",
     example=FrozenMap({"T": 0.002}),
     states="the signal's history over T",

@@ -26,6 +26,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} is {k} times what the model has",
+    asked="the scaling",
     excited_by="steps to several levels, with a record that the loop does not regulate",
     example=FrozenMap({"k": 0.9}),
     confusable=FrozenMap(

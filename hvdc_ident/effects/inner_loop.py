@@ -38,6 +38,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} is reached through a loop with integral action of {wn} and damping {zeta}",
+    asked="the bandwidth and damping of the inner control loop",
     excited_by="a step of the signal, recorded at several samples per 1/wn",
     example=FrozenMap({"wn": 400.0, "zeta": 0.7}),
     states="y and the integral's part i, one pair per insertion point",

@@ -26,6 +26,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     equivalent_delay=lambda p: p["T"],
     sentence="{at} of the plant follows that of the model with a first-order lag of {T}",
+    asked="the time constant of the filter or transducer",
     excited_by="a step or fast ramp of the signal, recorded at several samples per time constant",
     example=FrozenMap({"T": 0.002}),
     states="y, one per insertion point",

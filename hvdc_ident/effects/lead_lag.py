@@ -31,6 +31,7 @@ EFFECT = Effect(
     equivalent_delay=lambda p: p["T2"] - p["T1"],
     generalises=("lag",),
     sentence="{at} passes a lead-lag with T1 = {T1} and T2 = {T2}",
+    asked="the two time constants of the lead-lag",
     excited_by="a step of the signal, recorded at several samples per time constant",
     example=FrozenMap({"T1": 0.003, "T2": 0.001}),
     states="x, one per insertion point",

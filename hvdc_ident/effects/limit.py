@@ -31,6 +31,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} cannot exceed {level} in magnitude",
+    asked="the limit",
     excited_by="a step large enough that the signal reaches the limit, held, then released",
     example=FrozenMap({"level": 0.45}),
     confusable=FrozenMap(

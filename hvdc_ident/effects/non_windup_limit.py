@@ -54,6 +54,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} is held between {low} and {high} without windup",
+    asked="the levels of the limit, and that it acts without windup",
     excited_by="a step large enough that the state reaches the limit, held, then reversed: the state leaves the limit at once",
     example=FrozenMap({"low": -0.45, "high": 0.45}),
     insertion_kinds=("state",),

@@ -31,6 +31,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} is off by {c}",
+    asked="the offset",
     excited_by="a level held long enough, with a record that the loop does not regulate",
     example=FrozenMap({"c": 0.01}),
     confusable=FrozenMap(

@@ -98,6 +98,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     holds=True,
     sentence="{at} is rounded to multiples of {step}",
+    asked="the resolution of the measurement",
     excited_by="slow ramps both ways over several levels",
     example=FrozenMap({"step": 0.03}),
     confusable=FrozenMap(

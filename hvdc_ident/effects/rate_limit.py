@@ -35,6 +35,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} cannot change faster than {rate}",
+    asked="the limit of the rate of change",
     excited_by="steps of two sizes of the signal, so that two slopes would be asked for",
     example=FrozenMap({"rate": 1.0}),
     states="y, one per insertion point",

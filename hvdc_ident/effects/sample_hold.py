@@ -36,6 +36,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     equivalent_delay=lambda p: p["Ts"] / 2 + p["compute"],
     sentence="{at} is sampled every {Ts}[ and published {compute} later]",
+    asked="the sampling time",
     excited_by="a step or ramp of the signal, recorded several times per sampling period",
     example=FrozenMap({"Ts": 0.0013, "compute": 0.0003}),
     states="one held value per insertion point",

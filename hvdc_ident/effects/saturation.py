@@ -33,6 +33,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} saturates softly towards {level}",
+    asked="the level of saturation",
     excited_by="steps to several levels of both signs",
     example=FrozenMap({"level": 0.8}),
     confusable=FrozenMap(

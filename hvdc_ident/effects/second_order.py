@@ -37,6 +37,7 @@ EFFECT = Effect(
     equivalent_delay=lambda p: 2 * p["zeta"] / p["wn"],
     generalises=("lag",),
     sentence="{at} of the plant follows that of the model as a second-order system of {wn} and damping {zeta}, {equivalent_delay} late",
+    asked="the natural frequency and damping of the filter or transducer",
     excited_by="a step of the signal, recorded at several samples per 1/wn",
     example=FrozenMap({"wn": 400.0, "zeta": 0.5}),
     states="y and its rate v = y'/wn, one pair per insertion point",

@@ -44,6 +44,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     generalises=("lag", "rate-limit"),
     sentence="{at} follows through a servo with a lag of {T}, which rises by {up} at most and falls by {down}",
+    asked="the time constant and the rate limits of the servo",
     excited_by="steps of two sizes in both directions: the small one shows the lag, the large one the rates",
     example=FrozenMap({"T": 0.02, "up": 0.6, "down": 0.4}),
     states="y, one per insertion point",

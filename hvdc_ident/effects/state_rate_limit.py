@@ -50,6 +50,7 @@ EFFECT = Effect(
     ),
     rewrite=rewrite,
     sentence="{at} cannot rise faster than {up} nor fall faster than {down}",
+    asked="the limits of the rate of change, upwards and downwards",
     excited_by="steps of two sizes in both directions, so that the state would be asked for several slopes",
     example=FrozenMap({"up": 0.4, "down": 0.2}),
     insertion_kinds=("state",),

@@ -27,6 +27,7 @@ EFFECT = Effect(
     rewrite=rewrite,
     equivalent_delay=lambda p: p["T"] / 2,
     sentence="{at} is the mean over the last {T}",
+    asked="the length of the averaging window",
     excited_by="a step of the signal, recorded at several samples per window",
     example=FrozenMap({"T": 0.01}),
     states="y, one per insertion point, and the signal's history over T",

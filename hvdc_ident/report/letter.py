@@ -11,6 +11,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from hvdc_ident.effects import effects
 from hvdc_ident.errors import InputError
 from hvdc_ident.files import write_text
 from hvdc_ident.fit.uncertainty import MOVED
@@ -43,28 +44,6 @@ RIVALS = 3
 """Effects and places that are told beside the one in the model."""
 MOST_OFF = 4
 """Values that differ from the given ones which are told one by one."""
-ASKED = {
-    "backlash": "the play of the mechanism",
-    "deadband": "the width of the dead band",
-    "deadband-step": "the width of the dead band, and whether its output jumps at the edge",
-    "delay": "the dead time of sampling, computation and communication",
-    "gain": "the scaling",
-    "inner-loop": "the bandwidth and damping of the inner control loop",
-    "lag": "the time constant of the filter or transducer",
-    "lead-lag": "the two time constants of the lead-lag",
-    "limit": "the limit",
-    "non-windup-limit": "the levels of the limit, and that it acts without windup",
-    "offset": "the offset",
-    "quantisation": "the resolution of the measurement",
-    "rate-limit": "the limit of the rate of change",
-    "sample-hold": "the sampling time",
-    "saturation": "the level of saturation",
-    "servo": "the time constant and the rate limits of the servo",
-    "state-rate-limit": "the limits of the rate of change, upwards and downwards",
-    "second-order": "the natural frequency and damping of the filter or transducer",
-    "window-mean": "the length of the averaging window",
-}
-"""What a model's owner knows of an effect; of one that is not listed its name is asked for."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +210,9 @@ def _asked_of(f: FindingSummary) -> str:
     places = list(place_texts(f, listed))
     shown = places[: RIVALS if len(places) <= RIVALS else 2]
     where = " or ".join(shown) + (f" or one of {len(places) - 2} more places" if len(places) > len(shown) else "")
-    what = f"{ASKED.get(f.effect, f'the {f.effect}')} at {where}"
+    effect = effects().get(f.effect)
+    known = effect.asked if effect is not None else ""
+    what = f"{known or f'the {f.effect}'} at {where}"
     depends = any(p.values for p in f.places)
     return what if depends or not f.sizes else f"{what}, which the model leaves out (here {sizes_text(f.sizes)})"
 
