@@ -6,6 +6,8 @@ import tomllib
 from functools import cache
 from pathlib import Path
 
+from hvdc_ident.study.stages import stages
+
 
 @cache
 def keys() -> dict[str, dict[str, str]]:
@@ -13,17 +15,11 @@ def keys() -> dict[str, dict[str, str]]:
     return tomllib.loads(Path(__file__).with_name("results.toml").read_text("utf-8"))
 
 
-TITLES = {
-    "simulation": "`simulate`: the model at its given values",
-    "sweep": "`sweep`: errors over values of a parameter",
-    "screening": "`screen`: which parameters matter",
-    "linearization": "`linearize`: the linear model",
-    "identifiability": "`identify`: what the recordings determine",
-    "fit": "`fit`: the estimates",
-    "discrepancy": "`diagnose`: what the model lacks",
+OTHERS = {
     "run": "`run`: which stages ran",
     "summary": "`run` and every stage: what the results say, decided once; report, letter, screens and workbench show it",
 }
+"""Files beside those of the stages, with what writes them."""
 
 
 def page() -> str:
@@ -40,7 +36,8 @@ def page() -> str:
         *_table(keys()["heading"]),
         *_inner("heading"),
     ]
-    for file, title in TITLES.items():
+    titles = {s.file.removesuffix(".json"): f"`{s.name}`: {s.summary.removesuffix('.')}" for s in stages()} | OTHERS
+    for file, title in titles.items():
         lines += [f"## {file}.json {{: #{file} }}", "", f"{title}.", "", *_table(keys()[file]), *_inner(file)]
     return "\n".join(lines)
 
