@@ -449,7 +449,10 @@ def test_an_interrupt_is_130(study: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_every_stage_is_a_command_and_says_what_it_does() -> None:
     text = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "200"}).stdout
     for stage in stages():
-        assert f"  {stage.name}" in text and stage.summary.rstrip(".") in text
+        assert f"  {stage.name}" in text
+        assert stage.summary.rstrip(".") in text, (
+            f"the summary of {stage.name} is cut off in --help: say it in one line"
+        )
 
 
 def test_the_installed_command_answers(tmp_path: Path) -> None:

@@ -600,7 +600,7 @@ class FitTable(TomlTable):
     mode: Literal["simultaneous", "individual"] = optional("All parameters together, or one group after another.",
         'mode = "individual"', default="simultaneous")
     groups: list[GroupTable] = optional('The groups of mode "individual": one controller each.', "[[fit.groups]]", default=[])
-    optimiser: Name = optional("trust-region, least-squares or l-bfgs-b.", 'optimiser = "least-squares"', default="trust-region",
+    optimiser: Name = optional("Name of the method by which each search goes down.", 'optimiser = "least-squares"', default="trust-region",
         of="optimiser")
     loss: Name = optional("Weight of large residuals: linear (least squares), or a robust loss such as huber.",
         'loss = "huber"', default="linear", of="loss")

@@ -15,7 +15,7 @@ CATALOGUE = catalogue()
 
 
 def test_the_files_of_the_catalogue_say_what_they_are():
-    assert set(CATALOGUE) == {"trust-region", "least-squares", "l-bfgs-b"}
+    assert set(CATALOGUE) >= {"trust-region", "least-squares", "l-bfgs-b"}
     assert all(m.SUMMARY and "\n" not in m.SUMMARY and m.__doc__ for m in CATALOGUE.values())
     with pytest.raises(UnknownNameError, match="did you mean 'least-squares'"):
         optimiser("least-squarse")

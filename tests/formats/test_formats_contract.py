@@ -25,6 +25,9 @@ def module(request: pytest.FixtureRequest) -> Format:
 @pytest.fixture
 def sample(module: Format, tmp_path: Path) -> Path:
     path = tmp_path / f"sample{module.SUFFIXES[0]}"
+    assert module.NAME in SAMPLES, (
+        f"no sample of format {module.NAME}: tests/formats/samples.py needs a function that writes one"
+    )
     SAMPLES[module.NAME](path)
     return path
 

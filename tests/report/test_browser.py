@@ -137,7 +137,8 @@ def _too_faint(page: Any) -> list[dict[str, Any]]:
 
 def test_every_part_and_every_figure_is_there(page: Any) -> None:
     titles = [s.title for s in sections() if s.title not in ELSEWHERE]
-    assert page.eval_on_selector_all("details.section > summary h2", "all => all.map((h) => h.textContent)") == titles
+    shown = page.eval_on_selector_all("details.section > summary h2", "all => all.map((h) => h.textContent)")
+    assert shown == titles, "what this study does not ask for belongs in ELSEWHERE"
     assert page.eval_on_selector_all("nav a", "all => all.map((a) => a.textContent)") == titles
     unfold(page)
     sizes = page.eval_on_selector_all(
