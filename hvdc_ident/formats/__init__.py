@@ -74,7 +74,7 @@ class Format(Protocol):
 
     # A module that can list name and unit of every signal without reading the waveforms has `signals(path)`; one that can
     # also write its format `write(trajectory, path) -> None`, for `convert`; one whose recordings stand in several files
-    # `files(path) -> list[Path]`, all of them that are there.
+    # `files(path) -> list[Path]`, all of them that are there; one that takes what others may know better, as any text, `LAST = True`.
 
 
 @cache
@@ -363,8 +363,12 @@ def _usable_file(path: str | os.PathLike[str]) -> Path:
 SPREADSHEETS = (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods", ".numbers")
 
 
+def _comes_last(module: Format) -> bool:
+    return getattr(module, "LAST", False)
+
+
 def _format_of(path: Path) -> Format:
-    known = formats().values()
+    known = sorted(formats().values(), key=_comes_last)
     with open(path, "rb") as file:
         top = file.read(TOP)
     for module in known:
@@ -382,7 +386,7 @@ def _format_of(path: Path) -> Format:
             got=f"'{path.suffix}'",
             hint="save the sheet as CSV (UTF-8), without other tables and notes beside the columns",
         )
-    listed = "; ".join(f"{m.NAME} ({', '.join(m.SUFFIXES)}): {m.SUMMARY}" for m in known)
+    listed = "; ".join(f"{m.NAME} ({', '.join(m.SUFFIXES)}): {m.SUMMARY}" for m in formats().values())
     raise WaveformError(
         "the file is of no known waveform format",
         where=str(path),

@@ -34,6 +34,7 @@ SUMMARY = (
     "text columns under their names, and perhaps units, time in s, ms or as dates; comma, semicolon, tab or blanks"
 )
 SUFFIXES = (".csv", ".tsv", ".txt", ".ssv", ".asc")
+LAST = True
 
 _MAX_COLUMNS = 100_000
 _MAX_LINE = 32 * 1024**2  # characters

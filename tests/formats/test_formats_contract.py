@@ -5,11 +5,14 @@ from __future__ import annotations
 import re
 import tomllib
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hvdc_ident.data import Trajectory
 from hvdc_ident.errors import UnknownNameError, WaveformError
 from hvdc_ident.formats import Format, convert, formats, list_signals, read_waveforms
 from tests.formats.samples import SAMPLES
@@ -61,7 +64,25 @@ def test_describes_itself(module: Format) -> None:
 
 def test_only_this_format_recognises_its_sample(module: Format, sample: Path) -> None:
     top = sample.read_bytes()
-    assert [name for name, other in FORMATS if other.recognises(sample, top)] == [module.NAME]
+    others = [(name, other) for name, other in FORMATS if other is module or not getattr(other, "LAST", False)]
+    assert [name for name, other in others if other.recognises(sample, top)] == [module.NAME]
+
+
+def test_the_reader_of_any_text_is_asked_last(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
+        return Trajectory(np.array([0.0, 1.0]), np.array([[2.0], [3.0]]), ("own",))
+
+    def recognises(path: Path, top: bytes) -> bool:
+        return top.startswith(b"Recorder:")
+
+    other = SimpleNamespace(
+        NAME="other", SUMMARY="text of a recorder", SUFFIXES=(".txt",), recognises=recognises, read=read
+    )
+    catalogue = (("csv", formats()["csv"]), ("other", other))
+    monkeypatch.setattr("hvdc_ident.formats._catalogue", lambda: catalogue)
+    for text, names in (("Recorder: R1\nt,y\n0,1\n1,2\n", ("own",)), ("t,y\n0,1\n1,2\n", ("y",))):
+        (tmp_path / "r.txt").write_text(text)
+        assert read_waveforms(tmp_path / "r.txt").names == names
 
 
 def test_reads_its_sample(module: Format, sample: Path) -> None:
