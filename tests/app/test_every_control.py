@@ -58,9 +58,9 @@ LISTED = """(controls) => {
 }"""
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def study(finished: tuple[hi.Study, StudyRun], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the small study with its results, and other results beside them to compare with."""
+    """A copy of the small study with its results, and other results beside them to compare with; what one test does to it no other sees."""
     folder = tmp_path_factory.mktemp("controls") / "study"
     shutil.copytree(finished[0].path.parent, folder)
     shutil.copytree(folder / "study-results", folder / "other-results")
