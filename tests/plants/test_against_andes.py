@@ -19,8 +19,6 @@ import hvdc_ident as hi
 from hvdc_ident.model import Model, parse_card
 from hvdc_ident.plants import parts_of, unit_card
 
-pytestmark = pytest.mark.nightly
-
 HERE = Path(__file__).parent
 CASES = tomllib.loads((HERE / "cases.toml").read_text(encoding="utf-8"))
 RECORDED = json.loads((HERE / "andes.json").read_text(encoding="utf-8"))

@@ -10,8 +10,6 @@ import hvdc_ident as hi
 from hvdc_ident.model import Model, parse_card, shelf_model
 from hvdc_ident.plants import UnitPart, parts_of, unit_card
 
-pytestmark = pytest.mark.nightly
-
 TIMES = np.round(np.arange(0.0, 5.01, 0.1), 6)
 
 
