@@ -166,6 +166,10 @@ class Experiment(SignalTable, Shown):
         std = noise_before(self.time, values, event).std
         return std if std > noise_floor(values) else None
 
+    def __len__(self) -> int:
+        """Return the number of rows; the table is not made for it."""
+        return int(self.time.size)
+
     def table(self) -> Trajectory:
         """Return inputs and recorded outputs over time, as one table."""
         columns = {n: s(self.time) for n, s in self.inputs.items()}

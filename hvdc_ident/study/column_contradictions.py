@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Contradiction, Experiment, InputSignal, Trajectory, before_event, conversion
-from hvdc_ident.data.quantities import read_columns
+from hvdc_ident.data.quantities import Reading, read_columns
 from hvdc_ident.data.turning import Agreement, agreement, scatter
 from hvdc_ident.formats import read_waveforms
 from hvdc_ident.model.card import toml_table
@@ -221,8 +221,8 @@ class _Case:
         if "theta" not in e.inputs or not set(outputs) <= set(e.outputs):
             return
         column, data = self._column("theta"), self._file
-        readings = dict(zip(data.names, read_columns(data.names, data.units), strict=True))
-        currents = [n for n, r in readings.items() if r.measured == "current angle"]
+        readings = self._readings
+        currents = self._columns_of("current angle")
         if column not in data or len(currents) != 1:
             return
         (current,) = currents
@@ -336,6 +336,16 @@ class _Case:
         """The recording as its file has it."""
         return read_waveforms(self.study.path.parent / self.table.data)
 
+    @cached_property
+    def _readings(self) -> dict[str, Reading]:
+        """The readings of the file's columns, by name."""
+        names = self._file.names
+        return dict(zip(names, read_columns(names, self._file.units), strict=True))
+
+    def _columns_of(self, quantity: str) -> list[str]:
+        """Return the columns of the file whose names say a quantity."""
+        return [n for n, r in self._readings.items() if r.measured == quantity]
+
     @property
     def _when(self) -> str:
         return "before the event" if self.experiment.event is not None else "in the first row"
@@ -359,8 +369,8 @@ class _Case:
         data = self._file
         if column not in data or self.table.phases or self.table.phasors:
             return None
-        readings = dict(zip(data.names, read_columns(data.names, data.units), strict=True))
-        others = [n for n, r in readings.items() if r.measured == "frequency"]
+        readings = self._readings
+        others = self._columns_of("frequency")
         if len(others) != 1:
             return None
         (other,) = others
@@ -384,8 +394,8 @@ class _Case:
             return None
         data = self._file
         column = self._column("V")
-        readings = dict(zip(data.names, read_columns(data.names, data.units), strict=True))
-        currents = [n for n, r in readings.items() if r.measured == "current"]
+        readings = self._readings
+        currents = self._columns_of("current")
         if column not in data or len(currents) != 1 or data.time.size != e.time.size:
             return None
         line = self.table.columns.get("V")

@@ -63,11 +63,14 @@ class Recordings:
     _read: dict[str, Trajectory] = field(default_factory=dict)
 
     def load(self, columns: Mapping[str, Mapping[str, Sequence[str]]]) -> None:
-        """Read the files. columns: by file, by experiment, the columns wanted."""
+        """Read the files, but for those whose columns are there. columns: by file, by experiment, the columns wanted."""
         for name, wanted in columns.items():
             path = self.folder / name
+            asked = tuple(dict.fromkeys(c for cs in wanted.values() for c in cs))
+            if name in self._read and self._read[name].names == asked:
+                continue
             try:
-                self._read[name] = read_waveforms(path, dict.fromkeys(c for cs in wanted.values() for c in cs))
+                self._read[name] = read_waveforms(path, asked)
             except InputError as e:
                 raise self._placed(e, path, wanted) from None
             for file in files_of(path):
@@ -274,24 +277,23 @@ def _experiment(
     experiment, notes = with_noise(experiment, stated, means)
     if table.trim:
         experiment = _trimmed(experiment, table, mapped)
-    if windows := _windows(experiment, table, [o for o in outputs if columns[o] in recorded]):
+    if windows := _windows(experiment, [o for o in outputs if columns[o] in recorded]):
         said = replace(measured, origin=replace(origin, notes=(*origin.notes, windows)))
         experiment = experiment.with_(measured=said)
     return experiment, notes
 
 
-def _windows(experiment: Experiment, table: schema.ExperimentTable, outputs: Sequence[str]) -> str:
+def _windows(experiment: Experiment, outputs: Sequence[str]) -> str:
     """Return the sentence on outputs whose noise shows that they are means over a window which the study does not state; "" for none."""
     assert experiment.measured is not None
     time, lengths = experiment.time, {}
-    for o in (o for o in outputs if o not in table.instrument):
+    for o in (o for o in outputs if o not in experiment.instrument):
         if (rows := window_rows(time, experiment.measured[o], experiment.event)) is not None:
             lengths[o] = float(f"{rows * float(np.median(np.diff(time))):.4g}")
     if not lengths:
         return ""
     seen = ", ".join(f"{o} over {length:g} s" for o, length in lengths.items())
-    stated: dict[str, object] = {o: i.model_dump(by_alias=True, exclude_none=True) for o, i in table.instrument.items()}
-    stated |= {o: {"window-mean": length} for o, length in lengths.items()}
+    stated = {**experiment.instrument, **{o: {"window-mean": length} for o, length in lengths.items()}}
     return f"the noise before the event is that of means, {seen}; to take them of the model too write: instrument = {toml_table(stated)}"
 
 
