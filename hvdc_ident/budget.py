@@ -28,7 +28,7 @@ TO_CONCLUDE = 0.15
 
 @dataclass(frozen=True)
 class Known:
-    """What a part of some work had come to when its budget ended it.
+    """Part of some work as it stood when its budget ended it.
 
     done: what has ended, in lines. not_tried: what of the part has not been begun or not ended, in words; later: of what follows it.
     """

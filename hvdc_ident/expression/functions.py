@@ -70,7 +70,7 @@ class _Extremum:
 
     def __eq__(self, other: object) -> bool:
         """Return True for the same arguments, in an application of sympy's class too."""
-        return own(type(other)) is type(self) and self.args == other.args  # type: ignore[attr-defined]
+        return own(type(other)) is type(self) and self.args == other.args  # type: ignore[attr-defined]  # sympy has no types, so that args is unknown to mypy
 
     def __hash__(self) -> int:
         return super().__hash__()  # of the class's name and the arguments: that of sympy's

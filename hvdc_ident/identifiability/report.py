@@ -41,7 +41,7 @@ class Held:
 
 @dataclass(frozen=True)
 class Unsettled:
-    """What is known of a candidate on which there is no verdict, for the work was ended.
+    """A candidate without a verdict, for the work was ended, with what is known of it.
 
     value: at the lowest cost so far, None where no start has ended. profile_ends: the ends of its profile that were found, None where no
     part of it was walked. text: what was tried and what was not, in sentences.
