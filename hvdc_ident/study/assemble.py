@@ -57,9 +57,9 @@ def subject_of(source: ModelLike) -> AnyModel | Study:
         return load_model(source)
     if is_study(source):
         return source
-    for found in (source, getattr(source, "model", None)):
-        if is_white_box(found) or (hasattr(found, "with_effects") and hasattr(found, "simulate")):
-            return cast("AnyModel", found)
+    for subject in (source, getattr(source, "model", None)):
+        if is_white_box(subject) or (hasattr(subject, "with_effects") and hasattr(subject, "simulate")):
+            return cast("AnyModel", subject)
     raise InputError(
         "no model",
         expected="a Model, a Study, the name of a shipped model, or the path of a model card, an FMU or a study",
@@ -69,20 +69,20 @@ def subject_of(source: ModelLike) -> AnyModel | Study:
 
 def model_of(source: ModelLike) -> AnyModel:
     """Return the model that is meant, of a study its own. Raises InputError for what is no model."""
-    found = subject_of(source)
-    return found.model if is_study(found) else cast("AnyModel", found)
+    subject = subject_of(source)
+    return subject.model if is_study(subject) else cast("AnyModel", subject)
 
 
 def names_of(names: str | Iterable[str] | None, kind: str) -> tuple[str, ...] | None:
     """Return the names as a tuple; one alone may be a text. None stays None. Raises InputError for what is no name."""
     if names is None:
         return None
-    found = (names,) if isinstance(names, str) else tuple(names)
-    for name in found:
+    wanted = (names,) if isinstance(names, str) else tuple(names)
+    for name in wanted:
         if not isinstance(name, str):
             article = "an" if kind[0] in "aeiou" else "a"
             raise InputError(f"no name of {article} {kind}", expected="a text, or a list of texts", got=repr(name))
-    return found
+    return wanted
 
 
 def values_of(
@@ -94,15 +94,15 @@ def values_of(
         raise InputError(f"{kind} values are given by name", expected="{name: number}", got=repr(values)[:60])
     known: Collection[str] = model.inputs if kind == "input" else model.parameters
     others: Collection[str] = () if kind == "input" else model.inputs
-    found = {}
+    by_name = {}
     for name, value in table.items():
         if name not in known and name not in others:
             both = kind if kind == "input" else "parameter or input"
             raise unknown_name(both, name, [*known, *others], where=f"model '{model.name}'")
         if not isinstance(value, int | float | np.number):
             raise InputError(f"the value of '{name}' is no number", where=f"model '{model.name}'", got=repr(value)[:60])
-        found[name] = float(value)
-    return found
+        by_name[name] = float(value)
+    return by_name
 
 
 def experiments_of(data: DataLike, model: AnyModel) -> tuple[Experiment, ...]:
@@ -127,15 +127,15 @@ def experiments_of(data: DataLike, model: AnyModel) -> tuple[Experiment, ...]:
         data = [_from_table(data, model, "experiment")]
     elif not isinstance(data, Iterable) or isinstance(data, np.ndarray | Mapping | SignalTable):
         raise _no_data(data)
-    found = []
+    experiments = []
     for item in data:
         if isinstance(item, Experiment):
-            found.append(item)
+            experiments.append(item)
         elif isinstance(item, str | Path | Trajectory) or _is_frame(item):
-            found.extend(experiments_of(item, model))
+            experiments.extend(experiments_of(item, model))
         else:
             raise _no_data(item)
-    return tuple(_fitting(e, model) for e in _numbered(found))
+    return tuple(_fitting(e, model) for e in _numbered(experiments))
 
 
 def _no_data(data: object) -> InputError:
@@ -293,9 +293,9 @@ def study_of(
     from hvdc_ident.study.schema import TABLES, ModelTable, StudyFile
     from hvdc_ident.study.study import Study, candidates_of, load_study, with_nuisances, with_unknowns
 
-    found = subject_of(subject)
-    source = found if isinstance(found, Study) else None
-    model = source.model if source else cast("AnyModel", found)
+    meant = subject_of(subject)
+    source = meant if isinstance(meant, Study) else None
+    model = source.model if source else cast("AnyModel", meant)
     if isinstance(data, str | Path) and Path(data).suffix.lower() == ".toml":
         data = load_study(data)
     if source is None and isinstance(data, Study):

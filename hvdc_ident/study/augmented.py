@@ -47,7 +47,7 @@ def use_of(effect: FoundEffect | Rival) -> EffectUse:
     return EffectUse(effect.effect, effect.at, FrozenMap(sizes), source=effect.source, expression=expression)
 
 
-def compared(study: Study, found: Diagnosis) -> tuple[dict[str, Any], dict[str, str]]:
+def compared(study: Study, diagnosis: Diagnosis) -> tuple[dict[str, Any], dict[str, str]]:
     """Return what discrepancy.json says of the augmented model beside the recordings, and a CSV file of its curves by name.
 
     The JSON holds `units` of the outputs, `judgement` and `rmse_after`, as fit.json does of the fit; where no effect was put in, no
@@ -55,9 +55,9 @@ def compared(study: Study, found: Diagnosis) -> tuple[dict[str, Any], dict[str, 
     """
     sets = {"given": fitting.curves_at_given(study)}
     units = {o: study.model.outputs[o].unit for e in study.experiments for o in e.outputs}
-    if found.augmented is None:
+    if diagnosis.augmented is None:
         return {"units": units, "judgement": fitting.judgement_of(study, sets)}, {}
-    curves = _curves(study, found)
+    curves = _curves(study, diagnosis)
     files = {
         f"discrepancy.{e.name}.csv": fitting.curves_csv(e, curves[e.name])
         for e in study.experiments
@@ -71,65 +71,65 @@ def compared(study: Study, found: Diagnosis) -> tuple[dict[str, Any], dict[str, 
     return {"units": units, "rmse_after": rmse, "judgement": judgement}, files
 
 
-def _curves(study: Study, found: Diagnosis) -> dict[str, dict[str, Curve]]:
+def _curves(study: Study, diagnosis: Diagnosis) -> dict[str, dict[str, Curve]]:
     """Return the curves of the augmented model by experiment and output.
 
     Experiments that it cannot be run on are left out, and so are those with unknowns of their own, whose values a diagnosis does not
     keep.
     """
-    assert found.augmented is not None
+    assert diagnosis.augmented is not None
     curves = {}
     for e in study.experiments:
         if e.nuisance or e.measured is None:
             continue
         try:
-            run = simulate(found.augmented, e, found.parameters_after).trajectory
+            run = simulate(diagnosis.augmented, e, diagnosis.parameters_after).trajectory
         except ComputationError:  # its error is missing in `gap` too
             continue
         curves[e.name] = fitting.curves_of_run(e, run)
     return curves
 
 
-def with_estimates(study: Study, found: Diagnosis, fitted: Sequence[str]) -> Diagnosis:
+def with_estimates(study: Study, diagnosis: Diagnosis, fitted: Sequence[str]) -> Diagnosis:
     """Return the diagnosis with the estimates of the augmented model's fitted parameters at its values, and tests of its residuals.
 
     fitted: the parameters that the diagnosis estimated. Their 95 % intervals are by the curvature of the cost there, widened for
     correlated residuals, and without intervals where what is left is more than noise, as those of a fit are; the parameters of the
     effects are unknowns too. Nothing is added where nothing was put in, and where an experiment has unknowns of its own.
     """
-    model = found.augmented
+    model = diagnosis.augmented
     if model is None or any(e.nuisance for e in study.experiments):
-        return found
+        return diagnosis
     added = [n for n in model.parameters if n not in study.model.parameters]
     unknowns = [FitParameter.of(n, model.parameters[n]) for n in (*fitted, *added)]
     free = tuple(u for u in unknowns if not u.on_bound(u.start))
     if not any(u.name in fitted for u in free):
-        return found
-    problem = Problem(ModelSimulator(model), study.experiments, free, weights=FrozenMap(_misfit(study, found)))
+        return diagnosis
+    problem = Problem(ModelSimulator(model), study.experiments, free, weights=FrozenMap(_misfit(study, diagnosis)))
     try:
         blocks = problem.blocks(problem.start)
     except ComputationError:
-        return found
+        return diagnosis
     sources = {o: source_text(problem.fitted_experiments, o, problem.weights.get(o)) for o in problem.outputs}
     spans = np.array([u.span for u in problem.unknowns])
     known = uncertainty(blocks, problem.names, spans, problem.noise_source, None, problem.noise_dof)
     known = known.widened(adequacy(problem, blocks, sources, known.effective, known.rho).widening)
-    estimates = estimates_of(problem, problem.start, blocks, known, known, systematic=found.beyond_noise)
+    estimates = estimates_of(problem, problem.start, blocks, known, known, systematic=diagnosis.beyond_noise)
     why = "it depends on which of the likely effects and places is the true one"
     placed = {
-        n: Estimate(math.nan, unit=estimates[n].unit, reason=why) for n in found.values_by_place if n in estimates
+        n: Estimate(math.nan, unit=estimates[n].unit, reason=why) for n in diagnosis.values_by_place if n in estimates
     }
     return replace(
-        found,
+        diagnosis,
         estimates_after=FrozenMap({n: placed.get(n) or estimates[n] for n in fitted if n in estimates}),
         residual_tests_after=residual_tests(blocks, problem.fitted_experiments),
     )
 
 
-def _misfit(study: Study, found: Diagnosis) -> dict[str, float]:
+def _misfit(study: Study, diagnosis: Diagnosis) -> dict[str, float]:
     """Return the standard deviation of the misfit of every output whose noise is not known, over the fitted recordings."""
     fitted = tuple(e for e in study.experiments if e.role == "fit" and e.outputs)
     outputs = [o for o in dict.fromkeys(o for e in fitted for o in e.outputs) if source_of(fitted, o) == MISFIT]
-    curves = _curves(study, found) if outputs else {}
+    curves = _curves(study, diagnosis) if outputs else {}
     misfits = {o: [line[o].misfit for e in fitted if o in (line := curves.get(e.name, {}))] for o in outputs}
     return {o: float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) for o, parts in misfits.items() if parts}

@@ -270,12 +270,12 @@ def steady_notes(study: Study, *, searches: bool = False) -> list[str]:
     for e in (e for e in study.experiments if not e.drive):
         begins[f"experiment {e.name}"] = e.values | {n: float(signal.values[0]) for n, signal in e.inputs.items()}
     at_given = {where: _notes(model, study.given, inputs) for where, inputs in begins.items()}
-    found = [f"{where}: {note}" for where, notes in at_given.items() for note in notes]
+    sentences = [f"{where}: {note}" for where, notes in at_given.items() for note in notes]
     if searches and study.start != study.given:
         for where, inputs in begins.items():
             notes = _notes(model, study.start, inputs)
-            found += [f"{where}, at the start values: {note}" for note in notes if note not in at_given[where]]
-    return found
+            sentences += [f"{where}, at the start values: {note}" for note in notes if note not in at_given[where]]
+    return sentences
 
 
 def _notes(model: Model, values: Mapping[str, float], inputs: Mapping[str, float]) -> tuple[str, ...]:

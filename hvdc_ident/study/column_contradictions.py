@@ -69,14 +69,14 @@ def column_contradictions(study: Study) -> tuple[Contradiction, ...]:
     about = terminals_of(study.model)
     if about is None:
         return ()
-    found: list[Contradiction] = []
+    contradictions: list[Contradiction] = []
     tables = {t.name: t for t in study.settings.experiment}
     for e in (e for e in study.experiments if e.name in tables and e.measured is not None):
         case = _Case(study, e, tables[e.name], about)
         by_level = [*case.voltage(), *case.frequency(), *case.turns_twice(), *case.power(), *case.current()]
         by_turn = [] if by_level else [*case.angles(), *case.turn()]
-        found += by_level or by_turn or [*case.movement()]
-    return tuple(found)
+        contradictions += by_level or by_turn or [*case.movement()]
+    return tuple(contradictions)
 
 
 @dataclass(frozen=True)
@@ -197,17 +197,17 @@ class _Case:
 
     def current(self) -> Iterator[Contradiction]:
         """Yield a power that is another one than the recorded voltage and current make."""
-        found = self._beside_current()
-        if found is None or found.holds:
+        power = self._beside_current()
+        if power is None or power.holds:
             return
-        what = f"P and Q are {found.words} before the event"
-        if found.level_holds:
-            what = f"P and Q move otherwise than {found.named}: these leave {100 * found.left:.3g} % of the square of the movement"
+        what = f"P and Q are {power.words} before the event"
+        if power.level_holds:
+            what = f"P and Q move otherwise than {power.named}: these leave {100 * power.left:.3g} % of the square of the movement"
             yield self._finding("current", ("P", "Q"), f"{what}; one of them is another plant's")
             return
         ways = [(3.0, "phase", "they are those of one phase")]
         ways += [(k, "unit", f"they are in {u}W and {u}var") for k, u in ((1e-3, "k"), (1e-6, ""), (1e3, "G"))]
-        near = [w for w in ways if found.times(w[0]).level_holds]
+        near = [w for w in ways if power.times(w[0]).level_holds]
         if len(near) == 1:
             ((k, kind, words),) = near
             powers = {o: Way(k) for o in LEVELS.values() if o in self.experiment.outputs}
@@ -245,19 +245,19 @@ class _Case:
         if "theta" not in self.experiment.inputs:
             return
         signal = self.experiment.inputs["theta"]
-        found = self._beside_frequency()
-        if found is not None and not found.holds:
+        agreed = self._beside_frequency()
+        if agreed is not None and not agreed.holds:
             factors = [
                 (-1.0, "its sign is the other one"),
                 (DEGREE, "it is in degrees"),
                 (-DEGREE, "it is in degrees, with the other sign"),
             ]
-            times = found.factor or 0.0
-            fits = [(k, words) for k, words in factors if replace(found, factor=k * times).turns_alike]
+            times = agreed.factor or 0.0
+            fits = [(k, words) for k, words in factors if replace(agreed, factor=k * times).turns_alike]
             words = f": {fits[0][1]}" if fits else ""
             write = self._columns({"theta": Way(fits[0][0])}) if fits else ""
             yield self._finding(
-                "turn", ("theta",), f"theta and the recorded frequency: {agreement_words(found)}{words}", write
+                "turn", ("theta",), f"theta and the recorded frequency: {agreement_words(agreed)}{words}", write
             )
             return
         rate, limit = fastest(signal.times, signal.values), FASTEST * self.about.frequency

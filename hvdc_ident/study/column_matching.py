@@ -140,14 +140,14 @@ class Matching:
 
 def columns_of(record: Trajectory, event: float | None, counted: Mapping[str, str] = FrozenMap()) -> tuple[Column, ...]:
     """Return the columns of a recording that hold numbers. event: s; without one the first row tells the level. counted: by name."""
-    found = []
+    columns = []
     readings = read_columns(record.names, record.units)
     for name, unit, reading in zip(record.names, record.units, readings, strict=True):
         values = record[name]
         if not np.isnan(values).all():
             level, noise, quiet = _rest(record.time, values, event)
-            found.append(Column(name, unit, level, noise, quiet, counted.get(name, ""), reading))
-    return tuple(found)
+            columns.append(Column(name, unit, level, noise, quiet, counted.get(name, ""), reading))
+    return tuple(columns)
 
 
 def targets_of(model: AnyModel, levels: Mapping[str, float]) -> tuple[Target, ...]:
@@ -162,26 +162,26 @@ def match_names(columns: Sequence[Column], targets: Sequence[Target], place: str
 
     Where the units need a base there is a match too: `usable` tells.
     """
-    found: dict[str, Match] = {}
+    matches: dict[str, Match] = {}
     by_name = {c.name: c for c in columns}
     for target in targets:
         if target.name in by_name:
-            found[target.name] = Match(target, by_name[target.name], "the same name")
-    taken = {m.column.name for m in found.values()}
-    for target in (t for t in targets if t.name not in found):
+            matches[target.name] = Match(target, by_name[target.name], "the same name")
+    taken = {m.column.name for m in matches.values()}
+    for target in (t for t in targets if t.name not in matches):
         alike = [c for c in columns if c.name not in taken and _bare(target.name) in (_bare(c.name), _bare(c.stem))]
-        others = [t for t in targets if t.name not in found and _bare(t.name) == _bare(target.name)]
+        others = [t for t in targets if t.name not in matches and _bare(t.name) == _bare(target.name)]
         if len(alike) == 1 and len(others) == 1:
-            found[target.name] = Match(target, alike[0], "the same name but for case and punctuation")
-    for target in (t for t in targets if t.name not in found and t.name not in LEVELS):
+            matches[target.name] = Match(target, alike[0], "the same name but for case and punctuation")
+    for target in (t for t in targets if t.name not in matches and t.name not in LEVELS):
         said = target.reading.measured if not target.reading.place else ""
-        taken = {m.column.name for m in found.values()}
+        taken = {m.column.name for m in matches.values()}
         alike = [c for c in columns if c.reading.measured == said and not c.counted]
         here = [c for c in alike if _bare(place) and _bare(place) in _bare(c.name)]
         alike = here if len(here) == 1 else alike
         if said in AT_TERMINALS and len(alike) == 1 and alike[0].name not in taken:
-            found[target.name] = Match(target, alike[0], f"its name says {_article(said)}")
-    return found
+            matches[target.name] = Match(target, alike[0], f"its name says {_article(said)}")
+    return matches
 
 
 def matching(
@@ -274,38 +274,40 @@ def _evidence(match: Match) -> Evidence | None:
 
 def _is_near(match: Match) -> bool:
     """Return whether both levels are known and those of one quantity: within the noise, or by less than a way of counting."""
-    found = _evidence(match)
-    if found is None or found.recorded is None:
+    evidence = _evidence(match)
+    if evidence is None or evidence.recorded is None:
         return False
-    same = abs(found.recorded - found.levels[0]) <= CERTAIN * found.error
-    return same or found.level_mismatch() < math.log(NEAR)
+    same = abs(evidence.recorded - evidence.levels[0]) <= CERTAIN * evidence.error
+    return same or evidence.level_mismatch() < math.log(NEAR)
 
 
 def _far(match: Match) -> float:
     """Return the difference of the levels over the larger one; infinite where one is not known."""
-    found = _evidence(match)
-    if found is None or found.recorded is None:
+    evidence = _evidence(match)
+    if evidence is None or evidence.recorded is None:
         return math.inf
-    size = max(abs(found.recorded), abs(found.levels[0]))
-    return abs(found.recorded - found.levels[0]) / size if size else 0.0
+    size = max(abs(evidence.recorded), abs(evidence.levels[0]))
+    return abs(evidence.recorded - evidence.levels[0]) / size if size else 0.0
 
 
 def _questioned(match: Match) -> Match:
     """Return a match with the conversion that its levels suggest where they are far apart."""
-    found = _evidence(match)
-    suggested = suggest_conversion([found], match.target.unit) if found is not None and not _is_near(match) else None
-    if found is None or suggested is None:
+    evidence = _evidence(match)
+    suggested = (
+        suggest_conversion([evidence], match.target.unit) if evidence is not None and not _is_near(match) else None
+    )
+    if evidence is None or suggested is None:
         return match
     return replace(match, reason=f"{match.reason}{_levels(match)}: {suggested.reason}")
 
 
 def _levels(match: Match) -> str:
     """The levels of column and model, in words; "" where one is not known, or the reason has them."""
-    found = _evidence(match)
-    if found is None or found.recorded is None or "; it reads " in match.reason:
+    evidence = _evidence(match)
+    if evidence is None or evidence.recorded is None or "; it reads " in match.reason:
         return ""
     unit = match.target.unit
-    return f"; it reads {quantity(found.recorded, unit)} {match.column.place}, the model is at {quantity(found.levels[0], unit)}"
+    return f"; it reads {quantity(evidence.recorded, unit)} {match.column.place}, the model is at {quantity(evidence.levels[0], unit)}"
 
 
 def _base_meant(match: Match, parameters: Mapping[str, Parameter]) -> tuple[float, str] | None:
@@ -316,9 +318,9 @@ def _base_meant(match: Match, parameters: Mapping[str, Parameter]) -> tuple[floa
         if scale is None or column.level is None or target.level is None:
             continue
         evidence = Evidence(scale * column.level, (target.level,), scale * column.noise)
-        found = suggest_conversion([evidence], target.unit, {name: p})
-        if found is not None and f"of the base {name} =" in found.conversion.name:
-            return float(f"{found.conversion.factor / scale:.6g}"), found.reason
+        suggestion = suggest_conversion([evidence], target.unit, {name: p})
+        if suggestion is not None and f"of the base {name} =" in suggestion.conversion.name:
+            return float(f"{suggestion.conversion.factor / scale:.6g}"), suggestion.reason
     return None
 
 

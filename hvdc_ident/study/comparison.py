@@ -217,11 +217,11 @@ class RunComparison(Coded, Shown):
     def finding_lines(self) -> list[str]:
         """What each diagnosis found missing, a line each; none where no diagnosis has run."""
         lines = []
-        for side, found in zip(SIDES, self.findings, strict=True):
-            if found is not None:
-                said = [f"{f.effect} ({probability_text(f.probability)}): {f.text}" for f in found]
+        for side, findings in zip(SIDES, self.findings, strict=True):
+            if findings is not None:
+                said = [f"{f.effect} ({probability_text(f.probability)}): {f.text}" for f in findings]
                 lines.append(f"missing, {side}: {' '.join(said) or 'nothing was found'}")
-        kinds = [sorted(f.effect for f in found) for found in self.findings if found is not None]
+        kinds = [sorted(f.effect for f in findings) for findings in self.findings if findings is not None]
         if len(kinds) == 2 and any(kinds):
             lines.append(f"missing: {'the same effects' if kinds[0] == kinds[1] else 'different effects'} in both")
         return lines
@@ -257,8 +257,8 @@ def compare_runs(first: str | Path, second: str | Path) -> RunComparison:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     study = load_study(write_starter(Path(folder) / "a"))
     ...     ran = run_all(study, study.folder, StageOptions())
-    ...     found = hi.compare_runs(study.path, study.folder)
-    >>> [v.apart for v in found.values]
+    ...     comparison = hi.compare_runs(study.path, study.folder)
+    >>> [v.apart for v in comparison.values]
     [0.0, 0.0]
     """
     folders = [folder_of(Path(p)) for p in (first, second)]
@@ -420,8 +420,8 @@ def _verdicts(results: Sequence[Results]) -> FrozenMap[tuple[str, str]]:
     """Return the verdict on the model, then of each stage in one phrase; empty where it has not run."""
     first, second = results
     a, b = (verdict_sentence(r.summary) if r.summary.sets else "" for r in results)
-    found = {"model": (a, b), **{s.name: (_verdict(s, first), _verdict(s, second)) for s in stages()}}
-    return FrozenMap({name: both for name, both in found.items() if any(both)})
+    verdicts = {"model": (a, b), **{s.name: (_verdict(s, first), _verdict(s, second)) for s in stages()}}
+    return FrozenMap({name: both for name, both in verdicts.items() if any(both)})
 
 
 def _verdict(stage: Stage, results: Results) -> str:

@@ -96,8 +96,8 @@ def conversions(unit: str, parameters: Mapping[str, Parameter] = FrozenMap()) ->
     for name, factor, shift in (*_of_unit(unit), *_of_bases(unit, parameters)):
         if abs(abs(factor) - 1.0) > 1e-9 or shift:
             distinct.setdefault((f"{factor:.6g}", shift), Conversion(name, factor, shift))
-    found = tuple(distinct.values())
-    return (*found, *(Conversion(f"{c.name}, with the other sign", -c.factor) for c in found if not c.shift))
+    same_sign = tuple(distinct.values())
+    return (*same_sign, *(Conversion(f"{c.name}, with the other sign", -c.factor) for c in same_sign if not c.shift))
 
 
 def _of_unit(unit: str) -> Iterator[tuple[str, float, float]]:
@@ -228,7 +228,7 @@ def suggest_conversion(
     table = conversions(unit, parameters)
     tried = [(SIGN, 1), *((c, len(table)) for c in table)]
     tried += [(c, 2) for e in evidence if (c := _free_factor(e)) is not None]
-    found: list[tuple[float, Suggestion]] = []
+    likely: list[tuple[float, Suggestion]] = []
     for c, tries in tried:
         gains = {e: gain for e in evidence if (gain := e.gain_of(c)) is not None and gain > math.log(2.0)}
         total = sum(gains.values()) - math.log(tries) - math.log(2.0) * len(gains)
@@ -236,10 +236,10 @@ def suggest_conversion(
             total -= max(math.log(e.level_mismatch() / e.level_mismatch(c)) for e in gains)
         if gains and total > math.log(POSITIVE):
             # A unit is suspected only where that is clearly more likely than a gain of the model.
-            found.append((total + math.log(POSITIVE) if c.gain else total, Suggestion(c, tuple(gains), total)))
+            likely.append((total + math.log(POSITIVE) if c.gain else total, Suggestion(c, tuple(gains), total)))
     # Of those that candidates let fit about as well, the one that is nearest at the given values.
-    most = max((weighed for weighed, _ in found), default=0.0) - math.log(POSITIVE)
-    return min((s for weighed, s in found if weighed >= most), key=lambda s: s.distance, default=None)
+    most = max((weighed for weighed, _ in likely), default=0.0) - math.log(POSITIVE)
+    return min((s for weighed, s in likely if weighed >= most), key=lambda s: s.distance, default=None)
 
 
 def _free_factor(e: Evidence) -> Conversion | None:

@@ -37,8 +37,8 @@ class DaskExecutor:
 
     def submit(self, function: Callable[..., Any], /, *arguments: Any) -> Future[Any]:
         """Return the future of the function's value in a worker."""
-        found: Future[Any] = self._executor.submit(function, *arguments)
-        return found
+        future: Future[Any] = self._executor.submit(function, *arguments)
+        return future
 
     def why(self, error: BaseException) -> tuple[str, bool]:
         """Return why a future has no value, and whether that is the worker's end."""

@@ -179,7 +179,7 @@ def _fmu(source: Study | Model, selected: ValueSet | None, path: Path, options: 
 
     experiments = source.experiments if isinstance(source, Study) else ()
     stop = max((t for e in experiments if (t := float(e.time[-1])) > 0.0), default=1.0)
-    found = export_fmu(
+    exported = export_fmu(
         _described(source, selected),
         path,
         version=options.version,
@@ -188,7 +188,7 @@ def _fmu(source: Study | Model, selected: ValueSet | None, path: Path, options: 
         stop=stop,
         experiments=experiments,
     )
-    return Written(found.path, f"FMI {found.version}, {' and '.join(found.kinds)}; {found.note}")
+    return Written(exported.path, f"FMI {exported.version}, {' and '.join(exported.kinds)}; {exported.note}")
 
 
 def _modelica(source: Study | Model, selected: ValueSet | None, path: Path, _: FmuOptions) -> Written:

@@ -204,9 +204,9 @@ def judgement_of(
     """
     by = Yardsticks.of(study)
     sizes = result.adequacy.signals if result is not None and result.adequacy is not None else {}
-    found = {name: by.judge(runs, sizes if name == "fitted" else None) for name, runs in sets.items()}
+    judged = {name: by.judge(runs, sizes if name == "fitted" else None) for name, runs in sets.items()}
     head = {k: getattr(by.profile, k) for k in ("name", "version", "title", "source", "notes", "unit")}
-    return Judgements(by.tolerances, {**head, "named": by.named}, found)
+    return Judgements(by.tolerances, {**head, "named": by.named}, judged)
 
 
 @dataclass(frozen=True)
@@ -249,22 +249,22 @@ class Yardsticks:
 
 def curves_at_given(study: Study) -> dict[str, dict[str, Curve]]:
     """Return every recorded output beside a run at the given values, by experiment and output; experiments without a run are left out."""
-    found = {}
+    curves = {}
     for e in study.experiments:
         try:
-            found[e.name] = curves_of_run(e, simulate(study.model, e, study.given).trajectory)
+            curves[e.name] = curves_of_run(e, simulate(study.model, e, study.given).trajectory)
         except (ComputationError, SteadyStateError):  # the stage `simulate` says why
             continue
-    return found
+    return curves
 
 
-def curves_csv(experiment: Experiment, found: Mapping[str, Curve]) -> str:
+def curves_csv(experiment: Experiment, curves: Mapping[str, Curve]) -> str:
     """CSV text: time, then for each measured output OUTPUT, OUTPUT.measured and the ends of the 95 % band of a sample.
 
     The columns OUTPUT.low and OUTPUT.high are left out where no estimate has a standard deviation.
     """
     columns = {"time": experiment.time}
-    for output, c in found.items():
+    for output, c in curves.items():
         columns |= {output: c.model, f"{output}.measured": c.measured}
         if c.band is not None:
             columns |= {f"{output}.low": c.model - c.band, f"{output}.high": c.model + c.band}

@@ -25,19 +25,19 @@ def hindrances(study: Study, values: InitialValues, contradictions: Sequence[Con
     values, and all at the start values where these differ and a search begins there. contradictions: in the recordings; those that are
     mended already hinder nothing, and of an experiment with one that is not, nothing else is told.
     """
-    found = [c.text for c in contradictions if not c.done]
-    found += [*values.failures, *values.mistakes, *_bounds(study), *_nothing_recorded(study)]
-    found += _runs(study, at_start=False)
+    sentences = [c.text for c in contradictions if not c.done]
+    sentences += [*values.failures, *values.mistakes, *_bounds(study), *_nothing_recorded(study)]
+    sentences += _runs(study, at_start=False)
     searches = any(s.searches and s.wanted(study) for s in stages())
     if searches and study.start != study.given:
-        found += _runs(study, at_start=True)
+        sentences += _runs(study, at_start=True)
     for begins, asked in ((searches, need_start), (study.settings.linearize is not None, operating_point)):
-        if begins and not found:
+        if begins and not sentences:
             try:
                 asked(study)
             except HvdcIdentError as error:
-                found.append(str(error))
-    return list(dict.fromkeys(found))
+                sentences.append(str(error))
+    return list(dict.fromkeys(sentences))
 
 
 def _nothing_recorded(study: Study) -> list[str]:

@@ -282,8 +282,12 @@ def _judged(
     likely: dict[Evidence, tuple[Conversion, float]] = {}
     for output, group in _by("output", ranged).items():
         rest = [c.evidence for c in group]
-        while rest and (found := suggest_conversion(rest, model.outputs[output].unit, model.parameters)) is not None:
-            likely |= dict.fromkeys(found.explained, (found.conversion, found.gain / len(found.explained)))
+        while (
+            rest and (suggestion := suggest_conversion(rest, model.outputs[output].unit, model.parameters)) is not None
+        ):
+            likely |= dict.fromkeys(
+                suggestion.explained, (suggestion.conversion, suggestion.gain / len(suggestion.explained))
+            )
             rest = [e for e in rest if e not in likely]
     for name, group in _by("experiment", ranged).items():
         own = {c: likely[c.evidence][1] for c in group if c.evidence in likely}
@@ -402,17 +406,17 @@ def _exchanged(
     own: gain of what each suggests by itself. Both outputs have to differ, and each has to gain by the exchange.
     """
     off = [c for c in comparisons if c.differs(quantile) or c.moves_otherwise(quantile)]
-    found: dict[Comparison, Cause] = {}
+    causes: dict[Comparison, Cause] = {}
     for a, b in combinations(off, 2):
         gains = a.gain_by(b.simulated), b.gain_by(a.simulated)
-        if gains[0] is None or gains[1] is None or a in found or b in found:
+        if gains[0] is None or gains[1] is None or a in causes or b in causes:
             continue
         total = gains[0] + gains[1] - math.log(STRONG * math.comb(len(comparisons), 2))
         if total > max(math.log(POSITIVE), own.get(a, 0.0) + own.get(b, 0.0)):
             one, other = a.record.output, b.record.output
             text = f"{one} follows the model's {other} and {other} its {one}: are the columns of {one} and {other} exchanged?"
-            found |= dict.fromkeys((a, b), Cause(f"{one}, {other}", "columns exchanged", text, total))
-    return found
+            causes |= dict.fromkeys((a, b), Cause(f"{one}, {other}", "columns exchanged", text, total))
+    return causes
 
 
 def _input_mistakes(model: AnyModel, e: Experiment) -> Iterator[Undone]:
@@ -476,12 +480,12 @@ def _other_set_points(simulator: ModelSimulator, e: Experiment, comparisons: Seq
     for name in free:
         value = e.values.get(name, inputs[name].value)
         try:
-            found = least_squares(
+            solution = least_squares(
                 lambda at, name=name: (recorded - [c.model for c in run_at(name, float(at[0]))]) / error,
                 value, x_scale=abs(value) or 1.0, diff_step=FINEST, max_nfev=NEWTON,
             )  # fmt: skip
-            uncertain = max(1.0 / (float(np.linalg.norm(found.jac)) or 1e-300), FINEST * abs(value))
-            shown = round(float(found.x[0]), -math.floor(math.log10(uncertain)))
+            uncertain = max(1.0 / (float(np.linalg.norm(solution.jac)) or 1e-300), FINEST * abs(value))
+            shown = round(float(solution.x[0]), -math.floor(math.log10(uncertain)))
             after = run_at(name, shown)
         except (ComputationError, ValueError):
             continue
@@ -504,11 +508,11 @@ def _other_set_points(simulator: ModelSimulator, e: Experiment, comparisons: Seq
 
 def _input_after_failure(simulator: ModelSimulator, e: Experiment) -> list[str]:
     """Return a line for the input whose level, as recorded, leaves the model without a run, where undoing a unit gives one."""
-    found = []
+    likely = []
     for undone, odds, cause in _input_mistakes(simulator.model, e):
         if odds > 0.0 and not isinstance(outputs_of(simulator, undone), str):
-            found.append((odds, f"{e.name}: {cause.text}"))
-    return [max(found)[1]] if found else []
+            likely.append((odds, f"{e.name}: {cause.text}"))
+    return [max(likely)[1]] if likely else []
 
 
 def _time_mistakes(model: AnyModel, e: Experiment) -> list[Undone]:
@@ -594,7 +598,7 @@ def _with_candidate_runs(
     simulator: ModelSimulator, e: Experiment, candidates: Sequence[FitParameter], comparisons: Sequence[Comparison]
 ) -> list[Comparison]:
     """Return the comparisons with the runs at the ends of every candidate's range, and at the corners that move a level most."""
-    found, local = list(comparisons), f"{e.name}:"
+    with_runs, local = list(comparisons), f"{e.name}:"
     free = (*candidates, *unknowns(simulator, e))
     ends: dict[tuple[str, str, float], float] = {}  # level by output, candidate and value
 
@@ -603,13 +607,15 @@ def _with_candidate_runs(
         nuisance = {n.removeprefix(local): v for n, v in values.items() if n.startswith(local)}
         run = outputs_of(simulator, e, parameters, nuisance)
         if not isinstance(run, str):
-            found[:] = [c.with_run(run[c.record.output]) for c in found]
+            with_runs[:] = [c.with_run(run[c.record.output]) for c in with_runs]
         return not isinstance(run, str)
 
     for f in free:
         for value in (f.draw(0.0), f.draw(1.0)):
             if run_at({f.name: value}):
-                ends |= {(c.record.output, f.name, value): c.evidence.levels[-1] for c in found if c.evidence.levels}
+                ends |= {
+                    (c.record.output, f.name, value): c.evidence.levels[-1] for c in with_runs if c.evidence.levels
+                }
     corners: dict[tuple[float, ...], dict[str, float]] = {}
     for output in dict.fromkeys(o for o, _, _ in ends):
         for pick in (min, max):
@@ -621,4 +627,4 @@ def _with_candidate_runs(
     for corner in corners.values():
         if len(corner) > 1:
             run_at(corner)
-    return found
+    return with_runs

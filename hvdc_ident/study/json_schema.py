@@ -116,8 +116,8 @@ def _is_absent(default: Any) -> bool:
 
 def _item(schema: dict[str, Any]) -> dict[str, Any] | None:
     """Return the schema of the values of a table with free keys, were none nested; None for another."""
-    found = schema.get("additionalProperties") or next(iter(schema.get("patternProperties", {}).values()), None)
-    return found.get("else", found) if isinstance(found, dict) else None
+    item = schema.get("additionalProperties") or next(iter(schema.get("patternProperties", {}).values()), None)
+    return item.get("else", item) if isinstance(item, dict) else None
 
 
 def _kind(schema: dict[str, Any]) -> str:

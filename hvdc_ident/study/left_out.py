@@ -51,8 +51,8 @@ class RowsLeftOut:
             np.mean(v[1:] == v[:-1]) < HOLD_SHARE for v in inputs if v.size > 1
         ):  # one that is held is known in a gap too
             bad += [b for b in gaps(time) if needed[b.last]]
-        found = (_contradiction(b, self.write, table, time, asked, applied=stated is None) for b in bad)
-        self.contradictions = (*found, *_stated(table, time, columns))
+        contradictions = (_contradiction(b, self.write, table, time, asked, applied=stated is None) for b in bad)
+        self.contradictions = (*contradictions, *_stated(table, time, columns))
         if stated is None:
             for b in (b for b in bad if b.can_be_left_out):
                 for s in b.columns:
@@ -75,20 +75,20 @@ class RowsLeftOut:
 def _inside(time: Array, spans: Iterable[Sequence[float]]) -> NDArray[np.bool_]:
     """Return (n,) which rows lie in one of some spans, whose ends may be rounded as text rounds them."""
     slack = 1e-6 * float(np.median(np.diff(time))) if time.size > 1 else 0.0
-    found = np.zeros(time.size, dtype=bool)
+    inside = np.zeros(time.size, dtype=bool)
     for low, high in spans:
-        found |= (time >= low - slack) & (time <= high + slack)
-    return found
+        inside |= (time >= low - slack) & (time <= high + slack)
+    return inside
 
 
 def _between_kept(out: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return (n,) the rows between two that are kept, or beyond the last, among which some are left out: rows of other records too."""
     stands = np.concatenate([[-1], np.flatnonzero(kept), [kept.size]])
     lost = np.unique(np.searchsorted(stands, np.flatnonzero(out)))  # a line from one row that stands to the next
-    found = np.zeros(kept.size, dtype=bool)
+    between = np.zeros(kept.size, dtype=bool)
     for k in lost.tolist():
-        found[stands[k - 1] + 1 : stands[k]] = True
-    return found
+        between[stands[k - 1] + 1 : stands[k]] = True
+    return between
 
 
 def _contradiction(
@@ -147,7 +147,7 @@ def spans_of(rows: NDArray[np.bool_], time: Array) -> list[tuple[float, float]]:
 
 def leave_out_line(spans: Mapping[str, Iterable[tuple[float, float]]]) -> str:
     """Return the line of a study that leaves out spans of time in s, by signal."""
-    lines = (f"{toml_key(s)} = [{', '.join(f'[{a:.12g}, {b:.12g}]' for a, b in found)}]" for s, found in spans.items())
+    lines = (f"{toml_key(s)} = [{', '.join(f'[{a:.12g}, {b:.12g}]' for a, b in pairs)}]" for s, pairs in spans.items())
     return f"leave_out = {{{', '.join(lines)}}}"
 
 

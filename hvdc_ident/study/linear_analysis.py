@@ -86,7 +86,7 @@ def analyses(study: Study, linear: LinearModel) -> tuple[dict[str, Any], dict[st
     asked = study.settings.linearize or schema.LinearizeTable()
     scaled = linear.scaled(asked.scale)
     ports, files = _ports(asked.port, linear)
-    found = {
+    fields = {
         "norms": _norms(scaled),
         "scale": asked.scale,
         "trim": None if asked.trim is None else _trimmed(study.model, asked.trim, linear),
@@ -97,16 +97,16 @@ def analyses(study: Study, linear: LinearModel) -> tuple[dict[str, Any], dict[st
         "locus": None if asked.locus is None else _locus(asked.locus, linear),
         "ports": ports,
     }
-    return found, files
+    return fields, files
 
 
 def _norms(linear: LinearModel) -> dict[str, Any]:
     """Norms of the whole, and of each channel where these are few."""
     pairs = [(i, o) for o in linear.output_names for i in linear.input_names]
-    found: dict[str, Any] = {"whole": linear.norms()}
+    norms: dict[str, Any] = {"whole": linear.norms()}
     if len(pairs) <= MOST_CHANNELS:
-        found["channels"] = [{"input": i, "output": o, **linear.channel(i, o).norms()} for i, o in pairs]
-    return found
+        norms["channels"] = [{"input": i, "output": o, **linear.channel(i, o).norms()} for i, o in pairs]
+    return norms
 
 
 def _trimmed(model: AnyModel, trim: schema.TrimTable, linear: LinearModel) -> Trim:
@@ -117,8 +117,8 @@ def _trimmed(model: AnyModel, trim: schema.TrimTable, linear: LinearModel) -> Tr
         search = point.search
         moved = [n for n, i in model.inputs.items() if n not in trim.inputs and point.inputs[n] != i.value]
         free = moved if search is None else [search.system.inputs[k] for k in search.freed_u]
-    found = {**point.inputs, **point.parameters}
-    return Trim(dict(trim.outputs), dict(trim.inputs), {n: found[n] for n in free})
+    values = {**point.inputs, **point.parameters}
+    return Trim(dict(trim.outputs), dict(trim.inputs), {n: values[n] for n in free})
 
 
 def _equations(linear: LinearModel) -> tuple[Model, OperatingPoint]:
@@ -141,8 +141,8 @@ def _margins(asked: schema.LinearizeTable, linear: LinearModel) -> StudyMargins:
 
 def _reduced(asked: schema.ReduceTable, linear: LinearModel) -> StudyReduction:
     """The reduced model with the error it has and the bound that was known beforehand."""
-    found = linear.reduce(asked.order, asked.tolerance, match_dc=asked.match_dc)
-    return StudyReduction(found, found.error, len(linear.state_names))
+    reduction = linear.reduce(asked.order, asked.tolerance, match_dc=asked.match_dc)
+    return StudyReduction(reduction, reduction.error, len(linear.state_names))
 
 
 def _compared(study: Study, linear: LinearModel) -> ModelDistance:
@@ -160,16 +160,16 @@ def _formulas(study: Study, linear: LinearModel, parameters: list[str]) -> tuple
     """Each transfer function with some parameters as symbols; where there is none, the reason."""
     model = study.model
     assert is_white_box(model)
-    found = []
+    formulas = []
     for o in linear.output_names:
         for i in linear.input_names:
             try:
                 f = symbolic_transfer(model, i, o, parameters, linear.point)
             except LinearizationError as e:
-                found.append(Formula(i, o, reason=e.what))
+                formulas.append(Formula(i, o, reason=e.what))
             else:
-                found.append(Formula(i, o, *f.rounded(), f.latex()))
-    return tuple(found)
+                formulas.append(Formula(i, o, *f.rounded(), f.latex()))
+    return tuple(formulas)
 
 
 def _locus(asked: schema.LocusTable, linear: LinearModel) -> RootLocus:
@@ -183,13 +183,13 @@ def _locus(asked: schema.LocusTable, linear: LinearModel) -> RootLocus:
 
 def _ports(tables: list[schema.PortTable], linear: LinearModel) -> tuple[tuple[PortImpedance, ...], dict[str, str]]:
     """The impedance of each port, and a file of each."""
-    found, files = [], {}
+    impedances, files = [], {}
     for table in tables:
         model, point = _equations(linear)
         omega = 2 * np.pi * np.geomspace(table.band[0], table.band[1], table.points)
         z = port_impedance(model, port_of(table), omega, point)
         passive = np.linalg.eigvalsh(z.values + np.conj(np.swapaxes(z.values, 1, 2)))[:, 0] / 2
         k = int(np.argmin(passive))
-        found.append(PortImpedance(table.name, z, Crossing(float(omega[k]), float(passive[k]))))
+        impedances.append(PortImpedance(table.name, z, Crossing(float(omega[k]), float(passive[k]))))
         files[f"impedance.{table.name}.csv"] = csv_of_response(z)
-    return tuple(found), files
+    return tuple(impedances), files

@@ -55,7 +55,7 @@ def read_responses(
 
     Raises StudyError, UnknownNameError or WaveformError with the response's place in the study.
     """
-    found: list[MeasuredResponse] = []
+    responses: list[MeasuredResponse] = []
     sources: dict[str, str] = {}
     taken = {e.name.lower() for e in settings.experiment}
     for table in settings.response:
@@ -65,12 +65,12 @@ def read_responses(
         taken.add(table.name.lower())
         port = _checked(table, settings, model, place)
         with located(place):
-            found.append(_response(table, port, folder / table.data))
+            responses.append(_response(table, port, folder / table.data))
         path = folder / table.data
         for file in files_of(path) if table.signals else (path,):
             name = table.data if file == path else f"{Path(table.data).parent / file.name}"
             sources[name] = digest(file.read_bytes())
-    return tuple(found), sources
+    return tuple(responses), sources
 
 
 def _checked(table: schema.ResponseTable, settings: schema.StudyFile, model: AnyModel, place: str) -> Port | None:
@@ -146,29 +146,29 @@ def _channels(table: schema.ResponseTable, file: ResponseFile, wanted: Sequence[
         expected = "one channel, or the key columns"
         hint = f'columns = {{value = "{known[0]}"}}'
         raise StudyError("which channel of the file?", where=where, expected=expected, got=", ".join(known), hint=hint)
-    found = dict(table.columns)
-    for key in wanted if not found else ():
+    channels = dict(table.columns)
+    for key in wanted if not channels else ():
         numbered = key.replace("d", "1").replace("q", "2")
         ends = (key, numbered, f"{key[0]}from{key[1]}")
         bare = {n: re.sub(r"[^a-z0-9]", "", n.lower()) for n in known}
         hits = [n for n, b in bare.items() if b.endswith(ends)]
         if len(hits) == 1:
-            found[key] = hits[0]
+            channels[key] = hits[0]
     other = "y" if table.kind == "impedance" else "z"
-    turned = [n for n in found.values() if re.fullmatch(rf"{other}\s?(\d\d|[dq][dq])", n.lower())]
+    turned = [n for n in channels.values() if re.fullmatch(rf"{other}\s?(\d\d|[dq][dq])", n.lower())]
     if turned and not table.columns:
         kind = "admittance" if table.kind == "impedance" else "impedance"
         raise StudyError(
             f"channel '{turned[0]}' is no {table.kind}", where=where, hint=f'kind = "{kind}", or name it in columns'
         )
-    if not found:
+    if not channels:
         raise StudyError(
             "no channel of the port is in the file",
             where=where,
             expected=f"channels that end in {', '.join(wanted)}, or the key columns",
             got=", ".join(known),
         )
-    return found
+    return channels
 
 
 def _waveforms(table: schema.ResponseTable, path: Path) -> ResponseFile:
@@ -177,15 +177,15 @@ def _waveforms(table: schema.ResponseTable, path: Path) -> ResponseFile:
     record = read_waveforms(path, [sent, seen])
     u, y = record[sent], record[seen]
     if table.frequencies is None:
-        found: FrequencyResponse = response_from_record(record.time, u, y, input=sent, output=seen)
+        response: FrequencyResponse = response_from_record(record.time, u, y, input=sent, output=seen)
     else:
         omega = 2 * np.pi * np.array(table.frequencies)
-        found = response_at_tones(record.time, u, y, omega, input=sent, output=seen)
-    order = np.argsort(found.omega)
-    assert found.std is not None
+        response = response_at_tones(record.time, u, y, omega, input=sent, output=seen)
+    order = np.argsort(response.omega)
+    assert response.std is not None
     name = f"{seen} from {sent}"
-    channels = FrozenMap({name: found.values[order, 0, 0]})
-    return ResponseFile(found.omega[order], channels, FrozenMap({name: found.std[order, 0, 0]}))
+    channels = FrozenMap({name: response.values[order, 0, 0]})
+    return ResponseFile(response.omega[order], channels, FrozenMap({name: response.std[order, 0, 0]}))
 
 
 def compared(study: Study, sets: Mapping[str, Mapping[str, float]]) -> list[ComparedResponse]:

@@ -145,11 +145,11 @@ class NewStudy(Shown):
                 "event": e.event if e else None,
                 "noise": {o: n.std for o, n in r.noise.items()},
             }
-        found = {"schema": 1, "study": self.path.as_posix(), "model": self.model.name, "experiments": experiments}
+        fields = {"schema": 1, "study": self.path.as_posix(), "model": self.model.name, "experiments": experiments}
         if self.dyr is None:
-            return found
+            return fields
         bases = {"bus_kv": self.dyr.bus_kv, "mva": self.dyr.mva, "frequency": self.dyr.frequency}
-        return found | {"unknown_models": list(self.dyr.unknown), "bases": bases, "notes": list(self.dyr.notes)}
+        return fields | {"unknown_models": list(self.dyr.unknown), "bases": bases, "notes": list(self.dyr.notes)}
 
     def _screen(self) -> Iterator[str]:
         number = len(self.recordings)
@@ -219,9 +219,9 @@ def new_study(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     data = Path(folder, "step.csv")
     ...     _ = data.write_text("time [s],PREF_2 [pu],P2 [pu],spare [kV]\\n0,0.4,0.4,1\\n0.1,0.5,0.42,1\\n0.2,0.5,0.45,1\\n")
-    ...     found = hi.new_study(Path(folder, "study"), data, "vsc-hvdc-link")
-    ...     study = hi.load_study(found.path)
-    >>> [(m.target.name, m.column.name) for m in found.recordings[0].columns.mapped], study.experiments[0].outputs
+    ...     new = hi.new_study(Path(folder, "study"), data, "vsc-hvdc-link")
+    ...     study = hi.load_study(new.path)
+    >>> [(m.target.name, m.column.name) for m in new.recordings[0].columns.mapped], study.experiments[0].outputs
     ([('P2', 'P2'), ('Pref2', 'PREF_2')], ('P2',))
     """
     path = Path(folder) / "study.toml"
@@ -249,10 +249,10 @@ def proposal(record: Trajectory, model: AnyModel, name: str, about: Terminals | 
     phases = proposed_phases(record)
     made = without_phases(with_derived(phases, (), record, name), phases)
     made = without_bad_rows(made, [n for n in made.names if n in record])
-    found = _matched(made, model, phases, about or terminals_of(model))
-    phases = of_use(phases, [m.column.name for m in (*found.columns.mapped, *found.columns.proposed)])
-    unused = tuple(c for c in found.columns.unused if c in record)
-    return replace(found, columns=replace(found.columns, unused=unused), phases=phases)
+    proposed = _matched(made, model, phases, about or terminals_of(model))
+    phases = of_use(phases, [m.column.name for m in (*proposed.columns.mapped, *proposed.columns.proposed)])
+    unused = tuple(c for c in proposed.columns.unused if c in record)
+    return replace(proposed, columns=replace(proposed.columns, unused=unused), phases=phases)
 
 
 def _matched(
@@ -279,8 +279,8 @@ def _matched(
     levels, why = _levels(model, at)
     by_names = {**own.matches, **{m.target.name: m for m in own.open}} if about is not None else None
     columns = tuple(c for c in columns if c.name not in own.compared)
-    found = matching(columns, targets_of(model, levels), model.parameters, by_names)
-    return Proposal(found, why, tuple(phases), own.values, own.notes)
+    mapping = matching(columns, targets_of(model, levels), model.parameters, by_names)
+    return Proposal(mapping, why, tuple(phases), own.values, own.notes)
 
 
 def _event(record: Trajectory, moved: Sequence[Match], means: Mapping[str, float], *, played: bool) -> float | None:
@@ -297,16 +297,16 @@ def _event(record: Trajectory, moved: Sequence[Match], means: Mapping[str, float
 
 def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Terminals | None) -> Mapped:
     record = read_waveforms(file)
-    found = proposal(record, model, name, about)
+    proposed = proposal(record, model, name, about)
     data = _relative(file, folder)
     by_kind = {
-        kind: {m.target.name: m.column.name for m in found.columns.mapped if m.target.kind == kind}
+        kind: {m.target.name: m.column.name for m in proposed.columns.mapped if m.target.kind == kind}
         for kind in ("input", "output")
     }
-    rest = (found.phases, found.values, found.notes)
+    rest = (proposed.phases, proposed.values, proposed.notes)
     if not by_kind["output"]:
-        return Mapped(name, file, data, found.columns, found.levels, None, {}, *rest)
-    lines = {m.target.name: schema.ColumnTable(**m.line.keys) for m in found.columns.mapped if m.line.keys}
+        return Mapped(name, file, data, proposed.columns, proposed.levels, None, {}, *rest)
+    lines = {m.target.name: schema.ColumnTable(**m.line.keys) for m in proposed.columns.mapped if m.line.keys}
     lost = {s: record.own_rows(c) & np.isnan(record[c]) for s, c in by_kind["input"].items() if c in record}
     leave_out = {s: spans_of(rows, record.time) for s, rows in lost.items() if rows.any()}
     table = schema.ExperimentTable(
@@ -315,8 +315,8 @@ def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Termina
         inputs=by_kind["input"],
         outputs=by_kind["output"],
         columns=lines,
-        values=dict(found.values),
-        phases=list(found.phases),
+        values=dict(proposed.values),
+        phases=list(proposed.phases),
         leave_out={s: [list(span) for span in spans] for s, spans in leave_out.items()} or None,
     )
     recordings = Recordings(file.parent)
@@ -325,7 +325,9 @@ def _mapped(folder: Path, file: Path, name: str, model: AnyModel, about: Termina
     if measured:
         table = table.model_copy(update={"interpolation": dict.fromkeys(measured, "linear")})
         (experiment,), notes = read_experiments([table], model, recordings, str(file))
-    return Mapped(name, file, data, found.columns, found.levels, experiment, notes[name], *rest, measured, leave_out)
+    return Mapped(
+        name, file, data, proposed.columns, proposed.levels, experiment, notes[name], *rest, measured, leave_out
+    )
 
 
 def _values(record: Trajectory, match: Match) -> tuple[Array, Array]:

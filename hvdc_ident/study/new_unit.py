@@ -106,12 +106,12 @@ def new_unit_study(folder: str | Path, recordings: str | Path | Sequence[str | P
         notes=unit_notes(unit, records, grid, base, (frequency, source), list(candidates)),
     )
     try:
-        found = new_study(folder, recordings, card, dyr=about, terminals=_terminals(grid, base, frequency))
+        study = new_study(folder, recordings, card, dyr=about, terminals=_terminals(grid, base, frequency))
     except InputError:
         card.unlink()  # the next try finds the folder as it was
         raise
-    write(_levels(found))
-    return found
+    write(_levels(study))
+    return study
 
 
 def _in_power_flow(file: Path, bus: int, machine: str) -> InPowerFlow:
@@ -170,9 +170,9 @@ def _terminals(grid: InPowerFlow | None, base: float, frequency: float) -> Termi
     return Terminals(frequency, base, bus.base_kv or None, grid.raw.sbase, machine.pg, machine.qg, bus.name.strip())
 
 
-def _levels(found: NewStudy) -> dict[str, float]:
+def _levels(study: NewStudy) -> dict[str, float]:
     """Return the levels before the event of the first recording that has outputs, by input of the unit."""
-    experiment = next((r.experiment for r in found.recordings if r.experiment is not None), None)
+    experiment = next((r.experiment for r in study.recordings if r.experiment is not None), None)
     if experiment is None or experiment.measured is None:
         return {}
     own = {n: level_before(experiment.time, s(experiment.time), experiment.event) for n, s in experiment.inputs.items()}
@@ -192,14 +192,14 @@ def _places(unit: RecordedUnit, card: Path) -> tuple[str, ...]:
 
 def asked_about(unit: RecordedUnit) -> dict[str, tuple[float, float]]:
     """Return of each part that acts the first parameter that its card asks about, is not 0 and counts at its flags, with its bounds."""
-    found = {}
+    candidates = {}
     idle = idle_parts(unit.parts)
     for name, part in ((n, p) for n, p in unit.parts.items() if n not in idle):
         off = {n for n, flags in FLAGS.items() if any(part.values.get(f) == 0.0 for f in flags)}
         usual = next((n for n in asked_of(part.source) if n not in off and part.values.get(n)), None)
         if usual is not None:
-            found[f"{name}.{usual}"] = _bounds(part, usual)
-    return found
+            candidates[f"{name}.{usual}"] = _bounds(part, usual)
+    return candidates
 
 
 def offered(unit: RecordedUnit) -> dict[str, tuple[float, float]]:

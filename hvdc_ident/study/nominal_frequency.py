@@ -32,13 +32,15 @@ def recorded_frequencies(files: Sequence[Path]) -> tuple[RecordedFrequency, ...]
 
     A frequency deviation, one in pu and an angle in the frame of a network show none. Raises InputError for a file that cannot be read.
     """
-    found: dict[float, RecordedFrequency] = {}
+    frequencies: dict[float, RecordedFrequency] = {}
     for file in files:
         for level, what in _levels(read_waveforms(file)):
             nominal = min(NOMINAL, key=lambda n: abs(level - n))
             if abs(level - nominal) <= OFF_NOMINAL:
-                found.setdefault(nominal, RecordedFrequency(nominal, f"{what} of {file.name} reads {level:.4g} Hz"))
-    return tuple(found.values())
+                frequencies.setdefault(
+                    nominal, RecordedFrequency(nominal, f"{what} of {file.name} reads {level:.4g} Hz")
+                )
+    return tuple(frequencies.values())
 
 
 def _levels(record: Trajectory) -> Iterator[tuple[float, str]]:

@@ -76,9 +76,9 @@ def have_stage(study: Study, name: str, folder: Path, options: StageOptions) -> 
     """
     wanted = stage(name)
     with exclusive(folder):
-        found = _ended(study, wanted, folder)
-        if found is not None:
-            return found
+        kept = _ended(study, wanted, folder)
+        if kept is not None:
+            return kept
         done = _run_after(study, wanted, folder, options, {}, _rest_of(study, options))
         write_summary(folder, heading_of(study, options.seed))
         return done
@@ -160,9 +160,9 @@ def _rest_of(study: Study, options: StageOptions) -> Rest:
 
     @cache
     def rest() -> tuple[InitialValue, ...]:
-        found = initial_values(study)
-        options.announce(found.lines)
-        return found.all
+        values = initial_values(study)
+        options.announce(values.lines)
+        return values.all
 
     return rest
 
@@ -240,10 +240,10 @@ class _SoFar:
         self.last = text.partition(": ")[2]
         self._progress(done, total, text)
 
-    def ended_by(self, budget: Budget, wanted: Stage, known: Sequence[Known], found: Mapping[str, Any]) -> StageResult:
+    def ended_by(self, budget: Budget, wanted: Stage, known: Sequence[Known], data: Mapping[str, Any]) -> StageResult:
         """Return the result of a stage that its budget has ended: what it had come to, and what was not tried.
 
-        known: what its parts had come to; found: the JSON that the stage makes of it.
+        known: what its parts had come to; data: the JSON that the stage makes of it.
         """
         parts = list(wanted.parts.items())
         at = next((k for k, (begins, _) in enumerate(parts) if self.last.startswith(begins)), -1)
@@ -253,7 +253,7 @@ class _SoFar:
         message += f"; not tried: {listed(not_tried)}" if not_tried else ""
         done = [line for k in known for line in k.done]
         about = {"message": message, "done": done, "not_tried": not_tried}
-        return StageResult({**self.first, "status": UNFINISHED, **found, **about}, failed=message, unfinished=True)
+        return StageResult({**self.first, "status": UNFINISHED, **data, **about}, failed=message, unfinished=True)
 
 
 def _not_tried(budget: Budget) -> StageResult:

@@ -24,19 +24,19 @@ ESTIMATED = ("identifiable", "locally-identifiable", "weak", "at-bound")
 
 def violations(stage: str, data: Mapping[str, Any]) -> list[str]:
     """Return what keeps the result of a stage from being told, in words; empty where nothing does. data: its JSON."""
-    found: list[str] = []
+    wrong: list[str] = []
     if stage == "fit" and (fit := fit_of(data)) is not None:
-        found += [*intervals_contain(fit), *best_cost_is_told(fit), *fit_is_judged(fit)]
+        wrong += [*intervals_contain(fit), *best_cost_is_told(fit), *fit_is_judged(fit)]
     elif stage == "identify":
         report = identified_of(data)
-        found += [*intervals_contain(report), *pilot_is_judged(report)]
+        wrong += [*intervals_contain(report), *pilot_is_judged(report)]
     elif stage == "diagnose":
-        found += intervals_contain(diagnosis_of(data))
+        wrong += intervals_contain(diagnosis_of(data))
     elif stage == "linearize" and "modes" in data:
         linear = Linearisation.from_dict(data)
         for model in (linear.given, linear.at_fitted):
-            found += [] if model is None else branch_is_told(model)
-    return found
+            wrong += [] if model is None else branch_is_told(model)
+    return wrong
 
 
 def intervals_contain(result: Any) -> Iterator[str]:

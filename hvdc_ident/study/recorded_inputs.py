@@ -33,8 +33,8 @@ def fitted_records(study: Study) -> tuple[Simulator, tuple[Experiment, ...]]:
             runs[e.name] = observe(simulator, e, {n: c.given for n, c in study.candidates.items()}).values
     if not runs:
         return simulator, experiments
-    found = noise_of([e for e in noisy if e.name in runs], runs)
-    return simulator, tuple(_with_noise(e, found) if e.name in runs else e for e in experiments)
+    noise = noise_of([e for e in noisy if e.name in runs], runs)
+    return simulator, tuple(_with_noise(e, noise) if e.name in runs else e for e in experiments)
 
 
 def _is_moved(experiment: Experiment) -> bool:
@@ -43,10 +43,10 @@ def _is_moved(experiment: Experiment) -> bool:
     return any(np.ptp(s(experiment.time[rows])) > 0.0 for s in experiment.inputs.values()) if rows.any() else False
 
 
-def _with_noise(experiment: Experiment, found: Mapping[str, OutputNoise]) -> Experiment:
+def _with_noise(experiment: Experiment, estimated: Mapping[str, OutputNoise]) -> Experiment:
     """Return the experiment with the noise that was found, where it was estimated and is louder than the record alone says."""
     noise, dof, told_by = dict(experiment.noise), dict(experiment.noise_dof), dict(experiment.noise_from)
-    for o, n in found.items():
+    for o, n in estimated.items():
         if o in dof and n.std is not None and n.freedom and n.std > noise.get(o, 0.0):
             noise[o], dof[o], told_by[o] = n.std, float(n.freedom), n.source
     return experiment.with_(noise=noise, noise_dof=dof, noise_from=told_by)

@@ -110,15 +110,15 @@ def read_experiments(
         wanted.setdefault(table.data, {})[table.name] = list(dict.fromkeys(columns))
     with located(where):
         recordings.load(wanted)
-    found, notes = [], {}
+    experiments, notes = [], {}
     for table in tables:
         place = f"{where}, experiment '{table.name}'"
         try:
             experiment, notes[table.name] = _experiment(table, model, recordings[table.data], place)
         except InputError as e:
             raise (e if place in e.where else e.at(place)) from None
-        found.append(experiment)
-    return tuple(found), FrozenMap(notes)
+        experiments.append(experiment)
+    return tuple(experiments), FrozenMap(notes)
 
 
 def with_noise(
@@ -140,10 +140,10 @@ def with_noise(
     for o in e.outputs:
         recorded = np.flatnonzero(np.isfinite(table[o]))
         rows = recorded[_apart(e.time[recorded], means.get(o, 0.0))]
-        found = NoiseEstimate() if o in stated else noise_before(e.time[rows], table[o][rows], event)
-        notes[o] = _noise(stated.get(o), found, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
+        estimate = NoiseEstimate() if o in stated else noise_before(e.time[rows], table[o][rows], event)
+        notes[o] = _noise(stated.get(o), estimate, noise_floor(table[o]), by_row=o in e.noise_profile and o in stated)
         if notes[o].source == "estimated":
-            dof[o], told_by[o] = max(1.0, found.freedom), found.source
+            dof[o], told_by[o] = max(1.0, estimate.freedom), estimate.source
     noise = {o: n.std for o, n in notes.items() if n.source in ("given", "estimated")}
     profile = {o: v for o, v in e.noise_profile.items() if o in noise}
     known = {"noise_dof": e.noise_dof | dof, "noise_from": e.noise_from | told_by}
@@ -329,7 +329,7 @@ def _trimmed(experiment: Experiment, table: schema.ExperimentTable, mapped: Mapp
     return experiment.with_(
         inputs=inputs,
         values=experiment.values | values,
-        input_noise={n: found for n, found in noise.items() if found.any},
+        input_noise={n: own for n, own in noise.items() if own.any},
         levels=tuple(dict.fromkeys(table.trim.values())),
     )
 
@@ -536,9 +536,9 @@ def _deviations(data: Trajectory, column: str, of: str, mapping: tuple[float, fl
             expected=f"'{data.unit(of)}', as column '{of}'",
             got=f"'{unit}'",
         )
-    found = data[column] * by[0] * abs(mapping[0])
+    deviations = data[column] * by[0] * abs(mapping[0])
     recorded = ~np.isnan(data[of])
-    bad = np.flatnonzero(recorded & ~(found > 0))
+    bad = np.flatnonzero(recorded & ~(deviations > 0))
     if bad.size:
         raise StudyError(
             f"no standard deviation in column '{column}' at {data.time[bad[0]]:g} s",
@@ -546,14 +546,14 @@ def _deviations(data: Trajectory, column: str, of: str, mapping: tuple[float, fl
             expected=f"a number above 0 wherever '{of}' is recorded",
             got=f"{data[column][bad[0]]:g}",
         )
-    return np.where(recorded, found, np.nan)
+    return np.where(recorded, deviations, np.nan)
 
 
-def _noise(given: float | None, found: NoiseEstimate, floor: float, *, by_row: bool) -> NoiseNote:
+def _noise(given: float | None, estimate: NoiseEstimate, floor: float, *, by_row: bool) -> NoiseNote:
     """The larger of what is given, else found before the event, and the floor; where that acts the data show no noise."""
-    if given is None and not found.source:
+    if given is None and not estimate.source:
         return NoiseNote(floor, "residual")
-    std = given if given is not None else found.std
+    std = given if given is not None else estimate.std
     if std <= floor:
         return NoiseNote(floor, "floor")
     return NoiseNote(std, "given" if given is not None else "estimated", by_row)
@@ -572,17 +572,19 @@ def with_derived(
     phases: Sequence[schema.PhasesTable], phasors: Sequence[schema.PhasorsTable], data: Trajectory, place: str
 ) -> Trajectory:
     """The recording with the columns that phases and phasors give; the same object where none are asked for."""
-    found = data
+    recording = data
     for number, line in enumerate(phases, 1):
-        found = _added(found, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"), line.voltage[0])
+        recording = _added(
+            recording, line.gives, _of_phases(line, data, f"{place}.phases, line {number}"), line.voltage[0]
+        )
     for number, phasor in enumerate(phasors, 1):
-        found = _added(
-            found,
+        recording = _added(
+            recording,
             phasor.gives,
             _of_phasors(phasor, data, f"{place}.phasors, line {number}"),
             phasor.voltage.magnitude[0],
         )
-    return found
+    return recording
 
 
 def _of_phases(line: schema.PhasesTable, whole: Trajectory, where: str) -> Trajectory:
@@ -625,15 +627,15 @@ def _check_new(gives: Mapping[str, str], data: Trajectory, where: str) -> None:
         raise StudyError(f"a column '{taken[0]}' is already there", where=where, expected="a new name in gives")
 
 
-def _added(found: Trajectory, gives: Mapping[str, str], made: Trajectory, of: str) -> Trajectory:
+def _added(recording: Trajectory, gives: Mapping[str, str], made: Trajectory, of: str) -> Trajectory:
     """The recording with columns made of the one called `of`, at the rows of its record."""
-    values = np.full((len(found), len(gives)), np.nan)
-    values[found.own_rows(of)] = made.values
-    records = tuple((*r, *gives) if of in r else r for r in found.origin.records)
+    values = np.full((len(recording), len(gives)), np.nan)
+    values[recording.own_rows(of)] = made.values
+    records = tuple((*r, *gives) if of in r else r for r in recording.origin.records)
     return Trajectory(
-        found.time,
-        np.column_stack([found.values, values]),
-        (*found.names, *gives),
-        (*found.units, *made.units),
-        replace(found.origin, converted=(*found.origin.converted, *made.origin.converted), records=records),
+        recording.time,
+        np.column_stack([recording.values, values]),
+        (*recording.names, *gives),
+        (*recording.units, *made.units),
+        replace(recording.origin, converted=(*recording.origin.converted, *made.origin.converted), records=records),
     )

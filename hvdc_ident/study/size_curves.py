@@ -23,19 +23,19 @@ SHARES = (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
 """Of the way from the neutral size to the one that was found; 0 is the model without the effect, gains as found with it."""
 
 
-def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosis) -> SizeCurves | None:
+def size_curves(model: Model, experiments: Iterable[Experiment], diagnosis: Diagnosis) -> SizeCurves | None:
     """Return the output the effect matters most for, recorded and simulated at several sizes; None without an effect.
 
     The other effects and the parameters stay as found. A size that the effect cannot have, and one at which the model cannot be run,
     is left out.
     """
-    if not found.effects or found.augmented is None:
+    if not diagnosis.effects or diagnosis.augmented is None:
         return None
-    place = _where_it_matters(found)
+    place = _where_it_matters(diagnosis)
     chosen = next((e for e in experiments if place and e.name == place[1] and e.measured is not None), None)
     if place is None or chosen is None:
         return None
-    first = found.effects[0]
+    first = diagnosis.effects[0]
     name = next(iter(first.parameters))
     size = first.parameters[name]
     bounds = effects()[first.effect].parameters[name]
@@ -48,7 +48,7 @@ def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosi
         if value is not None and not bounds.min <= value <= bounds.max:
             continue
         try:
-            run = simulate(_with(model, found, value), chosen, found.parameters_after, outputs=[place[0]])
+            run = simulate(_with(model, diagnosis, value), chosen, diagnosis.parameters_after, outputs=[place[0]])
         except HvdcIdentError:  # as where a smaller limit leaves no rest to begin at
             continue
         label = "without it" if value is None else f"{name} = {quantity(value, size.unit)}"
@@ -65,13 +65,13 @@ def size_curves(model: Model, experiments: Iterable[Experiment], found: Diagnosi
     )  # fmt: skip
 
 
-def _where_it_matters(found: Diagnosis) -> tuple[str, str] | None:
+def _where_it_matters(diagnosis: Diagnosis) -> tuple[str, str] | None:
     """Output and experiment, held out where there are any, whose error in noise units falls most."""
     best: tuple[float, tuple[str, str]] | None = None
     for role in ("holdout", "fit"):
-        before, after = found.gap.refitted.get(role) or {}, found.gap.augmented.get(role) or {}
+        before, after = diagnosis.gap.refitted.get(role) or {}, diagnosis.gap.augmented.get(role) or {}
         for output, line in before.items():
-            unit = found.gap.noise_floor.get(output) or 1.0
+            unit = diagnosis.gap.noise_floor.get(output) or 1.0
             for experiment, was in line.items():
                 now = (after.get(output) or {}).get(experiment)
                 if was is None or now is None:
@@ -99,10 +99,10 @@ def _size(value: float, neutral: float, share: float) -> float | None:
     return value / share if math.isinf(neutral) else neutral + share * (value - neutral)
 
 
-def _with(model: Model, found: Diagnosis, value: float | None) -> Model:
+def _with(model: Model, diagnosis: Diagnosis, value: float | None) -> Model:
     """The model with the effects as found, the first one at another size, or without it."""
-    first = found.effects[0]
-    for effect in found.effects:
+    first = diagnosis.effects[0]
+    for effect in diagnosis.effects:
         if effect is not first:
             model = apply_effects(model, [use_of(effect).within(model)])
         elif value is not None:

@@ -180,13 +180,13 @@ class Job:
 
     def get(self, keys: Sequence[bytes]) -> Mapping[bytes, bytes]:
         """Return what is kept under the keys; a key without a result is missing."""
-        found: dict[bytes, bytes] = {}
+        kept: dict[bytes, bytes] = {}
         for start in range(0, len(keys), MOST_KEYS):
             part = keys[start : start + MOST_KEYS]
             marks = ",".join("?" * len(part))
             select = f"SELECT key, value FROM kept WHERE job = ? AND key IN ({marks})"
-            found.update((bytes(k), bytes(v)) for k, v in self._store.execute(select, [self.name, *part]))
-        return found
+            kept.update((bytes(k), bytes(v)) for k, v in self._store.execute(select, [self.name, *part]))
+        return kept
 
     def put(self, key: bytes, value: bytes) -> None:
         """Keep the value: a kill of this process at any instant afterwards does not lose it."""
@@ -238,10 +238,10 @@ class CachingExecutor:
         missing = [index for index, key in enumerate(keys) if key not in stored]
         todo = [items[index] for index in missing]
         if self._pool is not None and len(missing) > 1:
-            found = self._pool.run(function, todo)
+            outcomes = self._pool.run(function, todo)
         else:
-            found = (Outcome(k, function(item)) for k, item in enumerate(todo))
-        for outcome in found:
+            outcomes = (Outcome(k, function(item)) for k, item in enumerate(todo))
+        for outcome in outcomes:
             index = missing[outcome.index]
             if not outcome.failure:
                 self._put(keys[index], outcome.value)
@@ -378,8 +378,8 @@ def _value(plain: Any) -> Any:
     if kind == "t":
         return tuple(map(_value, content))
     if kind in "md":
-        found = {_value(k): _value(v) for k, v in content}
-        return FrozenMap(found) if kind == "m" else found
+        mapping = {_value(k): _value(v) for k, v in content}
+        return FrozenMap(mapping) if kind == "m" else mapping
     if kind == "o":
         return _class(plain["of"])(**{name: _value(v) for name, v in content.items()})
     raise ValueError(f"no kind '{kind}'")
@@ -391,7 +391,7 @@ def _class(name: str) -> Any:
     module, _, qualified = name.partition(":")
     if module.split(".")[0] != PACKAGE or "." in qualified:
         raise ValueError(f"'{name}' is no class of {PACKAGE}")
-    found = getattr(importlib.import_module(module), qualified, None)
-    if not (isinstance(found, type) and dataclasses.is_dataclass(found) and found.__module__ == module):
+    cls = getattr(importlib.import_module(module), qualified, None)
+    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls) and cls.__module__ == module):
         raise ValueError(f"'{name}' is no dataclass of {PACKAGE}")
-    return found
+    return cls

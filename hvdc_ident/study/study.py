@@ -291,7 +291,7 @@ def _other_model(
 
 def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> FrozenMap[FitParameter]:
     """Return the parameters that may be estimated. Raises StudyError or UnknownNameError."""
-    found = {}
+    candidates = {}
     for name, line in settings.parameters.items():
         place = f"{where}, parameters.{name}"
         if line.tie is not None or line.per_experiment:
@@ -311,8 +311,8 @@ def candidates_of(settings: schema.StudyFile, model: AnyModel, where: str) -> Fr
                 expected=f"bounds within [{parameter.min:g}, {parameter.max:g}]",
                 got=f"[{free.min:g}, {free.max:g}]",
             )
-        found[name] = free
-    return FrozenMap(found)
+        candidates[name] = free
+    return FrozenMap(candidates)
 
 
 def with_unknowns(settings: schema.StudyFile, model: AnyModel, where: str) -> AnyModel:
@@ -373,8 +373,8 @@ def with_nuisances(
     search = {}
     for name in (n for n in local if n in settings.parameters):
         with located(f"{where}, parameters.{name}"):
-            found = free_of(name, settings.parameters[name], model)
-        search[name] = (found.start, found.min, found.max)
+            parameter = free_of(name, settings.parameters[name], model)
+        search[name] = (parameter.start, parameter.min, parameter.max)
     return tuple(e.with_(nuisance=tuple(dict.fromkeys((*e.nuisance, *local))), search=search) for e in experiments)
 
 
@@ -392,13 +392,13 @@ def priors(settings: schema.StudyFile, experiments: Sequence[Experiment]) -> Fro
     from hvdc_ident.fit.likelihood import Prior
     from hvdc_ident.fit.simulator import unknown_of
 
-    found: dict[str, Prior] = {}
+    by_unknown: dict[str, Prior] = {}
     for name, line in settings.parameters.items():
         if line.prior is None:
             continue
         prior = Prior(line.prior.mean, line.prior.std)
         if line.per_experiment:
-            found |= {unknown_of(e.name, name): prior for e in experiments if e.role == "fit"}
+            by_unknown |= {unknown_of(e.name, name): prior for e in experiments if e.role == "fit"}
         else:
-            found[name] = prior
-    return FrozenMap(found)
+            by_unknown[name] = prior
+    return FrozenMap(by_unknown)

@@ -185,8 +185,8 @@ def angle_way(unit: str, stated: bool, time: Array, values: Array, frequency: Ar
     radians, degrees = Way(1.0, words="taken as rad"), Way(DEGREE, 0.0, ColumnLine(unit="deg"))
     if frequency is not None:
         for way, unit_words in ((radians, "rad"), (degrees, "degrees")):
-            found = agreement(time, way.scale * values, frequency, about.frequency)
-            if found.factor is not None and replace(found, factor=abs(found.factor)).turns_alike:
+            agreed = agreement(time, way.scale * values, frequency, about.frequency)
+            if agreed.factor is not None and replace(agreed, factor=abs(agreed.factor)).turns_alike:
                 return replace(way, words=f"{unit_words}, as its turn beside the frequency says")
     limit = FASTEST * about.frequency
     if fastest(time, values) > limit >= fastest(time, DEGREE * values):
@@ -242,12 +242,12 @@ def settled(record: Trajectory, named: Mapping[str, Match], event: float | None,
             notes.append(f"{named['theta'].column.name} is {unwrapped_words(jumps)}")
         if "f" in ways:
             frequency = _converted(record, named["f"], ways["f"])
-            found = agreement(record.time, angle, frequency, about.frequency)
+            agreed = agreement(record.time, angle, frequency, about.frequency)
             kept, dropped = ("theta", "f") if finer_is_angle(record.time, angle, frequency) else ("f", "theta")
             columns = {n: named[n].column.name for n in (kept, dropped)}
             notes.append(
                 f"{columns[dropped]} is not used beside {columns[kept]}: both tell how one voltage turns, {columns[kept]} more finely; "
-                f"{agreement_words(found)}"
+                f"{agreement_words(agreed)}"
             )
             del matches[dropped]
             compared = (columns[dropped],)
@@ -262,17 +262,17 @@ def settled(record: Trajectory, named: Mapping[str, Match], event: float | None,
 _OWN = ("V", "theta", "f", *LEVELS.values())
 
 
-def agreement_words(found: Agreement) -> str:
+def agreement_words(agreed: Agreement) -> str:
     """Return in words how far an angle and a frequency of one voltage agree."""
-    degrees = found.rms / DEGREE
-    if found.factor is None and found.holds:
+    degrees = agreed.rms / DEGREE
+    if agreed.factor is None and agreed.holds:
         return f"neither turns enough to compare them ({degrees:.2g} deg rms between them)"
-    if found.factor is None:
-        apart = f"{degrees:.3g} deg rms between them, where {found.unseen / DEGREE:.2g} would be seen"
+    if agreed.factor is None:
+        apart = f"{degrees:.3g} deg rms between them, where {agreed.unseen / DEGREE:.2g} would be seen"
         return f"they disagree: one turns and the other does not, {apart}"
-    if found.holds:
-        return f"they agree within {degrees:.2g} deg rms, of {found.moves / DEGREE:.3g} deg"
-    return f"they disagree: the angle turns {found.factor:.3g} times as far as the frequency says, {degrees:.3g} deg rms between them"
+    if agreed.holds:
+        return f"they agree within {degrees:.2g} deg rms, of {agreed.moves / DEGREE:.3g} deg"
+    return f"they disagree: the angle turns {agreed.factor:.3g} times as far as the frequency says, {degrees:.3g} deg rms between them"
 
 
 def unit_of_match(match: Match) -> tuple[str, bool]:
@@ -363,8 +363,8 @@ def _turn_before(time: Array, angle: Array, event: float | None) -> float:
 
 
 def _only(ways: Iterable[Way]) -> Way | None:
-    found = list(ways)
-    return found[0] if len(found) == 1 else None
+    all_ways = list(ways)
+    return all_ways[0] if len(all_ways) == 1 else None
 
 
 def _unit_line(unit: str, stated: bool) -> ColumnLine:

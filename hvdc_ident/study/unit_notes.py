@@ -102,28 +102,28 @@ def _of_power_flow(unit: RecordedUnit, grid: InPowerFlow, base: float, frequency
 
 def _of_shelf(unit: RecordedUnit) -> str:
     """Return what stands at values of the shelf because only a power flow states it; "" where nothing does."""
-    found = [
+    on_shelf = [
         f"{name}.{parameter} = {quantity(p.value, p.unit)} ({field})"
         for name, part in unit.parts.items()
         for parameter, field in power_flow_of(part.source).items()
         if parameter not in record_of(part.source) and (p := shelf_model(part.source).parameters[parameter])
     ]
-    if not found:
+    if not on_shelf:
         return ""
-    return f"no power flow (a .raw file) is given, which has these: {listed(found)}, as on the shelf"
+    return f"no power flow (a .raw file) is given, which has these: {listed(on_shelf)}, as on the shelf"
 
 
 def _unused_values(records: Sequence[DyrRecord]) -> Iterator[str]:
     """Yield the values of the records that the components do not use, but for zeros, which ask for nothing."""
-    found = [
+    unused = [
         f"value {k + 1} of {r.model} ({v:g})" if isinstance(v, float) else f"value {k + 1} of {r.model} ('{v}')"
         for r in records
         if (source := source_of(r.model)) is not None
         for k, (name, v) in enumerate(zip(record_of(source), r.values, strict=True))
         if name == "-" and v is not None and v != 0.0 and v != ""
     ]
-    if found:
-        yield f"not used of the records, as a remote bus or branch: {listed(found)}"
+    if unused:
+        yield f"not used of the records, as a remote bus or branch: {listed(unused)}"
 
 
 def _left_out(unit: RecordedUnit, asked: Collection[str]) -> Iterator[str]:
@@ -147,14 +147,14 @@ def _left_out(unit: RecordedUnit, asked: Collection[str]) -> Iterator[str]:
 def _open(unit: RecordedUnit) -> dict[tuple[str, str], str]:
     """Return by part and input the signal that no other part gives, though components of .dyr files do."""
     models = {n: shelf_model(p.source) for n, p in unit.parts.items()}
-    found = {}
+    signals = {}
     for name, model in models.items():
         others = {o for n, m in models.items() if n != name for o in m.outputs}
         for u in model.inputs:
             signal = AHEAD.get(u, u)
             if signal not in others and _giving([signal]):
-                found[name, u] = signal
-    return found
+                signals[name, u] = signal
+    return signals
 
 
 def _needed(open_: Mapping[tuple[str, str], str]) -> dict[tuple[str, str], str]:
@@ -187,8 +187,8 @@ def _near(record: DyrRecord, missing: Collection[str], open_: Collection[str]) -
     number = len(record.values)
     alike = nearest(record.model, [c.upper() for c in _giving(open_)])
     as_long = [c for c in lacking if len(record_of(c.lower())) == number]
-    found = [c for c in alike if c in as_long] or alike or as_long
-    if not found:
+    likely = [c for c in alike if c in as_long] or alike or as_long
+    if not likely:
         return f"; {listed(lacking)} give what is missing" if lacking else ""
-    why = ", by name" if found[0] in alike else f", with {number} values as well"
-    return f"; nearest on the shelf: {listed(found)}{why}: where it is that model, name it so in a copy of the .dyr"
+    why = ", by name" if likely[0] in alike else f", with {number} values as well"
+    return f"; nearest on the shelf: {listed(likely)}{why}: where it is that model, name it so in a copy of the .dyr"

@@ -35,8 +35,8 @@ def after_fit(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, 
     diagnosis, why = standing(study, "diagnose", folder)
     if why or not data["fingerprint"]:
         return {}
-    found = StageResults.read({"fit": data, "discrepancy": diagnosis})
-    return _files(study, found, folder) if counting_of(found.fit, found.diagnosis).name == "effect" else {}
+    results = StageResults.read({"fit": data, "discrepancy": diagnosis})
+    return _files(study, results, folder) if counting_of(results.fit, results.diagnosis).name == "effect" else {}
 
 
 def after_diagnosis(study: Study, folder: Path, data: Mapping[str, Any]) -> dict[str, str]:
@@ -52,9 +52,9 @@ def after_diagnosis(study: Study, folder: Path, data: Mapping[str, Any]) -> dict
     return _files(study, StageResults.read({"fit": fit, "discrepancy": data if data["fingerprint"] else {}}), folder)
 
 
-def _files(study: Study, found: StageResults, folder: Path) -> dict[str, str]:
-    assert found.fit is not None
-    return value_files(study, found.fit, found.of_fit.derived, found.diagnosis, folder)
+def _files(study: Study, results: StageResults, folder: Path) -> dict[str, str]:
+    assert results.fit is not None
+    return value_files(study, results.fit, results.of_fit.derived, results.diagnosis, folder)
 
 
 def value_files(
@@ -153,21 +153,21 @@ def _derived(study: Study, names: Iterable[str], values: Mapping[str, float]) ->
     if not is_white_box(study.model):
         return []
     known = {**study.model.values, **values}
-    found = []
+    comments = []
     for name in names:
         expression = study.model.signals[name].value
         value = float(expression.subs({s: known[s.name] for s in expression.free_symbols}))
-        found.append(f"# {name} = {expression} = {value!r}")
-    return found
+        comments.append(f"# {name} = {expression} = {value!r}")
+    return comments
 
 
 def _sizes(diagnosis: Diagnosis, model: AnyModel) -> dict[str, Estimate]:
     """Return the sizes of the effects as estimates, by the names of their parameters in the model."""
-    found = {}
+    sizes = {}
     for line in diagnosis.effects:
         use, catalogue = use_of(line), effects()[line.effect].parameters
         for name, size in line.parameters.items():
             own = use.parameter_name(name)
             if name in catalogue and own in model.parameters and model.parameters[own].value == size.value:
-                found[own] = Estimate(size.value, ci95=size.ci95)
-    return found
+                sizes[own] = Estimate(size.value, ci95=size.ci95)
+    return sizes

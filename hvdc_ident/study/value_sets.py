@@ -97,12 +97,12 @@ def value_set(study: Study, wanted: str | None, folder: Path | None = None) -> V
         return _asked(results, results.with_effect("effect") if results.counts.added else None, results.no_effect)
     if wanted == "fit":
         return _asked(results, results.of_fit("fit") if results.fit else None, results.no_fit)
-    found, why = results.fitted()
+    fitted, why = results.fitted()
     if wanted == "fitted":
-        return _asked(results, found, why)
-    if found is not None and not why:
-        return found
-    return _given(study, "" if why == NONE else why, (NextStep("values", "fitted"),) if found is not None else ())
+        return _asked(results, fitted, why)
+    if fitted is not None and not why:
+        return fitted
+    return _given(study, "" if why == NONE else why, (NextStep("values", "fitted"),) if fitted is not None else ())
 
 
 def fitted_values(study: Study, folder: Path) -> tuple[ValueSet | None, str]:
@@ -114,10 +114,10 @@ def fitted_values(study: Study, folder: Path) -> tuple[ValueSet | None, str]:
     return _Results.of(study, folder).fitted()
 
 
-def _asked(results: _Results, found: ValueSet | None, why: str) -> ValueSet:
+def _asked(results: _Results, values: ValueSet | None, why: str) -> ValueSet:
     """The values that were asked for by name. Raises StudyError, with the reason, where there are none."""
-    if found is not None:
-        return found
+    if values is not None:
+        return values
     command: NextKind = "diagnose" if why == results.no_effect else "fit"
     raise StudyError(
         f"there are no {'values with an effect' if command == 'diagnose' else 'fitted values'}: {why}",
@@ -177,10 +177,10 @@ class _Results:
         """Return the values that count, and why they are not to be taken unasked."""
         if not self.counts.name:
             return None, self.no_fit
-        found = self.with_effect("fitted") if self.counts.name == "effect" else self.of_fit("fitted")
+        values = self.with_effect("fitted") if self.counts.name == "effect" else self.of_fit("fitted")
         if self.fit is not None and self.fit.status in NOT_BY_ITSELF:
-            return found, f"the fit in {self.folder} ended as {self.fit.status}: {self.fit.message}"
-        return found, ""
+            return values, f"the fit in {self.folder} ended as {self.fit.status}: {self.fit.message}"
+        return values, ""
 
     def of_fit(self, name: Literal["fitted", "fit"]) -> ValueSet:
         """Return the values of the fit, by that name."""

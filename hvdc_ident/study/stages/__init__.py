@@ -134,15 +134,15 @@ def stages() -> tuple[Stage, ...]:
     """Every stage, in the order of a run, found by walking `stages/`."""
     from hvdc_ident.study import stages as folder
 
-    found = [
+    every = [
         importlib.import_module(f"{folder.__name__}.{m.name}").STAGE for m in pkgutil.iter_modules(folder.__path__)
     ]
-    return tuple(sorted(found, key=lambda s: (s.order, s.name)))
+    return tuple(sorted(every, key=lambda s: (s.order, s.name)))
 
 
 def stage(name: str) -> Stage:
     """The stage of that name. Raises UnknownNameError."""
-    for found in stages():
-        if found.name == name:
-            return found
+    for each in stages():
+        if each.name == name:
+            return each
     raise unknown_name("stage", name, [s.name for s in stages()])

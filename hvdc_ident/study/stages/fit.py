@@ -60,10 +60,10 @@ def so_far(study: Study, known: Sequence[Known], options: StageOptions) -> Mappi
     from hvdc_ident.fit.result import FitSoFar
     from hvdc_ident.study import fitting
 
-    found = next((k for k in known if isinstance(k, FitSoFar) and k.result is not None), None)
-    if found is None or found.result is None:
+    fit = next((k for k in known if isinstance(k, FitSoFar) and k.result is not None), None)
+    if fit is None or fit.result is None:
         return {}
-    return {**found.result.to_dict(), **_context(study, fitting.problem_of(study), found.forced)}
+    return {**fit.result.to_dict(), **_context(study, fitting.problem_of(study), fit.forced)}
 
 
 def _context(study: Study, problem: Problem, forced: Sequence[str]) -> dict[str, Any]:

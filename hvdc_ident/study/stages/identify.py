@@ -41,8 +41,8 @@ def so_far(study: Study, known: Sequence[Known], options: StageOptions) -> Mappi
     from hvdc_ident.identifiability.unfinished import ReportSoFar
     from hvdc_ident.study.study import candidate_lines
 
-    found = next((k.report for k in known if isinstance(k, ReportSoFar)), None)
-    return {} if found is None else {**found.to_dict(), "candidates": candidate_lines(study)}
+    report = next((k.report for k in known if isinstance(k, ReportSoFar)), None)
+    return {} if report is None else {**report.to_dict(), "candidates": candidate_lines(study)}
 
 
 def judged(
@@ -138,11 +138,11 @@ def verdict(data: Mapping[str, Any]) -> str:
     for name, v in report.parameters.items():
         groups.setdefault(v.verdict, []).append(name)
     groups |= {"no verdict": [*report.unsettled]} if report.unsettled else {}
-    found = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
+    verdicts = "; ".join(f"{kind}: {', '.join(names)}" for kind, names in groups.items())
     unknown = misfit_sentence(report.pilot.outputs_of_misfit).rstrip(".")
     if report.misspecified:
-        found = f"the model does not explain these data; if nothing else is missing, {found}"
-    return "; ".join(part for part in (report.pilot.search_doubt, found, unknown) if part)
+        verdicts = f"the model does not explain these data; if nothing else is missing, {verdicts}"
+    return "; ".join(part for part in (report.pilot.search_doubt, verdicts, unknown) if part)
 
 
 STAGE = Stage(

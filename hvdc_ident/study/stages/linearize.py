@@ -37,18 +37,20 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         model = linear_model(study, selected)
     fields, files = _described(study, model, selected, options)
     given = LinearResult(**fields)
-    found, why = (None, "") if options.folder is None else fitted_values(study, options.folder)
-    if found is None or why:
+    estimated, why = (None, "") if options.folder is None else fitted_values(study, options.folder)
+    if estimated is None or why:
         return StageResult(Linearisation(given, None, why).to_dict(), files)
     fitted: FittedLinear | NoLinearModel
     try:
-        fields, more = _described(study, linear_model(study, found), found, options, like=given.modes)
-        fitted = FittedLinear(**fields, fit=found.fit, diagnosis=found.diagnosis)
+        fields, more = _described(study, linear_model(study, estimated), estimated, options, like=given.modes)
+        fitted = FittedLinear(**fields, fit=estimated.fit, diagnosis=estimated.diagnosis)
         files |= {f"fitted.{name}": text for name, text in more.items()}
     except HvdcIdentError as e:  # the given model is the answer all the same
         message = f"no linear model: {e}"
-        fitted = NoLinearModel(message, found.name, found.of, dict(found.values), found.fit, found.diagnosis)
-    return StageResult(Linearisation(given, fitted, found.note).to_dict(), files)
+        fitted = NoLinearModel(
+            message, estimated.name, estimated.of, dict(estimated.values), estimated.fit, estimated.diagnosis
+        )
+    return StageResult(Linearisation(given, fitted, estimated.note).to_dict(), files)
 
 
 def _described(
@@ -127,15 +129,15 @@ def lines_of(data: Mapping[str, Any]) -> list[str]:
     from hvdc_ident.summary.linear import Linearisation, NoLinearModel
     from hvdc_ident.text import listed
 
-    found = Linearisation.from_dict(data)
-    model = found.given.linear
+    both = Linearisation.from_dict(data)
+    model = both.given.linear
     ends = f"from {listed(model.input_names)} to {listed(model.output_names)}"
     lines = [f"{model.name}, linear model of {len(model.state_names)} states {ends}", "at the given values:"]
-    lines += found.given.lines
-    if found.at_fitted is not None:
-        return [*lines, f"at the {found.fitted_note}:", *found.at_fitted.lines]
-    why = found.why_none
-    if isinstance(found.fitted, NoLinearModel):
+    lines += both.given.lines
+    if both.at_fitted is not None:
+        return [*lines, f"at the {both.fitted_note}:", *both.at_fitted.lines]
+    why = both.why_none
+    if isinstance(both.fitted, NoLinearModel):
         return [*lines, f"At the fitted values there is {why}."]
     lines += [f"There is no linear model at fitted values: {why}. `hvdc-ident fit STUDY` fits it."] if why else []
     return [*lines, "Next: `hvdc-ident export STUDY --to FILE.mat` (.json, .csv, .m) writes A, B, C and D."]
@@ -154,11 +156,11 @@ def verdict(data: Mapping[str, Any]) -> str:
     from hvdc_ident.summary.linear import Linearisation
 
     both = Linearisation.from_dict(data)
-    found = both.at_fitted or both.given
+    model = both.at_fitted or both.given
     least = next(
-        (f"; least damped mode {m.mode.frequency_hz:.4g} Hz, {100 * m.mode.damping:.3g} %" for m in found.swinging), ""
+        (f"; least damped mode {m.mode.frequency_hz:.4g} Hz, {100 * m.mode.damping:.3g} %" for m in model.swinging), ""
     )
-    return f"{_AT[found.set]}: {found.verdict or 'no states'}{least}"
+    return f"{_AT[model.set]}: {model.verdict or 'no states'}{least}"
 
 
 STAGE = Stage(

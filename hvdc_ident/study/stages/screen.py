@@ -44,14 +44,14 @@ def run(study: Study, options: StageOptions, earlier: Mapping[str, Any]) -> Stag
         }
         asked_for = (study.model, study.experiments, ranges)
         if asked.method == "morris":
-            found = morris(*asked_for, trajectories=asked.trajectories, **common)
+            screening = morris(*asked_for, trajectories=asked.trajectories, **common)
         else:
-            found = sobol(*asked_for, samples=asked.samples, **common)
+            screening = sobol(*asked_for, samples=asked.samples, **common)
     data = {
-        **found.to_dict(),
+        **screening.to_dict(),
         "against": asked.against,
         "ranges": {n: list(r) for n, r in ranges.items()},
-        "units": {o: study.model.outputs[o].unit for o, _ in found.series},
+        "units": {o: study.model.outputs[o].unit for o, _ in screening.series},
     }
     return StageResult(data)
 
@@ -60,12 +60,12 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """The parameters of each output and experiment, the one that matters most first."""
     from hvdc_ident.sensitivity import ScreeningResult
 
-    found = ScreeningResult.from_dict(data)
-    words = "mean effect" if found.method == "morris" else "total share"
-    lines = [f"{found.evaluations} runs, {found.failed} failed"]
-    for output, experiment in found.series:
-        unit = f" {data['units'][output]}".rstrip() if found.method == "morris" else ""
-        each = ", ".join(f"{p} {m[found.measure]:.3g}{unit}" for p, m in found.of(output, experiment).items())
+    screening = ScreeningResult.from_dict(data)
+    words = "mean effect" if screening.method == "morris" else "total share"
+    lines = [f"{screening.evaluations} runs, {screening.failed} failed"]
+    for output, experiment in screening.series:
+        unit = f" {data['units'][output]}".rstrip() if screening.method == "morris" else ""
+        each = ", ".join(f"{p} {m[screening.measure]:.3g}{unit}" for p, m in screening.of(output, experiment).items())
         lines.append(f"{output} in {experiment}, {words} on the RMSE: {each}")
     return lines
 
@@ -74,10 +74,10 @@ def verdict(data: Mapping[str, Any]) -> str:
     """Return the parameter that matters most to each output, by its mean over the experiments."""
     from hvdc_ident.sensitivity import ScreeningResult
 
-    found = ScreeningResult.from_dict(data)
+    screening = ScreeningResult.from_dict(data)
     total = {
-        o: {p: sum(m[p][found.measure] for m in line.values()) for p in found.parameters}
-        for o, line in found.measures.items()
+        o: {p: sum(m[p][screening.measure] for m in line.values()) for p in screening.parameters}
+        for o, line in screening.measures.items()
     }
     return ", ".join(f"{max(each, key=lambda p: each[p])} moves {o} most" for o, each in total.items())
 

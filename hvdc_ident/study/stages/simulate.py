@@ -146,27 +146,27 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
         return []
     held = f", {roles.count('holdout')} of them held out" if "holdout" in roles else ""
     recordings = f"{len(roles)} recording{'s' if len(roles) > 1 else ''}{held}"
-    found = [f"{data['model']} at its given values against {recordings}:", ""]
+    lines = [f"{data['model']} at its given values against {recordings}:", ""]
     rows = []
     for g in gaps[:ROWS]:
         percent = None if g.nrmse is None else rounded(100.0 * g.nrmse, 3)
         name = (g.output, g.experiment, about.experiments[g.experiment].role)
         rows.append((*name, rounded(g.rmse), g.unit, percent, rounded(g.noise_units, 3)))
     header = ("output", "recording", "role", "RMSE", "unit", "NRMSE, %", "RMSE/noise")
-    found += str(Table(header, tuple(rows)).without_empty()).splitlines()
-    found += [f"and {len(gaps) - ROWS} more, with smaller errors"] if len(gaps) > ROWS else []
+    lines += str(Table(header, tuple(rows)).without_empty()).splitlines()
+    lines += [f"and {len(gaps) - ROWS} more, with smaller errors"] if len(gaps) > ROWS else []
     g = gaps[0]
     by = f"{quantity(abs(g.largest), g.unit)} {'above' if g.largest > 0 else 'below'} the model"
-    found += ["", "NRMSE: RMSE over the recorded range of the output."]
-    found += [f"Worst signal: {g.text}.", f"Its largest gap: the recording is {by} at {g.at:.6g} s."]
+    lines += ["", "NRMSE: RMSE over the recorded range of the output."]
+    lines += [f"Worst signal: {g.text}.", f"Its largest gap: the recording is {by} at {g.at:.6g} s."]
     if about.candidates:
         names = listed(about.candidates)
-        found.append(f"Next: `hvdc-ident fit STUDY` estimates what the recordings determine of {names}.")
+        lines.append(f"Next: `hvdc-ident fit STUDY` estimates what the recordings determine of {names}.")
     else:
-        found.append(
+        lines.append(
             "Next: name what may be estimated in [parameters], NAME = {min = ..., max = ...}; then `hvdc-ident fit STUDY`."
         )
-    return found
+    return lines
 
 
 def verdict(data: Mapping[str, Any]) -> str:

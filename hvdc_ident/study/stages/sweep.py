@@ -118,17 +118,17 @@ def lines_of(data: Mapping[str, Any]) -> Sequence[str]:
     """Return the number of points, the reason of the first that failed, and where the error of each series is smallest."""
     from hvdc_ident.sensitivity import SweepSummary
 
-    found = SweepSummary.from_dict(data)
-    first = f"; the first: {found.failure}" if found.failure else ""
-    return [f"{found.text}, {found.failed} failed{first}", *(series.text for series in found.best)]
+    summary = SweepSummary.from_dict(data)
+    first = f"; the first: {summary.failure}" if summary.failure else ""
+    return [f"{summary.text}, {summary.failed} failed{first}", *(series.text for series in summary.best)]
 
 
 def verdict(data: Mapping[str, Any]) -> str:
     """Return the number of points and of those that failed."""
     from hvdc_ident.sensitivity import SweepSummary
 
-    found = SweepSummary.from_dict(data)
-    return f"{found.text}, {found.failed or 'none'} failed"
+    summary = SweepSummary.from_dict(data)
+    return f"{summary.text}, {summary.failed or 'none'} failed"
 
 
 STAGE = Stage(
