@@ -23,21 +23,21 @@ def notes_of(model: Model, point: OperatingPoint) -> tuple[str, ...]:
     free = resting(model)
     at = equilibria(free)
     v = np.array([*point.y, *point.extras.values()])
-    found = []
+    sentences = []
     if point.branch == "unconnected":
-        found.append(
+        sentences.append(
             "Followed from the model's own values, its steady state ends at a jump before these: this one is from a new search."
         )
     if point.branch == "other":
         own = at.start(free, point.p, point.w[1 : 1 + len(point.inputs)], point.time).v
-        found.append(f"This is not the model's own steady state, which stands at {at.text(own)}.")
+        sentences.append(f"This is not the model's own steady state, which stands at {at.text(own)}.")
     far = at.far(v)
     if far:
         shown = ", ".join(f"'{n}' at {point.states[n]:.4g} (guess {free.states[n].guess:g})" for n in far)
-        found.append(f"Far outside the states' own range: {shown}.")
+        sentences.append(f"Far outside the states' own range: {shown}.")
     if point.stable is False:
-        found.append(f"{unstable_by(point.equation)} {_elsewhere(model, at, point, v)}")
-    return tuple(found)
+        sentences.append(f"{unstable_by(point.equation)} {_elsewhere(model, at, point, v)}")
+    return tuple(sentences)
 
 
 def equation_at(model: Model, point: OperatingPoint, y: Array, w: Array) -> Characteristic | None:

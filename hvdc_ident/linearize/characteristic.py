@@ -85,17 +85,17 @@ class Part:
     def pencil(self, s: Array) -> Array:
         """(frequencies, rows, columns) of the matrix whose determinant is the characteristic function."""
         n, e = self.nx, len(self.channels)
-        found = -self.factors(s)[:, :, None] * self.matrix
-        found[:, range(n), range(n)] += s[:, None]
-        found[:, range(n, n + e), range(n, n + e)] += 1.0
-        return np.asarray(found)
+        pencil = -self.factors(s)[:, :, None] * self.matrix
+        pencil[:, range(n), range(n)] += s[:, None]
+        pencil[:, range(n, n + e), range(n, n + e)] += 1.0
+        return np.asarray(pencil)
 
     def pencil_by_s(self, s: Array) -> Array:
         """The derivative of the pencil by s."""
         n = self.nx
-        found = -self.factors_by_s(s)[:, :, None] * self.matrix
-        found[:, range(n), range(n)] += 1.0
-        return np.asarray(found)
+        slope = -self.factors_by_s(s)[:, :, None] * self.matrix
+        slope[:, range(n), range(n)] += 1.0
+        return np.asarray(slope)
 
     def pencil_along(self, s: Array, matrix: Array, times: Sequence[Array]) -> Array:
         """Return the derivative of the pencil for a derivative of the matrix and of the delays' times."""
@@ -103,10 +103,10 @@ class Part:
 
     def _by_row(self, s: Array, of_states: float, of_delays: Sequence[Array | complex]) -> Array:
         """Return (frequencies, rows) one number for all states, and those of the delays."""
-        found = np.full((s.size, self.nx + len(of_delays)), of_states, dtype=complex)
+        rows = np.full((s.size, self.nx + len(of_delays)), of_states, dtype=complex)
         for k, values in enumerate(of_delays):
-            found[:, self.nx + k] = values
-        return found
+            rows[:, self.nx + k] = values
+        return rows
 
     def _of_delays(self, function: Callable[[str, float, float, Array], T], s: Array) -> list[T]:
         """Return a function of kind, time, compute time and frequencies for each delay, at the edge of the search left of it."""
@@ -158,10 +158,10 @@ class Part:
         through = np.linalg.eigvals(self.factors(s)[0, n:, None] * inner)
         phase = n * np.angle(s[0]) + np.angle(1.0 - np.linalg.eigvals(a) / s[0]).sum() if n else 0.0
         phase += np.angle(1.0 - through).sum()
-        found = (phase - self._turned(line, top)) / np.pi
-        if abs(found - round(found)) > 1e-3:
-            raise Undecided("the phase of the characteristic function does not close", got=f"{found:.6g} turns")
-        return round(found)
+        turns = (phase - self._turned(line, top)) / np.pi
+        if abs(turns - round(turns)) > 1e-3:
+            raise Undecided("the phase of the characteristic function does not close", got=f"{turns:.6g} turns")
+        return round(turns)
 
     def _turned(self, line: float, top: float) -> float:
         """Return the change of the determinant's phase from `line` to `line + j top`."""
@@ -256,11 +256,11 @@ class Part:
         """Return the derivative of ln det; infinite on a root."""
         pencil, slope = self.pencil(s), self.pencil_by_s(s)
         good = np.asarray(np.isfinite(pencil).all(axis=(1, 2)) & np.isfinite(slope).all(axis=(1, 2)))
-        found = np.full(s.size, np.nan, dtype=complex)
-        found[good] = np.inf
+        derivative = np.full(s.size, np.nan, dtype=complex)
+        derivative[good] = np.inf
         good &= np.linalg.slogdet(np.where(good[:, None, None], pencil, np.eye(pencil.shape[1])))[0] != 0
-        found[good] = np.trace(np.linalg.solve(pencil[good], slope[good]), axis1=1, axis2=2)
-        return found
+        derivative[good] = np.trace(np.linalg.solve(pencil[good], slope[good]), axis1=1, axis2=2)
+        return derivative
 
     def _distinct(self, s: Array) -> Array:
         """Return the roots once each, real ones and conjugate pairs made exact."""

@@ -44,7 +44,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     whole, means = equation.whole, sliding_means(equation)
     names = (*model.state_names[: equation.nx], *(c.name for c in equation.channels))
     slowest = np.argsort(np.abs(roots), kind="stable")[:means]
-    found = []
+    rightmost = []
     for k, root in enumerate(roots):
         apart = np.abs(roots - root) > ALIKE * max(abs(root), 1e-3 * whole.unit)
         place = int((~apart[:k]).sum())  # among the roots that are alike
@@ -64,7 +64,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
             if g.exact is not None
         }
         mean = k in slowest and root == 0
-        found.append(
+        rightmost.append(
             Mode(
                 complex(root),
                 abs(float(root.imag)) / (2 * np.pi),
@@ -77,7 +77,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
                 else kind_of_mode(complex(root), *reached(equation, complex(root), (right, left))),
             )
         )
-    return tuple(found)
+    return tuple(rightmost)
 
 
 def _owner(equation: Characteristic, root: complex, unit: float, place: int) -> tuple[Array, int, int]:
@@ -85,8 +85,8 @@ def _owner(equation: Characteristic, root: complex, unit: float, place: int) -> 
 
     place: of the root among those that are alike, which may be of several parts: the first ones are of the first part.
     """
-    for places, found in equation.roots_by_part:
-        values = found.values if found.averaged is None else found.averaged
+    for places, own in equation.roots_by_part:
+        values = own.values if own.averaged is None else own.averaged
         times = times_at(values, root, unit)
         if place < times:
             return places, times, place

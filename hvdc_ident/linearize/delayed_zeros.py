@@ -50,11 +50,11 @@ def exact_zeros(equation: Characteristic) -> Array:
     starts = np.concatenate([zeros(*_approximate(equation, order)) for order in ORDERS])
     longest = float(equation.whole.lengths.max())
     spread = REACH / longest * np.array([0.1, 0.4, 0.9])[:, None] * np.exp(1j * np.pi * (np.arange(12) + 0.5) / 12)
-    found = part.refined(np.concatenate([starts, spread.ravel()]))
-    times = [part.multiplicity(v, found) for v in found]
-    found = np.repeat(found, times)
-    radius = _clear(found, REACH / longest)
-    inside, counted = int((np.abs(found) < radius).sum()), _counted(part, radius)
+    roots = part.refined(np.concatenate([starts, spread.ravel()]))
+    times = [part.multiplicity(v, roots) for v in roots]
+    roots = np.repeat(roots, times)
+    radius = _clear(roots, REACH / longest)
+    inside, counted = int((np.abs(roots) < radius).sum()), _counted(part, radius)
     if inside != counted:
         raise LinearizationError(
             "not every zero is found: with delays they are roots of a transcendental equation",
@@ -62,10 +62,10 @@ def exact_zeros(equation: Characteristic) -> Array:
             hint="the zeros of the Pade approximant: LinearModel.from_dict(model.to_dict()).zeros()",
         )  # fmt: skip
     if other is part:
-        return found
-    again = other.refined(found)
+        return roots
+    again = other.refined(roots)
     return np.array(
-        [v for v in found if again.size and np.abs(again - v).min() <= ALIKE * max(abs(v), part.unit)], dtype=complex
+        [v for v in roots if again.size and np.abs(again - v).min() <= ALIKE * max(abs(v), part.unit)], dtype=complex
     )
 
 
@@ -112,9 +112,9 @@ def _approximate(equation: Characteristic, order: int) -> tuple[Array, Array, Ar
     return quartered(approximants.closed(whole, equation.nx).result, equation.nx + len(approximants.a))
 
 
-def _clear(found: Array, radius: float) -> float:
+def _clear(roots: Array, radius: float) -> float:
     """Return a radius near one, in the widest gap between the zeros about it."""
-    sizes = np.sort(np.abs(found))
+    sizes = np.sort(np.abs(roots))
     sizes = np.unique(np.concatenate([[0.7 * radius], sizes[(sizes > 0.7 * radius) & (sizes < radius)], [radius]]))
     k = int(np.argmax(np.diff(sizes)))
     return float(0.5 * (sizes[k] + sizes[k + 1]))

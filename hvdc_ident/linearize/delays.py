@@ -159,13 +159,13 @@ def channels(model: Model, s: CompiledSystem, p: Array) -> tuple[Channel, ...]:
     """Every delay and sampled block with its times at parameters p."""
     times = s.timing(p)
     nd, nq = len(model.delays), len(model.sampled)
-    found = [Channel(n, "delay", float(times[k]), 0.0, (k,), np.ones(1)) for k, n in enumerate(model.delays)]
+    every = [Channel(n, "delay", float(times[k]), 0.0, (k,), np.ones(1)) for k, n in enumerate(model.delays)]
     for k, n in enumerate(model.sampled):
         places = (nd + k, nd + nq + k)
-        found.append(
+        every.append(
             Channel(n, "sampled", float(times[nd + k]), float(times[nd + nq + k]), places, np.array([0.5, 1.0]))
         )
-    return tuple(found)
+    return tuple(every)
 
 
 def _order(size: Layout, inputs: list[int], closed: Sequence[int]) -> tuple[list[int], list[int]]:

@@ -75,8 +75,8 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
 
     Raises as `linearize` does.
     """
-    found = channels(model, s, p)
-    closed = [k for k, c in enumerate(found) if c.total == 0.0]
+    delays = channels(model, s, p)
+    closed = [k for k, c in enumerate(delays) if c.total == 0.0]
     reduced = without_unknowns(s.layout, jacobian_at(model, s, y, w, p)[1], list(range(s.layout.nu)), closed)
     if reduced.condition > WELL_POSED:
         raise LinearizationError(
@@ -85,7 +85,7 @@ def characteristic(model: Model, s: CompiledSystem, y: Array, w: Array, p: Array
             got=f"condition number {reduced.condition:.2g}",
             hint="use linearize(), which keeps it as a descriptor",
         )
-    return Characteristic.of(reduced, s.layout.nx, tuple(c for c in found if c.total > 0.0))
+    return Characteristic.of(reduced, s.layout.nx, tuple(c for c in delays if c.total > 0.0))
 
 
 def _refuse_flat_roots(s: CompiledSystem, y: Array, w: Array, p: Array, modes: Array, model: str) -> None:

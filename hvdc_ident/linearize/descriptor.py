@@ -50,5 +50,5 @@ class Descriptor:
         finite = np.abs(beta) > 1e-12 * largest
         values = np.asarray(alpha[finite] / beta[finite], dtype=complex)
         off = np.full(values.size, 10.0 * len(self.e) * EPS * float(np.abs(values).max(initial=0.0)))
-        found = counted_eigenvalues(values, off)
-        return replace(found, values=first_roots([found.values], None))
+        roots = counted_eigenvalues(values, off)
+        return replace(roots, values=first_roots([roots.values], None))

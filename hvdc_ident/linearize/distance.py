@@ -57,8 +57,8 @@ def nu_gap(first: LinearModel, second: LinearModel) -> NuGap:
     --------
     >>> import hvdc_ident as hi
     >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
-    >>> found = hi.linear.nu_gap(hi.linearize(lag), hi.linearize(lag, values={"k": 1.0}))
-    >>> round(found.value, 3), found.winding
+    >>> gap = hi.linear.nu_gap(hi.linearize(lag), hi.linearize(lag, values={"k": 1.0}))
+    >>> round(gap.value, 3), gap.winding
     (0.333, 0)
     """
     same_channels(first, second)
@@ -197,15 +197,15 @@ def ncf_margin(plant: LinearModel, controller: LinearModel | None = None) -> Pea
             got=f"{len(controller.input_names)} inputs and {len(controller.output_names)} outputs",
         )
     closed = _four_blocks(visible(plant), visible(controller), f"'{plant.name}' with '{controller.name}'")
-    found = stability(closed)
-    if found.verdict == "not decided":
+    judged = stability(closed)
+    if judged.verdict == "not decided":
         raise LinearizationError(
             "whether the loop is stable cannot be told",
             where=f"'{plant.name}' with '{controller.name}'",
-            got=found.reason,
+            got=judged.reason,
         )
-    if found.verdict != "stable":
-        return Peak(0.0, float("nan") if found.rightmost is None else abs(found.rightmost.imag))
+    if judged.verdict != "stable":
+        return Peak(0.0, float("nan") if judged.rightmost is None else abs(judged.rightmost.imag))
     grid = np.unique(np.concatenate([wide_omega(m, 4000 if closed.channels else 400) for m in (plant, controller)]))
     peak = largest_gain(closed, grid)
     return Peak(1.0 / peak.value, peak.omega)
@@ -216,9 +216,9 @@ def _attainable(plant: LinearModel) -> float:
 
     The factors are those of the Riccati equation (Vidyasagar 1988), delays in their Pade form.
     """
-    found = approximate_visible(plant)
-    a, b, c, d = found.matrices
-    if found.nx == 0:
+    equation = approximate_visible(plant)
+    a, b, c, d = equation.matrices
+    if equation.nx == 0:
         return 1.0
     m = b.shape[1]
     r = np.eye(m) + d.T @ d

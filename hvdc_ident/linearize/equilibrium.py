@@ -393,24 +393,24 @@ class EquilibriumSearch:
 
 def _starts(model: Model, s: CompiledSystem, p: Array) -> dict[str, float]:
     """Return the starting value of each state and unknown, as far as the model gives one."""
-    found = {n: st.guess for n, st in model.states.items() if st.guess is not None}
-    found |= {s.states[k]: v for k, v in s.start_values(p).items() if np.isfinite(v)}
-    return found | {n: model.algebraic[n].start for n in s.unknowns}
+    starts = {n: st.guess for n, st in model.states.items() if st.guess is not None}
+    starts |= {s.states[k]: v for k, v in s.start_values(p).items() if np.isfinite(v)}
+    return starts | {n: model.algebraic[n].start for n in s.unknowns}
 
 
 def _all_starts(
     model: AnyModel, start: Mapping[str, float], bounds: Mapping[str, tuple[float, float]]
 ) -> dict[str, float]:
     """Return these, the values of inputs and parameters, and the middle of bounds of what has none."""
-    found = {
+    starts = {
         **start,
         **{n: i.value for n, i in model.inputs.items()},
         **{n: q.value for n, q in model.parameters.items()},
     }
     for n, (low, high) in bounds.items():
-        if n not in found and np.isfinite(low + high):
-            found[n] = 0.5 * (low + high)
-    return found
+        if n not in starts and np.isfinite(low + high):
+            starts[n] = 0.5 * (low + high)
+    return starts
 
 
 def _equation_rows(s: System, at: At, moving: Collection[str]) -> tuple[int, ...]:

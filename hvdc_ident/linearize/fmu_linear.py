@@ -53,14 +53,14 @@ class FmuSystem:
         given = dict(zip((*self.parameters, *self.inputs), (*p.tolist(), *w[1:].tolist()), strict=True))
         names = [self.parameters[k] for k in parameters]
         try:
-            found = at_point(self.model, given, y, self.outputs, names, float(w[0]), check=False)
+            at = at_point(self.model, given, y, self.outputs, names, float(w[0]), check=False)
         except SimulationError as e:
             if "returned" not in e.what:  # the FMU refused the point, which ends nothing: Newton takes a shorter step
                 raise
             return np.full(size.rows, np.nan), np.full(jac.shape, np.nan)
         places = [*range(size.nx), *(size.nx + k for k in self._smooth), *range(size.columns, jac.shape[1])]
-        jac[:, places] = found.jacobian
-        return np.concatenate([found.derivatives, found.outputs]), jac
+        jac[:, places] = at.jacobian
+        return np.concatenate([at.derivatives, at.outputs]), jac
 
     def limits(self, y: Array, w: Array, p: Array) -> tuple[Limit, ...]:
         """Return none: an FMU does not show them."""
@@ -101,8 +101,8 @@ class LinearFmu:
         n = len(point.states)
         a = point.search.system.evaluate(point.y, point.w, point.p)[1][:n, :n]
         none = np.zeros((n, 0))
-        found = Characteristic.rational(a, none, none.T, np.zeros((0, 0)), ACCURACY)
-        return found if np.isfinite(a).all() else None
+        equation = Characteristic.rational(a, none, none.T, np.zeros((0, 0)), ACCURACY)
+        return equation if np.isfinite(a).all() else None
 
     def notes(self, point: OperatingPoint) -> tuple[str, ...]:
         """Return a sentence on a point that is unstable."""
@@ -188,8 +188,8 @@ class LinearFmu:
 
         line = ParameterRuns(float, held[name], parameter.size, parameter.min, parameter.max, matrix)
         rule = extrapolated_difference(line, NUDGE * parameter.size)
-        (found,) = together([rule], lambda values: [at(value) for value in values])
-        return Gradient(*quartered(found, len(model.states)))
+        (slope,) = together([rule], lambda values: [at(value) for value in values])
+        return Gradient(*quartered(slope, len(model.states)))
 
 
 def _check_shown(model: FmuModel, asked: LinearOptions) -> None:

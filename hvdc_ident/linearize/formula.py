@@ -92,8 +92,8 @@ def symbolic_transfer(
     --------
     >>> import hvdc_ident as hi
     >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
-    >>> found = hi.linear.symbolic_transfer(lag, "u", "y", ["T"])
-    >>> found.rounded(3)
+    >>> transfer = hi.linear.symbolic_transfer(lag, "u", "y", ["T"])
+    >>> transfer.rounded(3)
     ('2.00', 'T*s + 1.0')
     """
     if model.delays or model.sampled:

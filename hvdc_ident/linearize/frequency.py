@@ -136,9 +136,9 @@ class FrequencyResponse(Shown):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> FrequencyResponse:
         """Return the response that `to_dict` wrote, without units. Raises InputError for anything else."""
-        found = read_fields(_Lists, data)
-        values = found.real + 1j * found.imag
-        return cls(found.omega, values, found.outputs, found.inputs, source=found.source, phase=found.phase_deg)
+        lists = read_fields(_Lists, data)
+        values = lists.real + 1j * lists.imag
+        return cls(lists.omega, values, lists.outputs, lists.inputs, source=lists.source, phase=lists.phase_deg)
 
 
 def transfer(model: LinearModel, s: Array) -> Array:
@@ -192,8 +192,8 @@ class _Resolved:
 
 
 def _refined(matrix: Array, given: Array) -> Array:
-    found = np.linalg.solve(matrix, given)
-    return np.asarray(found + np.linalg.solve(matrix, given - matrix @ found))
+    solution = np.linalg.solve(matrix, given)
+    return np.asarray(solution + np.linalg.solve(matrix, given - matrix @ solution))
 
 
 VISIBLE = 0.01
@@ -231,8 +231,8 @@ def _around(poles: Array, ends: Array, decades: float, points: int) -> Array:
 
 def _resonances(poles: Array, low: float, high: float) -> Array:
     """Return the frequencies of damped oscillations between two frequencies; on an undamped pole there is no response."""
-    found = np.abs(poles[np.abs(poles.real) > 1e-9 * np.abs(poles)].imag)
-    return np.asarray(found[(found > low) & (found < high)])
+    frequencies = np.abs(poles[np.abs(poles.real) > 1e-9 * np.abs(poles)].imag)
+    return np.asarray(frequencies[(frequencies > low) & (frequencies < high)])
 
 
 def _visible(model: LinearModel, poles: Array) -> Array:
@@ -266,11 +266,11 @@ Sloped = Callable[[Array], tuple[Array, Array, Array]]
 
 def by_s(model: LinearModel, s: Array) -> tuple[Array, Array, Array]:
     """Return the response at complex frequencies, its derivative by s and a bound on its rounding errors; delays exact."""
-    found, equation = [], model.equation
+    resolved, equation = [], model.equation
     for part in np.array_split(s, 1 + s.size * model.A.size // 2_000_000):
         at = _Resolved.of(equation, part)
-        found.append((at.values, at.along(*equation.pencil_by_s(part)), at.rounding))
-    values, slopes, rounding = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        resolved.append((at.values, at.along(*equation.pencil_by_s(part)), at.rounding))
+    values, slopes, rounding = (np.concatenate(parts) for parts in zip(*resolved, strict=True))
     return values, slopes, rounding
 
 

@@ -64,13 +64,13 @@ class Closing:
     def ends(self) -> list[Crossing]:
         """Return the crossings at 0 and at infinity, and where a gain around delays alone reaches 1; loops that are stable."""
         closed = self._closed(1.0)
-        found = []
+        crossings = []
         for omega, complementary in ((0.0, closed.response(np.zeros(1))[0]), (float("inf"), closed.through)):
             t = float(complementary[self.place, self.place].real)
             factor = (t - 1.0) / t if t else float("inf")  # -1/L with L = T/(1 - T)
             if 1.0 / UNLIMITED < factor < UNLIMITED:
-                found.append(Crossing(omega, factor))
-        return found + self._neutral()
+                crossings.append(Crossing(omega, factor))
+        return crossings + self._neutral()
 
     def _neutral(self) -> list[Crossing]:
         n = self.open.nx
@@ -80,14 +80,14 @@ class Closing:
         def excess(log: float) -> float:
             return spectral_radius(self._closed(float(np.exp(log))).whole.direct) - 1.0
 
-        found = []
+        crossings = []
         for side in (1.0, -1.0):
             logs = side * np.linspace(0.0, np.log(UNLIMITED), 200)
             for low, high in pairwise(logs):
                 if excess(low) < 0.0 <= excess(high):
-                    found.append(Crossing(float("inf"), float(np.exp(brentq(excess, low, high, xtol=1e-14)))))
+                    crossings.append(Crossing(float("inf"), float(np.exp(brentq(excess, low, high, xtol=1e-14)))))
                     break
-        return found
+        return crossings
 
     def limit(self, crossings: Sequence[Crossing], side: int) -> Crossing:
         """Return the crossing at which stability is lost first when the gain rises (side 1) or falls (side -1).
@@ -110,10 +110,10 @@ class Closing:
             passed = after
         for factor in FAR:
             log = passed + float(np.log(factor))
-            found = self.at(float(np.exp(side * log)))
-            if found.verdict == "not decided":
+            judged = self.at(float(np.exp(side * log)))
+            if judged.verdict == "not decided":
                 break
-            if found.verdict != "stable":
+            if judged.verdict != "stable":
                 return self._bisected(passed, log, side)
         return Crossing(float("inf"), float("inf") if side > 0 else 0.0)
 
@@ -152,9 +152,9 @@ def crossing_frequencies(a: Array, b: Array, c: Array, d: Array) -> Array:
         np.concatenate([-c, d @ c], axis=1),
         1.0 - d @ d,
     )
-    found = np.concatenate([odd, even])
-    found = found[np.isfinite(found)]
-    return np.unique(np.abs(found[np.abs(found.real) < 1e-3 * np.abs(found)].imag))
+    roots = np.concatenate([odd, even])
+    roots = roots[np.isfinite(roots)]
+    return np.unique(np.abs(roots[np.abs(roots.real) < 1e-3 * np.abs(roots)].imag))
 
 
 TURN = 0.3

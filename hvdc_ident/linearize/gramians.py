@@ -24,9 +24,9 @@ def reached_gramian(a: Array, b: Array) -> Array:
     for j in reversed(range(len(t))):
         right = -driven @ driven[j].conj() - y[:, j + 1 :] @ t[j, j + 1 :].conj()
         y[:, j] = scipy.linalg.solve_triangular(t + t[j, j].conj() * np.eye(len(t)), right)
-    found = np.zeros(a.shape)
-    found[np.ix_(order, order)] = np.outer(scale, scale) * (q @ y @ q.conj().T).real
-    return found
+    gramian = np.zeros(a.shape)
+    gramian[np.ix_(order, order)] = np.outer(scale, scale) * (q @ y @ q.conj().T).real
+    return gramian
 
 
 def seen_gramian(a: Array, c: Array) -> Array:

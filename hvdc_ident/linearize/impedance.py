@@ -188,11 +188,11 @@ def port_sensitivity(linear: LinearModel, port: Port, omega: Array, kind: str, n
     top, bottom = _parts(linear.response(omega), port, kind)
     inverse = np.linalg.inv(bottom)
     ratio = top @ inverse
-    found = []
+    slopes = []
     for slope in sensitivity(linear, omega, names).values():
         d_top, d_bottom = _parts(slope, port, kind)
-        found.append((d_top - ratio @ d_bottom) @ inverse)
-    return np.stack(found, axis=-1) if found else np.zeros((*ratio.shape, 0), dtype=complex)
+        slopes.append((d_top - ratio @ d_bottom) @ inverse)
+    return np.stack(slopes, axis=-1) if slopes else np.zeros((*ratio.shape, 0), dtype=complex)
 
 
 def _parts(values: Array, port: Port, kind: str) -> tuple[Array, Array]:
@@ -310,22 +310,22 @@ class MeasuredResponse:
     def seen(self, linear: LinearModel, names: Sequence[str] = ()) -> tuple[Array, Array]:
         """Return the same of a linear model that `linear` gave."""
         if self.port is None:
-            found = linear.response(self.omega)
-            slopes = np.zeros((*found.shape, 0), dtype=complex)
+            values = linear.response(self.omega)
+            slopes = np.zeros((*values.shape, 0), dtype=complex)
             if names:
                 slopes = np.stack([*sensitivity(linear, self.omega, names).values()], axis=-1)
         else:
-            found = port_values(linear, self.port, self.omega, self.kind)
+            values = port_values(linear, self.port, self.omega, self.kind)
             slopes = port_sensitivity(linear, self.port, self.omega, self.kind, names)
-        return self._channels_of(linear, found), self._channels_of(linear, slopes)
+        return self._channels_of(linear, values), self._channels_of(linear, slopes)
 
     def phase(self, linear: LinearModel) -> Array:
         """Return (n, channels) degrees of the response of a linear model that `linear` gave, turns between frequencies counted."""
         if self.port is None:
-            found = phase_of(linear, self.omega)
+            degrees = phase_of(linear, self.omega)
         else:
-            found = port_phase(linear, self.port, self.omega, self.kind)
-        return self._channels_of(linear, found)
+            degrees = port_phase(linear, self.port, self.omega, self.kind)
+        return self._channels_of(linear, degrees)
 
     def _channels_of(self, linear: LinearModel, values: Array) -> Array:
         """Return the measured channels, (n, channels, ...), of (n, outputs, inputs, ...)."""
@@ -358,7 +358,7 @@ class MeasuredResponse:
         factor: what the model's response times it meets the measured one best by, where that is no matter of a gain alone
         (negative, or over 2 or below a half) and explains nine tenths of the squared error; else None.
         """
-        found = []
+        by_channel = []
         for k, label in enumerate(self.labels):
             measured, model = self.values[:, k], model_values[:, k]
             apart = model - measured
@@ -369,7 +369,7 @@ class MeasuredResponse:
             size = float(np.sqrt(np.mean(np.abs(measured) ** 2)))
             first, second = int(np.argmax(np.abs(gain))), int(np.argmax(np.abs(phase)))
             chi2 = None if self.std is None else float(np.mean(np.abs(apart / self.std[:, k]) ** 2))
-            found.append(
+            by_channel.append(
                 {
                     "channel": label,
                     "relative": float(np.sqrt(np.mean(np.abs(apart) ** 2))) / size if size > 0 else None,
@@ -379,7 +379,7 @@ class MeasuredResponse:
                     "factor": _factor(measured, model),
                 }
             )
-        return found
+        return by_channel
 
 
 def _factor(measured: Array, model: Array) -> float | None:
@@ -430,8 +430,8 @@ def response_at_tones(
     >>> import numpy as np, hvdc_ident as hi
     >>> t = np.linspace(0.0, 10.0, 2001)
     >>> u = np.sin(2 * np.pi * t)
-    >>> found = hi.linear.response_at_tones(t, u, 2 * u + 0.1, np.array([2 * np.pi]))
-    >>> round(float(found.magnitude[0, 0, 0]), 9)
+    >>> response = hi.linear.response_at_tones(t, u, 2 * u + 0.1, np.array([2 * np.pi]))
+    >>> round(float(response.magnitude[0, 0, 0]), 9)
     2.0
     """
     t, u, y = (np.asarray(v, dtype=float) for v in (time, u, y))
@@ -509,8 +509,8 @@ def response_from_record(
     --------
     >>> import numpy as np, hvdc_ident as hi
     >>> t, u = np.arange(4000) * 0.01, np.random.default_rng(0).standard_normal(4000)
-    >>> found = hi.linear.response_from_record(t, u, 2 * u)
-    >>> bool(abs(found.magnitude - 2.0).max() < 1e-9), found.coherence.shape == found.values.shape
+    >>> response = hi.linear.response_from_record(t, u, 2 * u)
+    >>> bool(abs(response.magnitude - 2.0).max() < 1e-9), response.coherence.shape == response.values.shape
     (True, True)
     """
     import scipy.signal
@@ -602,8 +602,8 @@ def simulated_response(
     --------
     >>> import numpy as np, hvdc_ident as hi
     >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
-    >>> found = hi.linear.simulated_response(lag, "u", ["y"], [2.0, 6.0], 0.01)
-    >>> bool(np.allclose(found.values[:, 0, 0], 2.0 / (1.0 + 0.5j * found.omega), rtol=1e-5))
+    >>> response = hi.linear.simulated_response(lag, "u", ["y"], [2.0, 6.0], 0.01)
+    >>> bool(np.allclose(response.values[:, 0, 0], 2.0 / (1.0 + 0.5j * response.omega), rtol=1e-5))
     True
     """
     from hvdc_ident.simulate import simulate
@@ -633,13 +633,13 @@ def simulated_response(
 
     excited = rewritten(model, input, "multisine", multisine)
     run = simulate(excited, Experiment(time, "multisine"), values, outputs=list(outputs), rtol=rtol)
-    found = np.empty((harmonics.size, len(outputs), 1), dtype=complex)
+    response = np.empty((harmonics.size, len(outputs), 1), dtype=complex)
     drive = amplitude * np.exp(1j * (phases - np.pi / 2)) / 2
     for i, name in enumerate(outputs):
         spectrum = np.fft.fft(run.trajectory[name][1:]) / (count * periods)
-        found[:, i, 0] = spectrum[harmonics * periods] / drive
+        response[:, i, 0] = spectrum[harmonics * periods] / drive
     units = tuple((model.outputs[o].unit if o in model.outputs else "", model.inputs[input].unit) for o in outputs)
-    return FrequencyResponse(harmonics * base, found, tuple(outputs), (input,), units, source="simulation")
+    return FrequencyResponse(harmonics * base, response, tuple(outputs), (input,), units, source="simulation")
 
 
 def _settling(model: Model, values: Mapping[str, float]) -> float:

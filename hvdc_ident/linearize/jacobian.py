@@ -75,7 +75,7 @@ def steady(model: Model, search: EquilibriumSearch) -> tuple[Root, Branch]:
     free = model if search.at == "start" else resting(model)
     try:
         at = equilibria(free)
-        found = at.start(free, search.p, search.u, search.time)
+        start = at.start(free, search.p, search.u, search.time)
     except SteadyStateError as e:
         raise SteadyStateError(
             e.what,
@@ -84,11 +84,11 @@ def steady(model: Model, search: EquilibriumSearch) -> tuple[Root, Branch]:
             got=e.got,
             hint=f"{e.hint}; states that need not rest can be named in `moving`",
         ) from None
-    v = found.v
+    v = start.v
     with np.errstate(all="ignore"):
         r, jac = search.equations(v)
         shares = np.abs(r) / weights(jac, v)
-    return Root(v, r, shares, 0, "newton"), found.branch
+    return Root(v, r, shares, 0, "newton"), start.branch
 
 
 def _own(model: Model, search: EquilibriumSearch) -> Array | None:
@@ -107,16 +107,16 @@ def _linear_at(model: Model, at: OperatingPoint, asked: LinearOptions) -> Linear
     chosen = _chosen(s, asked.inputs, model.name)
     require_known("parameter", asked.sensitivities, s.parameters, f"model '{model.name}'")
     modes, jac = jacobian_at(model, s, at.y, at.w, at.p, asked.side)
-    found = channels(model, s, at.p)
+    delays = channels(model, s, at.p)
     which = [s.parameters.index(n) for n in asked.sensitivities]
-    closed = _closed(s, at.p, found, which)
-    kept = tuple(c for k, c in enumerate(found) if k not in closed)
+    closed = _closed(s, at.p, delays, which)
+    kept = tuple(c for k, c in enumerate(delays) if k not in closed)
     reduced = without_unknowns(s.layout, jac, chosen, closed)
     approximants = Approximants.of(kept, PADE_ORDER if asked.pade_order is None else asked.pade_order)
     whole = approximants.closed(reduced.result, s.layout.nx)
     condition = max(reduced.condition, whole.condition)
     descriptor = asked.descriptor or condition > WELL_POSED
-    if descriptor and found:
+    if descriptor and delays:
         raise LinearizationError(
             "the algebraic loop through a delay's direct part is ill-posed",
             where=f"model '{model.name}'",
@@ -184,13 +184,13 @@ def _provenance(
     return notes
 
 
-def _closed(s: CompiledSystem, p: Array, found: Sequence[Channel], which: list[int]) -> tuple[int, ...]:
+def _closed(s: CompiledSystem, p: Array, delays: Sequence[Channel], which: list[int]) -> tuple[int, ...]:
     """Return the places of the delays of 0 s that none of some parameters changes: they are no delays."""
-    zero = tuple(k for k, c in enumerate(found) if c.total == 0.0)
+    zero = tuple(k for k, c in enumerate(delays) if c.total == 0.0)
     if not zero or not which:
         return zero
     by_p = s.timing_by_parameters(p)[:, which]
-    return tuple(k for k in zero if not by_p[list(found[k].places)].any())
+    return tuple(k for k in zero if not by_p[list(delays[k].places)].any())
 
 
 def shift(s: CompiledSystem, at: OperatingPoint, which: list[int]) -> Array:

@@ -62,14 +62,14 @@ def conditions(structure: ModelEquations) -> tuple[Condition, ...]:
     g = structure.graph
     memo: dict[sp.Basic, int] = {}
     known = {v: k for k, v in enumerate(g.switches)}
-    found: dict[int, Condition] = {}
+    by_switch: dict[int, Condition] = {}
 
     def node(e: sp.Basic) -> int:
         return g.expression(e, structure.nodes, memo)
 
     def note(value: int, signal: str, kind: str, expression: object, level: object, sign: float = 1.0) -> None:
-        if value in known and known[value] not in found:
-            found[known[value]] = Condition(known[value], signal, kind, _text(expression), _text(level), sign)
+        if value in known and known[value] not in by_switch:
+            by_switch[known[value]] = Condition(known[value], signal, kind, _text(expression), _text(level), sign)
 
     for name, definition in _definitions(structure).items():
         for e in sp.preorder_traversal(definition):
@@ -87,8 +87,10 @@ def conditions(structure: ModelEquations) -> tuple[Condition, ...]:
                 a, b = e.args
                 note(g.sub(node(a), node(b)), name, "branch", a, b)
                 note(g.sub(node(b), node(a)), name, "branch", b, a)
-    rest = (Condition(k, "model", "branch", f"condition {k}", "0") for k in range(len(g.switches)) if k not in found)
-    return tuple(sorted((*found.values(), *rest), key=lambda c: c.index))
+    rest = (
+        Condition(k, "model", "branch", f"condition {k}", "0") for k in range(len(g.switches)) if k not in by_switch
+    )
+    return tuple(sorted((*by_switch.values(), *rest), key=lambda c: c.index))
 
 
 def _text(e: Any) -> str:
@@ -132,24 +134,24 @@ def _extremum(
 
 def _limiters(definition: sp.Basic) -> frozenset[sp.Basic]:
     """Every min that holds a max against a number, or is held by one, and the reverse."""
-    found = set()
+    limiters = set()
     for e in definition.atoms(sp.Min, sp.Max):
         other = sp.Max if isinstance(e, sp.Min) else sp.Min
         for inner in e.args:
             if isinstance(inner, other) and any(a.is_number for a in e.args) and any(a.is_number for a in inner.args):
-                found |= {e, inner}
-    return frozenset(found)
+                limiters |= {e, inner}
+    return frozenset(limiters)
 
 
 def _definitions(structure: ModelEquations) -> dict[str, sp.Basic]:
     m = structure.model
-    found: dict[str, sp.Basic] = {n: s.value for n, s in m.signals.items()}
-    found |= {n: a.equation for n, a in m.algebraic.items()}
-    found |= {n: s.derivative for n, s in m.states.items()}
-    found |= {f"outputs.{n}" if n in found else n: o.value for n, o in m.outputs.items()}
-    found |= {n: d.of for n, d in m.delays.items()} | {n: s.value for n, s in m.sampled.items()}
-    found |= {n: symbol(n) for n in structure.outputs if n not in found}
-    return found
+    definitions: dict[str, sp.Basic] = {n: s.value for n, s in m.signals.items()}
+    definitions |= {n: a.equation for n, a in m.algebraic.items()}
+    definitions |= {n: s.derivative for n, s in m.states.items()}
+    definitions |= {f"outputs.{n}" if n in definitions else n: o.value for n, o in m.outputs.items()}
+    definitions |= {n: d.of for n, d in m.delays.items()} | {n: s.value for n, s in m.sampled.items()}
+    definitions |= {n: symbol(n) for n in structure.outputs if n not in definitions}
+    return definitions
 
 
 def limits(structure: ModelEquations, known: tuple[Condition, ...], values: NDArray[np.float64]) -> tuple[Limit, ...]:
@@ -159,13 +161,13 @@ def limits(structure: ModelEquations, known: tuple[Condition, ...], values: NDAr
     are no limiters (kind "branch") are listed with their distance and are never active.
     """
     _, used = in_use(structure, structure_roots(structure), values < 0.0)
-    found = []
+    limiters = []
     for c in known:
         if c.index in used:
             margin = c.sign * float(values[c.index])
             active = c.kind != "branch" and margin < 0.0
-            found.append(Limit(c.signal, c.kind, c.expression, c.level, margin, active))
-    return tuple(found)
+            limiters.append(Limit(c.signal, c.kind, c.expression, c.level, margin, active))
+    return tuple(limiters)
 
 
 def structure_roots(structure: ModelEquations) -> list[int]:

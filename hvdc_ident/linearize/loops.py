@@ -169,10 +169,10 @@ def loop(
     at = point_at(opened, {n: states[n] for n in opened.states}, inputs, parameters, time=closed.time)
     if sensitivities:  # the derivatives need the shift of a point that is at rest
         at = find_operating_point(opened, {**inputs, **parameters}, guess=states)
-    found = linearize(
+    linear = linearize(
         opened, at, inputs=list(signals), outputs=outputs, sensitivities=sensitivities, pade_order=pade_order
     )
-    return Loop(", ".join(signals), found.negated())
+    return Loop(", ".join(signals), linear.negated())
 
 
 def plant_and_controller(
@@ -292,10 +292,10 @@ class Margins(Coded):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Return the margins that `to_dict` wrote. Raises InputError for anything else."""
-        found = super().from_dict(data)
-        if found.stable:
-            return found
-        return replace(found, gain_margin=NONE, lower_gain_margin=NONE, delay=NONE, modulus=NONE, disk=NONE)
+        written = super().from_dict(data)
+        if written.stable:
+            return written
+        return replace(written, gain_margin=NONE, lower_gain_margin=NONE, delay=NONE, modulus=NONE, disk=NONE)
 
     def __str__(self) -> str:
         if not self.stable:
@@ -318,13 +318,13 @@ class Margins(Coded):
         return first
 
 
-def _without_margins(found: Stability, what: str) -> str:
+def _without_margins(judged: Stability, what: str) -> str:
     """Return the sentence on closed loops that are not stable, or of which it cannot be told."""
-    if found.verdict == "not decided":
-        return f"whether {what} stable cannot be told, so that no margins are given: {found.reason}"
-    if found.verdict != "unstable":
+    if judged.verdict == "not decided":
+        return f"whether {what} stable cannot be told, so that no margins are given: {judged.reason}"
+    if judged.verdict != "unstable":
         return f"{what} on the limit of stability: there are no margins"
-    return f"{what} not stable ({found.count_text}): there are no margins"
+    return f"{what} not stable ({judged.count_text}): there are no margins"
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,8 +362,8 @@ class LoopMargins(Coded):
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Return the margins that `to_dict` wrote. Raises InputError for anything else."""
-        found = super().from_dict(data)
-        return found if found.stable else replace(found, disk=NONE)
+        written = super().from_dict(data)
+        return written if written.stable else replace(written, disk=NONE)
 
     def __str__(self) -> str:
         if not self.stable:
@@ -392,10 +392,10 @@ def disk_phase(alpha: float) -> float:
 
 def _disk_json(disk: Crossing) -> dict[str, Any]:
     """Return a disk margin with the gain and the phase that it allows, as JSON holds them."""
-    found: dict[str, Any] = plain(
+    fields: dict[str, Any] = plain(
         {"value": disk.value, "omega": disk.omega, "gain": disk_gain(disk.value), "phase_deg": disk_phase(disk.value)}
     )
-    return found
+    return fields
 
 
 def _disk_text(disk: Crossing) -> str:
@@ -429,8 +429,8 @@ def margins(loop: Loop | LinearModel, omega: Array | None = None) -> Margins:
     Examples
     --------
     >>> import hvdc_ident as hi
-    >>> found = hi.linear.margins(hi.linear.loop(hi.load_model("vsc-hvdc-link"), "Irorder1"))
-    >>> found.stable, round(found.phase_margin.value, 1)
+    >>> margins = hi.linear.margins(hi.linear.loop(hi.load_model("vsc-hvdc-link"), "Irorder1"))
+    >>> margins.stable, round(margins.phase_margin.value, 1)
     (True, 65.3)
     """
     model = loop.open if isinstance(loop, Loop) else loop
@@ -469,15 +469,15 @@ def open_equation(model: LinearModel) -> Characteristic:
 
     Raises LinearizationError where the direct part is -1.
     """
-    found = whole(model)
-    through = np.eye(found.through.shape[0]) + found.through
+    equation = whole(model)
+    through = np.eye(equation.through.shape[0]) + equation.through
     if np.linalg.cond(through) > 1e12 or np.abs(np.linalg.det(through)) < 1e-12:
         raise LinearizationError(
             "the loop is ill-posed: its direct part is -1",
             where=f"loop at '{', '.join(model.input_names)}'",
             hint="add the lag that is there",
         )
-    return found
+    return equation
 
 
 def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMargins:
@@ -506,8 +506,8 @@ def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMa
     Examples
     --------
     >>> import hvdc_ident as hi
-    >>> found = hi.linear.loop_margins(hi.linear.loop(hi.load_model("vsc-hvdc-link"), ["Irorder1", "Irorder2"]))
-    >>> list(found.each), found.stable
+    >>> margins = hi.linear.loop_margins(hi.linear.loop(hi.load_model("vsc-hvdc-link"), ["Irorder1", "Irorder2"]))
+    >>> list(margins.each), margins.stable
     (['Irorder1', 'Irorder2'], True)
     """
     model = loop.open if isinstance(loop, Loop) else loop
@@ -521,7 +521,7 @@ def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMa
         )
     equation = open_equation(model)
     closed = equation.closed(np.ones(len(names)))
-    found = stability(closed)
+    judged = stability(closed)
 
     def sensitivity(w: Array) -> Array:
         """S = 1 - T from the closed loops, which poles of L do not disturb."""
@@ -531,11 +531,11 @@ def loop_margins(loop: Loop | LinearModel, omega: Array | None = None) -> LoopMa
     for i, n in enumerate(names):
         closing = Closing(equation, i)
         each[n] = _of_curve(_alone(sensitivity, i), _grid(model, closing, omega), closing)
-    if found.verdict != "stable":
-        return LoopMargins(FrozenMap(each), NONE, found)
+    if judged.verdict != "stable":
+        return LoopMargins(FrozenMap(each), NONE, judged)
     if len(names) == 1:
-        return LoopMargins(FrozenMap(each), each[names[0]].disk, found)
-    return LoopMargins(FrozenMap(each), _common_disk(sensitivity, _grid(model, Closing(equation, 0), omega)), found)
+        return LoopMargins(FrozenMap(each), each[names[0]].disk, judged)
+    return LoopMargins(FrozenMap(each), _common_disk(sensitivity, _grid(model, Closing(equation, 0), omega)), judged)
 
 
 def _alone(sensitivity: Curves, i: int) -> Curves:
@@ -565,9 +565,9 @@ def _grid(model: LinearModel, closing: Closing, omega: Array | None) -> Array:
 
 def _of_curve(values_at: Curves, grid: Array, closing: Closing) -> Margins:
     """Return the margins of a loop whose transfer function is given over rad/s."""
-    found = closing.at(1.0)
+    judged = closing.at(1.0)
     values = values_at(grid)
-    if closing.open.channels and found.verdict == "stable":
+    if closing.open.channels and judged.verdict == "stable":
         grid, values = refined(values_at, grid, values)
 
     def curve(w: float) -> complex:
@@ -577,13 +577,13 @@ def _of_curve(values_at: Curves, grid: Array, closing: Closing) -> Margins:
         _gains(grid, values, curve, FLOOR if closing.open.channels else 0.0),
         tuple(_phases(grid, values, curve)),
     )
-    if found.verdict != "stable":
-        return Margins(_nearest(gain), NONE, NONE, phase, NONE, NONE, NONE, found)
+    if judged.verdict != "stable":
+        return Margins(_nearest(gain), NONE, NONE, phase, NONE, NONE, NONE, judged)
     gain += closing.ends()
     modulus = _smallest(grid, np.abs(1 + values), lambda w: abs(1 + curve(w)))
     disk = _smallest(grid, _disk(values), lambda w: float(_disk(np.array([curve(w)]))[0]))
     upper, lower = closing.limit(gain, 1), closing.limit(gain, -1)
-    return Margins(_nearest(gain), upper, lower, phase, _delay(phase, closing), modulus, disk, found)
+    return Margins(_nearest(gain), upper, lower, phase, _delay(phase, closing), modulus, disk, judged)
 
 
 def _nearest(gain: list[Crossing]) -> tuple[Crossing, ...]:
@@ -620,12 +620,12 @@ def _common_disk(sensitivity: Curves, grid: Array) -> Crossing:
         if sharp > best:
             best, place = sharp, int(k)
     low, high = grid[max(place - 1, 0)], grid[min(place + 1, grid.size - 1)]
-    found = minimize_scalar(
+    solution = minimize_scalar(
         lambda w: -structured_singular_value(matrices(np.array([w]))[0]), bounds=(low, high), method="bounded",
         options={"xatol": 1e-9 * high},
     )  # fmt: skip
-    if -found.fun > best:
-        return Crossing(float(found.x), float(-1.0 / found.fun))
+    if -solution.fun > best:
+        return Crossing(float(solution.x), float(-1.0 / solution.fun))
     return Crossing(float(grid[place]), 1.0 / best)
 
 
@@ -652,10 +652,10 @@ def _strongly_coupled(matrix: Array) -> float:
     for order in (8, 64, 512, 4096):
         if best <= lower * (1.0 + 1e-9):
             break
-        found = minimize(_schatten, logs, (matrix, order), jac=True, method="BFGS", options={"gtol": 1e-7})
-        value = _scaled_norm(matrix, found.x)
+        solution = minimize(_schatten, logs, (matrix, order), jac=True, method="BFGS", options={"gtol": 1e-7})
+        value = _scaled_norm(matrix, solution.x)
         if value < best:
-            best, logs = value, found.x - found.x[0]
+            best, logs = value, solution.x - solution.x[0]
     return best
 
 
@@ -700,25 +700,25 @@ def _disk(values: Array) -> Array:
 
 def _gains(grid: Array, values: Array, curve: Curve, floor: float) -> list[Crossing]:
     """Crossings of the negative real axis, where L is above a floor: with delays there are infinitely many near 0."""
-    found = []
+    crossings = []
     imag, large = values.imag, np.maximum(np.abs(values[1:]), np.abs(values[:-1])) > floor
     for k in np.flatnonzero((imag[:-1] * imag[1:] <= 0) & (imag[:-1] != imag[1:]) & large):
         w = _zero(lambda x: curve(x).imag, grid[k], grid[k + 1])
         real = curve(w).real
         if real < -1e-9 and abs(curve(w).imag) < 1e-6 * abs(real):
-            found.append(Crossing(w, -1.0 / real))
-    return found
+            crossings.append(Crossing(w, -1.0 / real))
+    return crossings
 
 
 def _phases(grid: Array, values: Array, curve: Curve) -> list[Crossing]:
     """Crossings of the unit circle."""
-    found = []
+    crossings = []
     level = np.abs(values) - 1.0
     for k in np.flatnonzero((level[:-1] * level[1:] <= 0) & (level[:-1] != level[1:])):
         w = _zero(lambda x: abs(curve(x)) - 1.0, grid[k], grid[k + 1])
         angle = float(np.degrees(np.angle(curve(w)))) + 180.0
-        found.append(Crossing(w, (angle + 180.0) % 360.0 - 180.0))
-    return found
+        crossings.append(Crossing(w, (angle + 180.0) % 360.0 - 180.0))
+    return crossings
 
 
 def _zero(function: Callable[[float], float], low: float, high: float) -> float:
@@ -734,7 +734,7 @@ def _smallest(grid: Array, values: Array, at: Callable[[float], float]) -> Cross
     k = int(np.argmin(values))
     low, high = grid[max(k - 1, 0)], grid[min(k + 1, grid.size - 1)]
     if high > low:
-        found = minimize_scalar(at, bounds=(low, high), method="bounded", options={"xatol": 1e-12 * high})
-        if found.fun <= values[k]:
-            return Crossing(float(found.x), float(found.fun))
+        least = minimize_scalar(at, bounds=(low, high), method="bounded", options={"xatol": 1e-12 * high})
+        if least.fun <= values[k]:
+            return Crossing(float(least.x), float(least.fun))
     return Crossing(float(grid[k]), float(values[k]))

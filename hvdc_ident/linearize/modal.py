@@ -69,10 +69,10 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
     order = sorted(
         range(values.size), key=lambda k: (-round(float(values[k].real), 9), abs(values[k].imag), -values[k].imag)
     )
-    found = []
+    every = []
     for k in order:
         v = right[:, k] / right[np.argmax(np.abs(right[:, k])), k]
-        found.append(
+        every.append(
             Mode(
                 complex(values[k]),
                 abs(float(values[k].imag)) / (2 * np.pi),
@@ -83,7 +83,7 @@ def modes(model: LinearModel) -> tuple[Mode, ...]:
                 _kind(model, complex(values[k]), right[:, k], left[k]),
             )
         )
-    return tuple(found)
+    return tuple(every)
 
 
 def at_rest(values: Array, roots: Array) -> Array:

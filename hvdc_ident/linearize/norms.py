@@ -71,14 +71,14 @@ def _clear_of_axis(model: LinearModel) -> Characteristic:
     The bases that show what is hidden are orthogonal, and mix states of very different sizes: the model's own keep the
     digits. Raises LinearizationError for a pole on the axis that the inputs reach and the outputs see.
     """
-    found = whole(model)
-    if not found.channels:
-        found = Characteristic.rational(
-            *scaled_states(found.matrix, found.given, found.read), found.through, found.error
+    equation = whole(model)
+    if not equation.channels:
+        equation = Characteristic.rational(
+            *scaled_states(equation.matrix, equation.given, equation.read), equation.through, equation.error
         )
-    if found.channels or found.roots.axis:
-        found = visible(model)
-        axis = poles_of_transfer(found, f"linear model '{model.name}'")[1]
+    if equation.channels or equation.roots.axis:
+        equation = visible(model)
+        axis = poles_of_transfer(equation, f"linear model '{model.name}'")[1]
         if axis.size:
             raise LinearizationError(
                 "the L-infinity norm is infinite: a pole lies on the imaginary axis",
@@ -86,7 +86,7 @@ def _clear_of_axis(model: LinearModel) -> Characteristic:
                 got=f"eigenvalue {axis[0]:.6g}",
                 hint="compare with nu_gap, which takes integrators",
             )
-    return found
+    return equation
 
 
 def largest_gain(equation: Characteristic, omega: Array, tolerance: float = 1e-13) -> Peak:
@@ -146,8 +146,8 @@ def hinf_norm(model: LinearModel, tolerance: float = 1e-13) -> Peak:
     --------
     >>> import hvdc_ident as hi
     >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
-    >>> found = hi.linear.hinf_norm(hi.linearize(lag))
-    >>> round(found.value, 9), found.omega  # the gain at rest
+    >>> peak = hi.linear.hinf_norm(hi.linearize(lag))
+    >>> round(peak.value, 9), peak.omega  # the gain at rest
     (2.0, 0.0)
     """
     _refuse_unstable(model, "an unstable model has no H-infinity norm")
@@ -207,19 +207,19 @@ def h2_norm(model: LinearModel) -> float:
     """
     _refuse_unstable(model, "the H2 norm is infinite: the model is not stable")
     a, b, c, d = without_sliding_means(model)
-    found = Characteristic.rational(*scaled_states(a, b, c), d, model.error)
-    if found.roots.unstable or found.roots.axis:
-        found = approximate_visible(model)
-    if np.any(found.through):
+    equation = Characteristic.rational(*scaled_states(a, b, c), d, model.error)
+    if equation.roots.unstable or equation.roots.axis:
+        equation = approximate_visible(model)
+    if np.any(equation.through):
         raise LinearizationError("the H2 norm is infinite: D is not 0", where=f"linear model '{model.name}'")
-    if found.nx == 0:
+    if equation.nx == 0:
         return 0.0
-    if found.roots.unstable or found.roots.axis:
+    if equation.roots.unstable or equation.roots.axis:
         raise LinearizationError(
             "the H2 norm is not known: the model is stable, and its delays' Pade approximants are not",
             where=f"linear model '{model.name}'",
         )
-    a, b, c, _ = found.matrices
+    a, b, c, _ = equation.matrices
     squares = [float(np.trace(c @ reached_gramian(a, b) @ c.T)), float(np.trace(b.T @ seen_gramian(a, c) @ b))]
     if not abs(squares[0] - squares[1]) <= 2.0 * AGREE * max(squares):
         raise LinearizationError(
@@ -234,16 +234,16 @@ def h2_norm(model: LinearModel) -> float:
 
 def norms(model: LinearModel) -> dict[str, Any]:
     """Return H2, H-infinity and L-infinity norms as plain numbers; of one that does not exist, None and the reason."""
-    found: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
     for name, norm in (("h2", h2_norm), ("hinf", hinf_norm), ("linf", linf_norm)):
         try:
             value = norm(model)
         except LinearizationError as e:
-            found[name] = None
-            found[f"{name}_reason"] = e.what
+            by_name[name] = None
+            by_name[f"{name}_reason"] = e.what
         else:
-            found[name] = value.to_dict() if isinstance(value, Peak) else value
-    return found
+            by_name[name] = value.to_dict() if isinstance(value, Peak) else value
+    return by_name
 
 
 def _axis_crossings(equation: Characteristic, level: float) -> Array:
@@ -274,15 +274,15 @@ def refined(gain: Callable[[float], float], best: Peak) -> Peak:
     """Return the peak near a frequency at which the gain is known."""
     if not 0.0 < best.omega < np.inf:
         return best
-    found = minimize_scalar(
+    solution = minimize_scalar(
         lambda x: -gain(float(np.exp(x))),
         bounds=(np.log(best.omega) - NEAR, np.log(best.omega) + NEAR), method="bounded", options={"xatol": 1e-12},
     )  # fmt: skip
-    return Peak(-float(found.fun), float(np.exp(found.x))) if -found.fun > best.value else best
+    return Peak(-float(solution.fun), float(np.exp(solution.x))) if -solution.fun > best.value else best
 
 
 def peak_over(values: Callable[[Array], Array], grid: Array) -> Peak:
     """Return the largest of some positive values over the frequencies of a grid, refined beside the largest."""
-    found = values(grid)
-    k = int(np.argmax(found))
-    return refined(lambda w: float(values(np.array([w]))[0]), Peak(float(found[k]), float(grid[k])))
+    sizes = values(grid)
+    k = int(np.argmax(sizes))
+    return refined(lambda w: float(values(np.array([w]))[0]), Peak(float(sizes[k]), float(grid[k])))

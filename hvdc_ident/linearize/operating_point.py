@@ -195,12 +195,12 @@ def signal_values(model: Model, point: OperatingPoint, names: Sequence[str]) -> 
     """Return the values of any names at an operating point."""
     known = {**point.states, **point.unknowns, **point.extras, **point.inputs, **point.parameters}
     asked = tuple(n for n in names if n not in known)
-    found = {n: float(known[n]) for n in names if n in known}
+    values = {n: float(known[n]) for n in names if n in known}
     if asked:
         s = system(model, asked)
         shown = s.values(point.y, point.w, point.p, s.modes(point.y, point.w, point.p))[s.layout.n + s.layout.ne :]
-        found |= {n: float(v) for n, v in zip(s.outputs, shown, strict=False)}
-    return found
+        values |= {n: float(v) for n, v in zip(s.outputs, shown, strict=False)}
+    return values
 
 
 # --- trim: inputs that are set so that outputs have given values ---

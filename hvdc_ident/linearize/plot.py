@@ -162,26 +162,26 @@ def shapes(mode: Mode, smallest: float = 0.01, ax: Any = None) -> Any:
     return axes
 
 
-def locus(found: RootLocus, left: float | None = None, ax: Any = None) -> Any:
+def locus(loci: RootLocus, left: float | None = None, ax: Any = None) -> Any:
     """Return the axes: one curve a mode, a dot at the parameter's start, a square at its end. left: edge of the axis."""
     axes = axes_of(ax, 6.5, 5.0)
-    for k in range(found.eigenvalues.shape[1]):
-        v = found.eigenvalues[:, k]
+    for k in range(loci.eigenvalues.shape[1]):
+        v = loci.eigenvalues[:, k]
         if left is not None and v.real.max() < left:
             continue
         colour = SERIES[k % len(SERIES)]
         axes.plot(v.real, v.imag, color=colour, linewidth=1.2)
         axes.plot(v.real[:1], v.imag[:1], "o", color=colour, markersize=5)
         axes.plot(v.real[-1:], v.imag[-1:], "s", color=colour, markersize=5)
-    for limit in found.limits:
+    for limit in loci.limits:
         axes.plot([limit.eigenvalue.real], [limit.eigenvalue.imag], "D", color="#000000", markersize=6)
-        axes.annotate(f"{found.parameter} = {limit.value:.4g}", (limit.eigenvalue.real, limit.eigenvalue.imag))
+        axes.annotate(f"{loci.parameter} = {limit.value:.4g}", (limit.eigenvalue.real, limit.eigenvalue.imag))
     if left is not None:
         axes.set_xlim(left, None)
     axes.axvline(0.0, color=MARK)
-    unit = f" {found.unit}" if found.unit else ""
+    unit = f" {loci.unit}" if loci.unit else ""
     axes.set_title(
-        f"{found.parameter} from {found.values[0]:g} (dot) to {found.values[-1]:g}{unit} (square)", fontsize="medium"
+        f"{loci.parameter} from {loci.values[0]:g} (dot) to {loci.values[-1]:g}{unit} (square)", fontsize="medium"
     )
     axes.set_xlabel("real part, rad/s")
     axes.set_ylabel("imaginary part, rad/s")

@@ -142,7 +142,7 @@ def difference(first: LinearModel, second: LinearModel) -> LinearModel:
     same_channels(first, second)
     a1, b1, c1, d1 = without_sliding_means(first)
     a2, b2, c2, d2 = without_sliding_means(second)
-    found = first.with_matrices(
+    rational = first.with_matrices(
         scipy.linalg.block_diag(a1, a2) if a1.size or a2.size else np.zeros((0, 0)),
         np.concatenate([b1, b2]),
         np.concatenate([c1, -c2], axis=1),
@@ -152,7 +152,7 @@ def difference(first: LinearModel, second: LinearModel) -> LinearModel:
         error=max(first.error, second.error),
     )
     if first.exact is None and second.exact is None:
-        return found
+        return rational
     inputs, outputs = np.eye(len(first.input_names)), np.eye(len(first.output_names))
     both = whole(first).beside(whole(second))
-    return replace(found, exact=both.between(np.vstack([inputs, inputs]), np.hstack([outputs, -outputs])))
+    return replace(rational, exact=both.between(np.vstack([inputs, inputs]), np.hstack([outputs, -outputs])))

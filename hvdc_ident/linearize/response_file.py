@@ -75,8 +75,8 @@ def read_response(path: str | Path) -> ResponseFile:
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     scan = Path(folder, "scan.csv")
     ...     _ = scan.write_text("f_Hz,Z_re,Z_im\\n1,0.1,0.2\\n10,0.1,2.0\\n")
-    ...     found = hi.linear.read_response(scan)
-    >>> list(found.channels), found.channels["Z"].tolist()
+    ...     response = hi.linear.read_response(scan)
+    >>> list(response.channels), response.channels["Z"].tolist()
     (['Z'], [(0.1+0.2j), (0.1+2j)])
     """
     file = Path(path)
@@ -89,8 +89,8 @@ def read_response(path: str | Path) -> ResponseFile:
     except (OSError, UnicodeDecodeError) as e:
         raise WaveformError("the file cannot be read as text", where=str(file), got=str(e)[:100]) from None
     ports = re.fullmatch(r"\.s(\d+)p", file.suffix.lower())
-    found = _touchstone(text, int(ports[1]), file.name) if ports else _columns(text, file.name)
-    return _averaged(found, file.name)
+    response = _touchstone(text, int(ports[1]), file.name) if ports else _columns(text, file.name)
+    return _averaged(response, file.name)
 
 
 # --- columns of text ---
@@ -198,10 +198,10 @@ def _joined(parts: Mapping[str, Array], name: str, where: str) -> Array:
 
 
 def _cell(text: str, separator: str, where: str) -> complex:
-    found = _complex(text, separator)
-    if found is None or not np.isfinite(found):
+    number = _complex(text, separator)
+    if number is None or not np.isfinite(number):
         raise WaveformError("a cell is no number", where=where, got=repr(text))
-    return found
+    return number
 
 
 def _complex(text: str, separator: str) -> complex | None:
@@ -273,23 +273,23 @@ def _touchstone(text: str, ports: int, where: str) -> ResponseFile:
 # --- repeated sweeps ---
 
 
-def _averaged(found: ResponseFile, where: str) -> ResponseFile:
+def _averaged(response: ResponseFile, where: str) -> ResponseFile:
     """Return the response in the order of its frequencies, repeated ones by their mean with the mean's standard deviation."""
-    if not (np.isfinite(found.omega).all() and (found.omega >= 0).all()):
+    if not (np.isfinite(response.omega).all() and (response.omega >= 0).all()):
         raise WaveformError("a frequency is not a number of at least 0", where=where)
-    omega, place, counts = np.unique(found.omega, return_inverse=True, return_counts=True)
+    omega, place, counts = np.unique(response.omega, return_inverse=True, return_counts=True)
     least = int(counts.min())
     channels, std, dof = {}, {}, {}
-    for name, values in found.channels.items():
+    for name, values in response.channels.items():
         if not np.isfinite(values).all():
             raise WaveformError("a value is not finite", where=where, got=f"channel '{name}'")
         mean = np.zeros(omega.size, dtype=complex)
         np.add.at(mean, place, values)
         mean /= counts
         channels[name] = mean
-        if name in found.std:
+        if name in response.std:
             power = np.zeros(omega.size)
-            np.add.at(power, place, found.std[name] ** 2)
+            np.add.at(power, place, response.std[name] ** 2)
             std[name] = np.sqrt(power) / counts
         elif (counts > 1).any():
             std[name] = _scatter(values - mean[place], mean, place, counts)

@@ -145,23 +145,23 @@ class _Along:
             raise e.at(f"{self.parameter} = {value:g}") from None
         s = search.system
         assert isinstance(s, CompiledSystem)
-        found = characteristic(self.model, s, *search.vectors(root.v))
-        return found.without_states([s.states.index(n) for n in constants(self.model)])
+        whole = characteristic(self.model, s, *search.vectors(root.v))
+        return whole.without_states([s.states.index(n) for n in constants(self.model)])
 
 
 def _columns(equations: Sequence[Characteristic]) -> Array:
     """Return (points, modes) the eigenvalues of models without delays, each column one mode throughout."""
-    found: list[Array] = []
+    rows: list[Array] = []
     left: Array | None = None
     for equation in equations:
         eigenvalues, right, left_new = eigen(equation.matrix)
         eigenvalues = at_rest(eigenvalues, equation.roots.values)
         if left is not None:
-            order = match(found[-1], left, eigenvalues, right)
+            order = match(rows[-1], left, eigenvalues, right)
             eigenvalues, left_new = eigenvalues[order], left_new[order]
-        found.append(eigenvalues)
+        rows.append(eigenvalues)
         left = left_new
-    return np.array(found)
+    return np.array(rows)
 
 
 def _delayed_columns(equations: Sequence[Characteristic]) -> tuple[Array, tuple[float | None, ...]]:
@@ -169,17 +169,17 @@ def _delayed_columns(equations: Sequence[Characteristic]) -> tuple[Array, tuple[
 
     There are as many columns as the fewest rightmost roots found at one of the points, at least one for each state.
     """
-    found = [equation.roots for equation in equations]
-    count = min(r.values.size for r in found)
+    by_point = [equation.roots for equation in equations]
+    count = min(r.values.size for r in by_point)
     rows: list[Array] = []
-    for r in found:
+    for r in by_point:
         roots = r.values
         if rows:
             before = rows[-1]
             size = np.maximum(np.maximum(np.abs(before)[:, None], np.abs(roots)[None, :]), 1e-300)
             roots = roots[linear_sum_assignment(np.abs(before[:, None] - roots[None, :]) / size)[1]]
         rows.append(roots[:count])
-    return np.array(rows).reshape(len(found), count), tuple(r.unstable for r in found)
+    return np.array(rows).reshape(len(by_point), count), tuple(r.unstable for r in by_point)
 
 
 def match(before: Array, left: Array, after: Array, right: Array) -> Array:

@@ -71,15 +71,15 @@ def _events(
     channels: Sequence[Channel], waiting: Sequence[int], period: float
 ) -> list[tuple[float, list[int], list[int]]]:
     """Return (time, blocks that read, blocks that publish what they read earlier) by time, over one common period."""
-    found: list[tuple[float, int, bool]] = []
+    acts: list[tuple[float, int, bool]] = []
     for i, c in enumerate(channels):
         count = round(period / c.time)
-        found += [(k * c.time, i, True) for k in range(count)]
+        acts += [(k * c.time, i, True) for k in range(count)]
         if c.compute > 1e-9 * c.time:
             late = c.compute - waiting[i] * c.time
-            found += [(k * c.time + (late if late > 1e-9 * c.time else 0.0), i, False) for k in range(count)]
+            acts += [(k * c.time + (late if late > 1e-9 * c.time else 0.0), i, False) for k in range(count)]
     events: list[tuple[float, list[int], list[int]]] = []
-    for time, i, reads in sorted(found):
+    for time, i, reads in sorted(acts):
         if not events or time > events[-1][0] + 1e-9 * period:
             events.append((time, [], []))
         (events[-1][1] if reads else events[-1][2]).append(i)

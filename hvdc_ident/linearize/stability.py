@@ -216,8 +216,8 @@ class Characteristic:
 
     def part(self, places: Array) -> Part:
         """Return some of the unknowns as a part, not balanced."""
-        found = tuple(self.channels[i - self.nx] for i in places if i >= self.nx)
-        return Part(self.matrix[np.ix_(places, places)], len(places) - len(found), found)
+        channels = tuple(self.channels[i - self.nx] for i in places if i >= self.nx)
+        return Part(self.matrix[np.ix_(places, places)], len(places) - len(channels), channels)
 
     def parts(self) -> Iterator[tuple[Part, Array]]:
         """Return the parts that determine one another's unknowns only one way, balanced, with the places of their unknowns."""
@@ -240,25 +240,25 @@ class Characteristic:
     @cached_property
     def roots(self) -> Roots:
         """The rightmost roots, at least one for each state and `PER_DELAY` for each delay, and the number that is unstable."""
-        found = [r for _, r in self.roots_by_part]
+        by_part = [r for _, r in self.roots_by_part]
         unstable: float | None = 0.0
-        for r in found:
+        for r in by_part:
             unstable = _sum(unstable, r.unstable)
-        axis = sum(r.axis for r in found)
-        reasons = dict.fromkeys(r.reason for r in found if r.reason)
+        axis = sum(r.axis for r in by_part)
+        reasons = dict.fromkeys(r.reason for r in by_part if r.reason)
         grows = 0.0 if unstable is None else unstable
         least = max(self.nx + PER_DELAY * len(self.whole.channels), axis + int(grows)) if np.isfinite(grows) else None
-        averaged = first_roots([r.values if r.averaged is None else r.averaged for r in found], least)
-        values = first_roots([r.values for r in found], least)
-        return Roots(values, unstable, axis, "; ".join(reasons), all(r.certain for r in found), averaged)
+        averaged = first_roots([r.values if r.averaged is None else r.averaged for r in by_part], least)
+        values = first_roots([r.values for r in by_part], least)
+        return Roots(values, unstable, axis, "; ".join(reasons), all(r.certain for r in by_part), averaged)
 
     def counts(self) -> tuple[float | None, int]:
         """Return the numbers of roots right of the imaginary axis and on it, as in `Roots`, without looking for the roots."""
-        found = [self._counts_of(part) for part, _ in self.parts()]
+        by_part = [self._counts_of(part) for part, _ in self.parts()]
         total: float | None = 0.0
-        for unstable, _ in found:
+        for unstable, _ in by_part:
             total = _sum(total, unstable)
-        return total, sum(axis for _, axis in found)
+        return total, sum(axis for _, axis in by_part)
 
     def is_stable(self) -> bool:
         """Return whether `stability` says "stable", without looking for the roots."""
@@ -276,8 +276,8 @@ class Characteristic:
 
     def _counts_of(self, part: Part) -> tuple[float | None, int]:
         if any(c.kind == "sampled" for c in part.channels):
-            found = multipliers(part.matrix, part.nx, part.channels) if part.matrix.any() else (np.zeros(0), 1.0)
-            return (None, 0) if isinstance(found, str) else _on_circle(found[0])
+            over_period = multipliers(part.matrix, part.nx, part.channels) if part.matrix.any() else (np.zeros(0), 1.0)
+            return (None, 0) if isinstance(over_period, str) else _on_circle(over_period[0])
         if not part.channels or not part.matrix.any() or spectral_radius(part.direct) >= 1.0 - NEUTRAL:
             roots = self._roots_of(part)
             return roots.unstable, roots.axis
@@ -295,12 +295,12 @@ def quartered(matrix: Array, size: int) -> tuple[Array, Array, Array, Array]:
 
 def first_roots(values: list[Array], least: int | None) -> Array:
     """Return so many values by falling real part, conjugates together and the upper one first; all of them for None."""
-    found = np.concatenate([np.zeros(0, dtype=complex), *values])
-    found = found[np.lexsort((-found.imag, np.abs(found.imag), -found.real))]
-    count = found.size if least is None else least
-    if 0 < count < found.size and found[count - 1].imag > 0:
+    roots = np.concatenate([np.zeros(0, dtype=complex), *values])
+    roots = roots[np.lexsort((-roots.imag, np.abs(roots.imag), -roots.real))]
+    count = roots.size if least is None else least
+    if 0 < count < roots.size and roots[count - 1].imag > 0:
         count += 1
-    return found[:count]
+    return roots[:count]
 
 
 def _on_circle(z: Array) -> tuple[int, int]:
@@ -320,12 +320,12 @@ def _sum(first: float | None, second: float | None) -> float | None:
 def _sampled(part: Part) -> Roots:
     """The multipliers over the sampling period decide; where there are none, it is said what the averaged equation has."""
     averaged = _delayed(part)
-    found = multipliers(part.matrix, part.nx, part.channels)
-    if isinstance(found, str):
+    over_period = multipliers(part.matrix, part.nx, part.channels)
+    if isinstance(over_period, str):
         said = "an unknown number of" if averaged.unstable is None else f"{averaged.unstable:.0f}"
-        reason = f"{found}; without their aliases the loop has {said} unstable roots"
+        reason = f"{over_period}; without their aliases the loop has {said} unstable roots"
         return Roots(averaged.values, None, 0, reason, False)
-    z, period = found
+    z, period = over_period
     unstable, axis = _on_circle(z)
     values = np.log(z[np.abs(z) > 1e-12].astype(complex))
     values[np.abs(values) <= ON_CIRCLE] = 0.0
@@ -340,28 +340,28 @@ def _delayed(part: Part) -> Roots:
     try:
         tolerance, total, right = _counted(part)
     except Undecided as e:
-        found = part.refined(np.linalg.eigvals(part.discretised(_orders(part)[-1])))
-        grows = int((found.real > 1e-9 * part.unit).sum())
-        return Roots(found, grows or None, 0, f"{e.what} ({e.got})", False)
-    found = np.zeros(0, dtype=complex)
+        roots = part.refined(np.linalg.eigvals(part.discretised(_orders(part)[-1])))
+        grows = int((roots.real > 1e-9 * part.unit).sum())
+        return Roots(roots, grows or None, 0, f"{e.what} ({e.got})", False)
+    roots = np.zeros(0, dtype=complex)
     for order in _orders(part):
-        found = part.refined(np.concatenate([np.linalg.eigvals(part.discretised(order)), found]))
-        found[np.abs(found) <= tolerance] = 0.0
-        near = found[found.real > -tolerance]
+        roots = part.refined(np.concatenate([np.linalg.eigvals(part.discretised(order)), roots]))
+        roots[np.abs(roots) <= tolerance] = 0.0
+        near = roots[roots.real > -tolerance]
         if near.size < total:
-            times = [part.multiplicity(v, found) for v in near]
-            found = np.concatenate([found, *(np.full(k - 1, v) for v, k in zip(near, times, strict=True))])
-        if (found.real > tolerance).sum() != right or (found.real > -tolerance).sum() != total or found.size < n:
+            times = [part.multiplicity(v, roots) for v in near]
+            roots = np.concatenate([roots, *(np.full(k - 1, v) for v, k in zip(near, times, strict=True))])
+        if (roots.real > tolerance).sum() != right or (roots.real > -tolerance).sum() != total or roots.size < n:
             continue
-        if total or not found.size:
-            return Roots(found, right, total - right)
-        first = float(found.real.max())
+        if total or not roots.size:
+            return Roots(roots, right, total - right)
+        first = float(roots.real.max())
         try:
             if part.count(first + CERTAIN * abs(first)) == 0:
-                return Roots(found, 0, 0)
+                return Roots(roots, 0, 0)
         except Undecided:
-            return Roots(found, 0, 0, certain=False)
-    return Roots(found, right, total - right, certain=False)
+            return Roots(roots, 0, 0, certain=False)
+    return Roots(roots, right, total - right, certain=False)
 
 
 def _counted(part: Part) -> tuple[float, int, int]:
@@ -428,7 +428,7 @@ def _neutral(part: Part, direct: float) -> Roots:
     Around a single ring of delays a gain above 1 leaves infinitely many roots right of the axis, near Re s = ln gain / T. In
     other cases the phases decide, which delays that are a little different turn (Hale and Verduyn Lunel 1993, 9.6).
     """
-    found = part.refined(np.linalg.eigvals(part.discretised(_orders(part)[-1])))
+    roots = part.refined(np.linalg.eigvals(part.discretised(_orders(part)[-1])))
     links = part.direct > 0
     _, label = connected_components(links, directed=True, connection="strong")
     rings = [np.ix_(label == k, label == k) for k in range(label.max() + 1)]
@@ -436,9 +436,9 @@ def _neutral(part: Part, direct: float) -> Roots:
     ring = any((links[r].sum(axis=1) == 1).all() and spectral_radius(part.direct[r]) > 1.0 + NEUTRAL for r in reached)
     said = f"the gain around a delay without a state on the way is {direct:.6g}"
     if ring:
-        return Roots(found, np.inf, 0, f"{said}, above 1: infinitely many roots grow", False)
-    grows = int((found.real > 1e-9 * part.unit).sum())
-    return Roots(found, grows or None, 0, f"{said}, and must be below 1 for a count of the roots", False)
+        return Roots(roots, np.inf, 0, f"{said}, above 1: infinitely many roots grow", False)
+    grows = int((roots.real > 1e-9 * part.unit).sum())
+    return Roots(roots, grows or None, 0, f"{said}, and must be below 1 for a count of the roots", False)
 
 
 @dataclass(frozen=True, eq=False)

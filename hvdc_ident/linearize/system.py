@@ -149,11 +149,11 @@ class CompiledSystem:
     def _entries(self) -> list[tuple[int, int, int]]:
         """Return (row, column, node) of every derivative over y and w that is not 0 by structure."""
         n = self.layout.n
-        found = []
+        entries = []
         for i, v in enumerate(self.nodes):
-            found += [(i, j, d) for j, d in self.structure.partial(v, "y").items()]
-            found += [(i, n + j - 1, d) for j, d in self.structure.partial(v, "w").items() if j > 0]
-        return found
+            entries += [(i, j, d) for j, d in self.structure.partial(v, "y").items()]
+            entries += [(i, n + j - 1, d) for j, d in self.structure.partial(v, "w").items() if j > 0]
+        return entries
 
     def _compile(self) -> None:
         s, g, size = self.structure, self.structure.graph, self.layout
@@ -230,16 +230,16 @@ class CompiledSystem:
         """Code of the second derivatives, and the row, column and variable each of them belongs to."""
         s, size = self.structure, self.layout
         variables = {"y": 0, "w": size.n - 1, "p": size.columns}
-        found = []
+        entries = []
         for i, j, d in self._by_yw:
             if i >= size.main:
                 continue
             for leaf, slope in s.graph.gradient(d).items():
                 _, group, index = s.graph.nodes[leaf]
                 if not (group == "w" and index == 0):
-                    found.append((i, j, variables[group] + index, slope))
-        code = Code(s.graph, [Function("hess", [(k, e[3]) for k, e in enumerate(found)])], 1)
-        rows, columns, over = (np.array([e[k] for e in found], dtype=np.intp) for k in range(3))
+                    entries.append((i, j, variables[group] + index, slope))
+        code = Code(s.graph, [Function("hess", [(k, e[3]) for k, e in enumerate(entries)])], 1)
+        rows, columns, over = (np.array([e[k] for e in entries], dtype=np.intp) for k in range(3))
         return code, _SIGNATURE(code.address["hess"]), rows, columns, over
 
     def jacobian_along(self, y: Array, w: Array, p: Array, m: Array, directions: Array) -> Array:

@@ -125,10 +125,10 @@ def _gain(a: Array, b: Array, c: Array, d: Array, zeros_: Array, poles: Array) -
     """Return the leading coefficient, from values of the transfer function at points away from every pole and zero."""
     sizes = np.abs(np.concatenate([poles, zeros_, [1.0 + 0j]]))
     typical = float(np.exp(np.log(np.maximum(sizes, 1e-3)).mean()))
-    found, eye = [], np.eye(a.shape[0])
+    gains, eye = [], np.eye(a.shape[0])
     for angle in (0.31, 0.77, 1.23):
         s = 1.7 * typical * np.exp(1j * angle)
         value = (c @ np.linalg.solve(s * eye - a, b) + d)[0, 0]
         log = np.log(value) + np.log(s - poles).sum() - np.log(s - zeros_).sum() if value != 0 else -np.inf
-        found.append(float(np.exp(log).real))
-    return float(np.median(found))
+        gains.append(float(np.exp(log).real))
+    return float(np.median(gains))
