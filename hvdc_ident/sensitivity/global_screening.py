@@ -62,8 +62,8 @@ class ScreeningResult(Coded, Shown):
 
     def of(self, output: str, experiment: str) -> FrozenMap[FrozenMap[float]]:
         """Return the measures of one output in one experiment by parameter, the one that matters most first."""
-        found = self.measures[output][experiment]
-        return FrozenMap(sorted(found.items(), key=lambda line: -line[1][self.measure]))
+        measures = self.measures[output][experiment]
+        return FrozenMap(sorted(measures.items(), key=lambda line: -line[1][self.measure]))
 
     def array(self, name: str) -> Array:
         """Return one measure, (series, parameters)."""
@@ -157,8 +157,8 @@ def morris(
     >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
     >>> t, u = np.linspace(0.0, 5.0, 51), {"u": hi.step(0.0, 1.0, at=1.0)}
     >>> record = hi.Experiment(t, "step", inputs=u, outputs={"y": hi.simulate(lag, t, inputs=u)["y"]})
-    >>> found = hi.sensitivity.morris(lag, [record], {"T": (0.9, 1.1), "k": (1.0, 3.0)}, trajectories=4)
-    >>> found.evaluations, list(found.of("y", "step"))  # k matters most
+    >>> screening = hi.sensitivity.morris(lag, [record], {"T": (0.9, 1.1), "k": (1.0, 3.0)}, trajectories=4)
+    >>> screening.evaluations, list(screening.of("y", "step"))  # k matters most
     (12, ['k', 'T'])
     """
     library("SALib", "global screening", "'hvdc_ident[screening]'")
@@ -230,8 +230,8 @@ def sobol(
     >>> lag = hi.Model("lag", parameters={"T": 1.0, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
     >>> t, u = np.linspace(0.0, 5.0, 51), {"u": hi.step(0.0, 1.0, at=1.0)}
     >>> record = hi.Experiment(t, "step", inputs=u, outputs={"y": hi.simulate(lag, t, inputs=u)["y"]})
-    >>> found = hi.sensitivity.sobol(lag, [record], {"T": (0.9, 1.1), "k": (1.0, 3.0)}, samples=16)
-    >>> found.evaluations, list(found.of("y", "step"))  # k matters most
+    >>> screening = hi.sensitivity.sobol(lag, [record], {"T": (0.9, 1.1), "k": (1.0, 3.0)}, samples=16)
+    >>> screening.evaluations, list(screening.of("y", "step"))  # k matters most
     (64, ['k', 'T'])
     """
     library("SALib", "global screening", "'hvdc_ident[screening]'")
@@ -280,12 +280,12 @@ def _measures(
     names: Sequence[str], analyse: Callable[[Array], Mapping[str, Any]], swept: SweepResult, parameters: tuple[str, ...]
 ) -> Measures:
     """Return the measures of every series of a sweep, by output, experiment, parameter and name."""
-    found: dict[str, dict[str, FrozenMap[FrozenMap[float]]]] = {}
+    measures: dict[str, dict[str, FrozenMap[FrozenMap[float]]]] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for (output, experiment), column in zip(swept.series, swept.rmse.T, strict=True):
             line = analyse(column)
             rows = zip(*(np.asarray(line[n], dtype=float).tolist() for n in names), strict=True)
             each = {p: FrozenMap(zip(names, row, strict=True)) for p, row in zip(parameters, rows, strict=True)}
-            found.setdefault(output, {})[experiment] = FrozenMap(each)
-    return FrozenMap({o: FrozenMap(line) for o, line in found.items()})
+            measures.setdefault(output, {})[experiment] = FrozenMap(each)
+    return FrozenMap({o: FrozenMap(line) for o, line in measures.items()})

@@ -150,20 +150,20 @@ def collinear_subsets(matrix: Array, names: Sequence[str]) -> tuple[Collinear, .
     All of them for up to ten parameters; else the pairs, and from the twenty worst of each size the next one up.
     """
     p = len(names)
-    found: list[tuple[tuple[int, ...], float]] = []
+    indices: list[tuple[tuple[int, ...], float]] = []
     if p <= ENUMERATED:
         sets = [s for k in range(2, p + 1) for s in combinations(range(p), k)]
-        found = [(s, collinearity_index(matrix[np.ix_(s, s)])) for s in sets]
+        indices = [(s, collinearity_index(matrix[np.ix_(s, s)])) for s in sets]
     else:
         pairs: list[tuple[int, ...]] = list(combinations(range(p), 2))
         front = [(s, collinearity_index(matrix[np.ix_(s, s)])) for s in pairs]
         while front:
-            found += front
+            indices += front
             worst = sorted(front, key=lambda s: -s[1])[:20]
             grown = {tuple(sorted((*s, i))) for s, _ in worst for i in range(p) if i not in s}
             front = [(s, collinearity_index(matrix[np.ix_(s, s)])) for s in sorted(grown)]
-    found.sort(key=lambda s: (len(s[0]), -s[1]))
-    return tuple(Collinear(tuple(names[i] for i in s), float(g)) for s, g in found)
+    indices.sort(key=lambda s: (len(s[0]), -s[1]))
+    return tuple(Collinear(tuple(names[i] for i in s), float(g)) for s, g in indices)
 
 
 def pivoted_order(matrix: Array) -> tuple[int, ...]:

@@ -40,7 +40,7 @@ def factors(
     A factor is the width of a given range, else the magnitude of the value; where the value is 0, the width of the
     model's own bounds or the parameter's size. Raises UnknownNameError, and StudyError for a range without a width.
     """
-    at, found = {}, {}
+    at, scales = {}, {}
     require_known("parameter", names, model.parameters, f"model '{model.name}'")
     for name in names:
         parameter = model.parameters[name]
@@ -52,10 +52,10 @@ def factors(
                 f"the range of '{name}' is wrong", expected="finite min < max", got=f"min {low:g}, max {high:g}"
             )
         if name in ranges or (at[name] == 0 and math.isfinite(width) and width > 0):
-            found[name] = float(width)
+            scales[name] = float(width)
         else:
-            found[name] = abs(at[name]) or parameter.size
-    return FrozenMap(at), FrozenMap(found)
+            scales[name] = abs(at[name]) or parameter.size
+    return FrozenMap(at), FrozenMap(scales)
 
 
 def _labelled(values: Any, name: str, **axes: Any) -> xarray.DataArray:
@@ -103,8 +103,8 @@ class Sensitivities(Coded, Shown):
         """Return one derivative over time, (n,), in units or times the parameter's factor."""
         gradient = self._run(experiment).gradient(output)
         require_known("parameter", [parameter], self.parameters, "")
-        found = gradient[:, self.parameters.index(parameter)]
-        return found * self.factors[parameter] if normalised else found
+        derivative = gradient[:, self.parameters.index(parameter)]
+        return derivative * self.factors[parameter] if normalised else derivative
 
     @property
     def _scale(self) -> Array:
@@ -112,23 +112,23 @@ class Sensitivities(Coded, Shown):
 
     def array(self, experiment: str, *, normalised: bool = False) -> xarray.DataArray:
         """One experiment's derivatives with labelled axes time, output, parameter."""
-        found = self._run(experiment).sensitivities
-        return (found * self._scale).rename("normalised sensitivity") if normalised else found
+        derivatives = self._run(experiment).sensitivities
+        return (derivatives * self._scale).rename("normalised sensitivity") if normalised else derivatives
 
     @cached_property
     def table(self) -> FrozenMap[FrozenMap[FrozenMap[tuple[float, float]]]]:
         """(rms, peak) of the normalised sensitivity over the compared rows, by experiment, output and parameter."""
-        found = {}
+        by_experiment = {}
         for e, run in self.runs.items():
             scaled = run.gradients[self.compared[e]] * self._scale
             rms, peak = np.sqrt((scaled**2).mean(axis=0)), np.abs(scaled).max(axis=0)
-            found[e] = FrozenMap(
+            by_experiment[e] = FrozenMap(
                 {
                     o: FrozenMap({p: (float(rms[i, k]), float(peak[i, k])) for k, p in enumerate(self.parameters)})
                     for i, o in enumerate(run.trajectory.names)
                 }
             )
-        return FrozenMap(found)
+        return FrozenMap(by_experiment)
 
     @property
     def norms(self) -> xarray.Dataset:
@@ -284,9 +284,9 @@ class LinearSensitivities(Coded, Shown):
 
     def eigenvalue_array(self, *, normalised: bool = False) -> xarray.DataArray:
         """d(lambda)/dp with labelled axes mode, parameter; modes in the order of `LinearModel.modes`."""
-        found = self.eigenvalue_gradients * self._scale if normalised else self.eigenvalue_gradients
+        gradients = self.eigenvalue_gradients * self._scale if normalised else self.eigenvalue_gradients
         modes = np.arange(self.eigenvalues.size)
-        array = _labelled(found, "eigenvalue sensitivity", mode=modes, parameter=list(self.parameters))
+        array = _labelled(gradients, "eigenvalue sensitivity", mode=modes, parameter=list(self.parameters))
         return array.assign_coords(eigenvalue=("mode", self.eigenvalues))
 
     def response_array(self, *, normalised: bool = False) -> xarray.DataArray:
@@ -306,8 +306,8 @@ class LinearSensitivities(Coded, Shown):
         require_known("output", [output], self.outputs, "")
         require_known("parameter", [parameter], self.parameters, "")
         places = self.outputs.index(output), self.inputs.index(input), self.parameters.index(parameter)
-        found = self.response_gradients[(slice(None), *places)]
-        return np.asarray(found * self.factors[parameter] if normalised else found)
+        derivative = self.response_gradients[(slice(None), *places)]
+        return np.asarray(derivative * self.factors[parameter] if normalised else derivative)
 
     def plot(self, input: str | None = None, output: str | None = None, ax: Any = None) -> Any:
         """Axes with one channel's normalised derivatives over frequency (default: the first), a curve a parameter."""
@@ -383,8 +383,8 @@ def linear_sensitivities(
     --------
     >>> import hvdc_ident as hi
     >>> lag = hi.Model("lag", parameters={"T": 0.5, "k": 2.0}, inputs={"u": 0.0}, states={"x": "(k*u - x)/T"}, outputs={"y": "x"})
-    >>> found = hi.linear.linear_sensitivities(lag, ["T"])
-    >>> found.eigenvalues.real.round(9).tolist(), found.eigenvalue_gradients.real.round(9).tolist()  # -1/T and 1/T^2
+    >>> derivatives = hi.linear.linear_sensitivities(lag, ["T"])
+    >>> derivatives.eigenvalues.real.round(9).tolist(), derivatives.eigenvalue_gradients.real.round(9).tolist()  # -1/T and 1/T^2
     ([-2.0], [[4.0]])
     """
     from hvdc_ident.linearize import find_operating_point, frequency, linearize

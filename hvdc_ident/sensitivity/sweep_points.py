@@ -160,12 +160,12 @@ def points_of(axes: AxesLike) -> Points:
         return Points((axes,))
     if isinstance(axes, Mapping):
         return Points(tuple(listed(name, values) for name, values in axes.items()))
-    found = tuple(axes)
-    if not all(isinstance(a, Samples) for a in found):
+    several = tuple(axes)
+    if not all(isinstance(a, Samples) for a in several):
         raise InputError(
-            "an axis of a sweep is none", expected="grid, log_grid, listed or latin_hypercube", got=str(found)[:80]
+            "an axis of a sweep is none", expected="grid, log_grid, listed or latin_hypercube", got=str(several)[:80]
         )
-    return Points(found)
+    return Points(several)
 
 
 # --- one point: parameter values in; RMSE, poles and frequency response out ---
@@ -218,14 +218,14 @@ class PointTask:
         """
         given = FrozenMap({**self.values, **dict(zip(self.names, map(float, point), strict=True))})
         try:
-            found = (self._errors(given), *self._linear(given))
+            results = (self._errors(given), *self._linear(given))
         except HvdcIdentError as e:
             return str(e)
-        return found if all(np.isfinite(numbers).all() for numbers in found) else "a result is not finite"
+        return results if all(np.isfinite(numbers).all() for numbers in results) else "a result is not finite"
 
     def _errors(self, given: FrozenMap[float]) -> Array:
         """Return the RMSE of each reference, (references,), in the outputs' units."""
-        found = np.empty(len(self.references))
+        errors = np.empty(len(self.references))
         for experiment in self.experiments:
             columns = [(i, r) for i, r in enumerate(self.references) if r.experiment == experiment.name]
             if not columns:
@@ -233,8 +233,8 @@ class PointTask:
             run = simulated(self.model, experiment, given, tuple(r.output for _, r in columns), self.method)
             for column, (i, r) in enumerate(columns):
                 difference = run[r.rows, column] - r.values
-                found[i] = np.sqrt(np.mean(difference * difference))
-        return found
+                errors[i] = np.sqrt(np.mean(difference * difference))
+        return errors
 
     def _linear(self, given: FrozenMap[float]) -> tuple[Complex, Complex, Array]:
         """Return the poles, sorted, the response and its phase; each empty where it is not wanted."""
@@ -256,8 +256,8 @@ class PointTask:
                 )  # e.g. a loop that becomes ill-posed
             poles = poles[np.lexsort((poles.imag, poles.real))]
         if self.omega.size:
-            found = linear.bode(self.omega)
-            response, phase = found.values, found.phase_deg
+            bode = linear.bode(self.omega)
+            response, phase = bode.values, bode.phase_deg
         return poles, response, phase
 
 
@@ -363,10 +363,10 @@ def _method(model: AnyModel, experiments: tuple[Experiment, ...], base: FrozenMa
     """The integrator of every point: the one that serves at the base values."""
     first = experiments[0]
     try:
-        found = simulate(model, first, base).statistics.method
+        method = simulate(model, first, base).statistics.method
     except (ComputationError, SteadyStateError):
         return "rosenbrock"
-    return "nonstiff" if found == "explicit" else "rosenbrock"
+    return "nonstiff" if method == "explicit" else "rosenbrock"
 
 
 def _references(
@@ -380,15 +380,15 @@ def _references(
     """Return the references of one experiment: its recording, the run at the base values, or another model's run."""
     if against == "data":
         recorded = [o for o in (e.outputs if outputs is None else outputs) if o in e.outputs]
-        found = []
+        references = []
         for o in recorded:
             assert e.measured is not None
             rows = np.flatnonzero(e.compared & np.isfinite(e.measured[o]))
             if not rows.size:
                 hint = "a wider window"
                 raise StudyError(f"no row of '{o}' can be compared", where=f"experiment '{e.name}'", hint=hint)
-            found.append(Reference(e.name, o, rows, np.array(e.measured[o][rows])))
-        return found
+            references.append(Reference(e.name, o, rows, np.array(e.measured[o][rows])))
+        return references
     compared = tuple(outputs if outputs is not None else (e.outputs or model.outputs))
     rows = np.flatnonzero(e.compared)
     if not isinstance(against, str) and hasattr(against, "outputs"):

@@ -200,13 +200,13 @@ class SweepResult(Coded, Shown):
     @property
     def bests(self) -> tuple[SeriesBest, ...]:
         """The smallest and the largest error of each series; none of one without an error."""
-        found = []
+        bests = []
         for (output, experiment), unit in zip(self.series, self.series_units, strict=True):
             errors = self.error(output, experiment)
             if np.isfinite(errors).any():
                 low, high = float(np.nanmin(errors)), float(np.nanmax(errors))
-                found.append(SeriesBest(output, experiment, unit, low, high, self.best(output, experiment)))
-        return tuple(found)
+                bests.append(SeriesBest(output, experiment, unit, low, high, self.best(output, experiment)))
+        return tuple(bests)
 
     def row(self, index: int) -> dict[str, Any]:
         """One point as sweep.json has it: values, rmse, status, reason, poles, bode and its phase where wanted."""
@@ -223,19 +223,19 @@ class SweepResult(Coded, Shown):
         rmse: dict[str, dict[str, float | None]] = {}
         for (output, experiment), error in zip(self.series, self.rmse[index].tolist(), strict=True):
             rmse.setdefault(output, {})[experiment] = None if bad is not None else error
-        found: dict[str, Any] = {
+        row: dict[str, Any] = {
             "values": dict(zip(self.parameters, values, strict=True)),
             "rmse": rmse,
             "status": "done" if bad is None else "failed",
             "reason": bad or "",
         }
         if "poles" in self.wanted:
-            found["poles"] = None if bad is not None else [[p.real, p.imag] for p in self.poles[index].tolist()]
+            row["poles"] = None if bad is not None else [[p.real, p.imag] for p in self.poles[index].tolist()]
         if "bode" in self.wanted:
             pairs = np.stack([self.response[index].real, self.response[index].imag], axis=-1)
-            found["bode"] = None if bad is not None else self._by_channel(pairs)
-            found["phase_deg"] = None if bad is not None else self._by_channel(self.phase_deg[index])
-        return found
+            row["bode"] = None if bad is not None else self._by_channel(pairs)
+            row["phase_deg"] = None if bad is not None else self._by_channel(self.phase_deg[index])
+        return row
 
     def _by_channel(self, numbers: Array) -> dict[str, dict[str, list[Any]]]:
         """Return lists over the frequencies by output and input of (frequencies, outputs, inputs, ...)."""
@@ -279,10 +279,10 @@ class SweepResult(Coded, Shown):
         shape = (told.omega.size, len(channels[1]), len(channels[0]))
         poles = [p.poles if p.poles is not None else np.full(modes, np.nan) for p in rows]
 
-        def table(found: Mapping[str, Mapping[str, Any]] | None) -> Array:
-            if found is None:
+        def table(channel_values: Mapping[str, Mapping[str, Any]] | None) -> Array:
+            if channel_values is None:
                 return np.full(shape, np.nan)
-            return np.array([[found[o][i] for i in channels[0]] for o in channels[1]]).transpose(2, 0, 1)
+            return np.array([[channel_values[o][i] for i in channels[0]] for o in channels[1]]).transpose(2, 0, 1)
 
         rmse = [[np.nan if (v := p.rmse[o][e]) is None else v for o, e in series] for p in rows]
         return cls(
@@ -424,8 +424,8 @@ def sweep(
 
     >>> from hvdc_ident import load_model
     >>> from hvdc_ident.sensitivity import sweep
-    >>> found = sweep(load_model("vsc-hvdc-link"), [], {"KIVDC": [250.0, 750.0, 1500.0]}, want=["poles"])
-    >>> len(found), found.poles.shape
+    >>> result = sweep(load_model("vsc-hvdc-link"), [], {"KIVDC": [250.0, 750.0, 1500.0]}, want=["poles"])
+    >>> len(result), result.poles.shape
     (3, (3, 6))
     """
     points = points_of(axes)
@@ -440,8 +440,8 @@ def sweep(
     phase = np.full(response.shape, np.nan)
     failed: dict[int, str] = {}
     items = Made(partial(_row, points), range(count))
-    found = map(Outcome, itertools.count(), map(task, items)) if executor is None else outcomes(executor, task, items)
-    for done, outcome in enumerate(found, start=1):
+    swept = map(Outcome, itertools.count(), map(task, items)) if executor is None else outcomes(executor, task, items)
+    for done, outcome in enumerate(swept, start=1):
         k, value = outcome.index, outcome.value
         if outcome.failure or isinstance(value, str):
             failed[k] = outcome.failure or value

@@ -188,30 +188,32 @@ def _combination(
     if len(members) == 1:
         return Combination(own, (), only_seen(own, ()), 1, ((1.0,),))
     n, free = len(members), len(points[0].among(members).directions)
-    found = None
+    invariants = None
     for coefficients in (n, n * (n + 3) // 2) if n <= FEW else (n,):
         while len(points) * free < coefficients + SPARE and (point := more()) is not None:
             points.append(point)
-        found = _invariants([p.among(members) for p in points], error)
-        if found is not None:
+        invariants = _invariants([p.among(members) for p in points], error)
+        if invariants is not None:
             break
-    if found is None:
+    if invariants is None:
         number = "one combination" if n - free == 1 else f"{n - free} combinations"
         words = f"only {number} of {listed(own)} {'is' if n - free == 1 else 'are'} seen"
         return Combination(own, (), words, free)
-    seen = tuple(i.text(own) for i in found)
-    directions, relative = _null_directions(found, [values[k] for k in members])
+    seen = tuple(i.text(own) for i in invariants)
+    directions, relative = _null_directions(invariants, [values[k] for k in members])
     return Combination(own, seen, only_seen(own, seen), free, directions, relative)
 
 
-def _null_directions(found: Sequence[Invariant], values: Sequence[float]) -> tuple[tuple[tuple[float, ...], ...], bool]:
+def _null_directions(
+    invariants: Sequence[Invariant], values: Sequence[float]
+) -> tuple[tuple[tuple[float, ...], ...], bool]:
     """The null directions at some values: of the logarithms where only products are seen."""
-    relative = all(len(i.terms) == 1 for i in found)
+    relative = all(len(i.terms) == 1 for i in invariants)
     if relative:
-        matrix = np.array([i.terms[0][1] for i in found], float)
+        matrix = np.array([i.terms[0][1] for i in invariants], float)
     else:
         with np.errstate(all="ignore"):
-            matrix = np.array([i.slopes([np.float64(v) for v in values]) for i in found])
+            matrix = np.array([i.slopes([np.float64(v) for v in values]) for i in invariants])
         if not np.isfinite(matrix).all():  # a power or a quotient that has no slope at these values
             return (), False
     null = np.linalg.svd(matrix)[2][len(matrix) :]
@@ -225,17 +227,17 @@ def _invariants(points: Sequence[Point], error: float) -> tuple[Invariant, ...] 
     needed = theta.size - len(points[-1].directions)
     selected: list[Invariant] = []
     for candidates in (_products, _sums, _polynomials):
-        found = sorted(candidates(points, error), key=lambda i: i.cost)
-        selected = _independent([*selected, *found], theta)
+        more = sorted(candidates(points, error), key=lambda i: i.cost)
+        selected = _independent([*selected, *more], theta)
         if len(selected) == needed:
             return tuple(sorted(selected, key=lambda i: (i.cost[0], *(-c for c in reversed(i.cost[2:])))))
     return None
 
 
-def _independent(found: Iterable[Invariant], theta: Array) -> list[Invariant]:
+def _independent(invariants: Iterable[Invariant], theta: Array) -> list[Invariant]:
     selected: list[Invariant] = []
     gradients: list[Array] = []
-    for i in found:
+    for i in invariants:
         row = np.array(i.slopes(theta.tolist())) * theta
         gradients.append(row / np.linalg.norm(row))
         if np.linalg.matrix_rank(gradients, tol=EXACT) == len(gradients):
@@ -246,8 +248,8 @@ def _independent(found: Iterable[Invariant], theta: Array) -> list[Invariant]:
 
 
 def _products(points: Sequence[Point], error: float) -> list[Invariant]:
-    found = _constant(np.concatenate([p.directions for p in points]), error)
-    return [Invariant(((Fraction(1), e),)) for e in found]
+    exponents = _constant(np.concatenate([p.directions for p in points]), error)
+    return [Invariant(((Fraction(1), e),)) for e in exponents]
 
 
 def _sums(points: Sequence[Point], error: float) -> list[Invariant]:
@@ -267,8 +269,8 @@ def _of_terms(terms: Sequence[Exponents], points: Sequence[Point], error: float)
     """Sums of such terms that no direction changes."""
     powers = np.array(terms)
     conditions = [(p.directions @ powers.T) * np.prod(p.theta**powers, axis=1) for p in points]
-    found = _constant(np.concatenate(conditions), error)
-    return [Invariant(tuple((Fraction(c), e) for e, c in zip(terms, v, strict=True) if c)) for v in found]
+    coefficients = _constant(np.concatenate(conditions), error)
+    return [Invariant(tuple((Fraction(c), e) for e, c in zip(terms, v, strict=True) if c)) for v in coefficients]
 
 
 def _constant(conditions: Array, error: float) -> list[Exponents]:
@@ -284,13 +286,13 @@ def _constant(conditions: Array, error: float) -> list[Exponents]:
     size[size == 0] = 1.0
     _, s, vt = np.linalg.svd(rows / size)
     space = _reduced(vt[int((s > error * s[0]).sum()) :] / size)
-    found, k = [_whole(row, error) for row in space], len(space)
+    vectors, k = [_whole(row, error) for row in space], len(space)
     if k > 1 and math.comb(n, k - 1) <= SUBSETS:
         for zero in combinations(range(n), k - 1):
             _, s, vt = np.linalg.svd(space[:, list(zero)].T)
             if s[-1] > np.sqrt(error) * s[0]:
-                found.append(_whole(vt[-1] @ space, error))
-    return sorted({v for v in found if v is not None})
+                vectors.append(_whole(vt[-1] @ space, error))
+    return sorted({v for v in vectors if v is not None})
 
 
 def _reduced(rows: Array) -> Array:

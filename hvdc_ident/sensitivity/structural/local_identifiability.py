@@ -62,8 +62,8 @@ def _answer(question: Question, names: tuple[str, ...], seed: int) -> dict[str, 
 
     def more() -> Point | None:
         try:
-            found = (unseen_at_random(question, next(seeds)) for _ in range(POINTS))
-            return next((p for p in found if p.pattern == points[0].pattern), None)
+            unseen = (unseen_at_random(question, next(seeds)) for _ in range(POINTS))
+            return next((p for p in unseen if p.pattern == points[0].pattern), None)
         except (OutOfTime, NotReached):
             return None
 
@@ -147,7 +147,7 @@ def structural_identifiability(
     asked = {n for n, s in model.states.items() if s.start == "free" and f"{n}_start" in names}
     branches, places = dict(regime or {}), list(model.parameters)
     words = [f"{n}: {mode}" for n, mode in branches.items()]
-    found: dict[str, Any] = {}
+    answer: dict[str, Any] = {}
     try:
         if model.delays or model.sampled:
             raise NotReached("it has delays or sampled parts")
@@ -163,12 +163,12 @@ def structural_identifiability(
             all(s == "steady" for s in source.start.values()),
             time.thread_time() + time_limit,
         )
-        found = _answer(question, names, seed)
+        answer = _answer(question, names, seed)
     except OutOfTime:
-        found = {"reason": f"the time limit of {time_limit:g} s was reached"}
+        answer = {"reason": f"the time limit of {time_limit:g} s was reached"}
     except (NotReached, SteadyStateError) as e:
-        found = {"reason": f"the method does not reach this model: {e}", "out_of_reach": True}
-    result = {"status": "not decided", "regime": tuple(words), "seconds": time.thread_time() - begun, **found}
+        answer = {"reason": f"the method does not reach this model: {e}", "out_of_reach": True}
+    result = {"status": "not decided", "regime": tuple(words), "seconds": time.thread_time() - begun, **answer}
     return StructuralResult(names, watched, FrozenMap(moved), FrozenMap(starts), **result)
 
 

@@ -83,13 +83,13 @@ class EquationSource:
 
     def active(self) -> tuple[str, ...]:
         """ "NAME: low | high" for each named signal whose limiter holds it at the operating point."""
-        found = []
+        limited = []
         for name in self.model.signals:
             key = self.graph.nodes[self.structure.nodes[name]]
             if key[0] == "select" and self._is_clip(key):
                 low, high = self.holds[key[1]], self.holds[self.graph.nodes[key[3]][1]]
-                found += [f"{name}: {'low' if low else 'high'}"] if low or high else []
-        return tuple(found)
+                limited += [f"{name}: {'low' if low else 'high'}"] if low or high else []
+        return tuple(limited)
 
     def _conditions(self) -> dict[int, bool]:
         """Return {condition: True where it holds} at the operating point."""

@@ -145,17 +145,17 @@ def _number(value: float) -> Decimal:
 
 def values(equations: Equations, nodes: Iterable[int], leaves: Mapping[int, Decimal]) -> dict[int, Decimal]:
     """{node: value} of nodes in an order of evaluation. Raises ArithmeticError where one has none."""
-    found: dict[int, Decimal] = {}
+    by_node: dict[int, Decimal] = {}
     for n in nodes:
         op, *a = equations.graph.nodes[n]
         if op == "leaf":
-            found[n] = leaves[n]
+            by_node[n] = leaves[n]
         elif op == "const":
-            found[n] = _number(a[0])
+            by_node[n] = _number(a[0])
         else:
-            x = [found[k] for k in equations.arguments(n)]
-            found[n] = ARITHMETIC[op](*x) if op in ARITHMETIC else _function(op, x)
-    return found
+            x = [by_node[k] for k in equations.arguments(n)]
+            by_node[n] = ARITHMETIC[op](*x) if op in ARITHMETIC else _function(op, x)
+    return by_node
 
 
 class TaylorSeries:
@@ -187,8 +187,8 @@ class TaylorSeries:
         self.order = -1
         width = next(iter(directions.values())).size if directions else 0
         self.c = zeros(len(self.nodes), order + 1, 1 + width)
-        found = values(e, self.nodes, {n: series[0] for n, series in point.items()})
-        self.c[:, 0, 0] = [found[n] for n in self.nodes]
+        begin = values(e, self.nodes, {n: series[0] for n, series in point.items()})
+        self.c[:, 0, 0] = [begin[n] for n in self.nodes]
         for n, series in point.items():
             if n in self.at:
                 self.c[self.at[n], : len(series), 0] = series[: order + 1]
@@ -198,14 +198,14 @@ class TaylorSeries:
 
     def _closed(self, roots: Sequence[int]) -> list[int]:
         """The nodes behind the roots and behind the derivatives of the functions among them."""
-        g, pending, found = self.graph, list(roots), set[int]()
+        g, pending, closed = self.graph, list(roots), set[int]()
         while pending:
-            new = self.equations.behind(pending, known=found)
-            found.update(new)
+            new = self.equations.behind(pending, known=closed)
+            closed.update(new)
             functions = [n for n in new if g.nodes[n][0] not in (*ARITHMETIC, "leaf", "const")]
             self.slopes |= {n: self._power(n) if g.nodes[n][0] == "pow" else g.slopes(n) for n in functions}
             pending = [slope for n in functions for _, slope in self.slopes[n]]
-        return sorted(found)
+        return sorted(closed)
 
     def _power(self, n: int) -> list[tuple[int, int]]:
         """(argument, derivative of n = x**a with respect to it) pairs, written with n itself, so that they come to an end."""

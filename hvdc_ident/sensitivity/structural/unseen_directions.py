@@ -134,8 +134,8 @@ class _Start:
 
     def _leaves(self, equations: Equations, y: Sequence[Decimal], w: Sequence[Series]) -> dict[int, Series]:
         leaf = equations.graph.leaf
-        found = {leaf("p", k): [v] for k, v in enumerate(self.p)} | {leaf("y", k): [v] for k, v in enumerate(y)}
-        return found | {leaf("w", k): v for k, v in enumerate(w)}
+        leaves = {leaf("p", k): [v] for k, v in enumerate(self.p)} | {leaf("y", k): [v] for k, v in enumerate(y)}
+        return leaves | {leaf("w", k): v for k, v in enumerate(w)}
 
     def _newton(self, e: Equations, zeros: Sequence[int], unknown: Sequence[int], y: Series, w: Series) -> None:
         """Move the unknown elements of y so that the nodes are 0."""
@@ -146,8 +146,8 @@ class _Start:
         nodes = e.behind([*zeros, *chain(*slopes)])
         close = Decimal(1).scaleb(-(getcontext().prec // 2) - 2)  # the step after it would be below the last digit
         for _ in range(STEPS):
-            found = values(e, nodes, {n: v[0] for n, v in self._leaves(e, y, [[v] for v in w]).items()})
-            matrix, right = np.array([[found[d] for d in row] for row in slopes]), [[found[z]] for z in zeros]
+            at = values(e, nodes, {n: v[0] for n, v in self._leaves(e, y, [[v] for v in w]).items()})
+            matrix, right = np.array([[at[d] for d in row] for row in slopes]), [[at[z]] for z in zeros]
             step = solve(matrix, np.array(right))[:, 0]
             for k, d in zip(unknown, step, strict=True):
                 y[k] -= d
