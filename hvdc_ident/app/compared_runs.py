@@ -53,17 +53,17 @@ class ComparedRuns:
         if self._found is not None:  # None: the server is ending
             self._show(self._found, [self._folder.name, other.name])
 
-    def _show(self, found: RunComparison, names: list[str]) -> None:
+    def _show(self, comparison: RunComparison, names: list[str]) -> None:
         self._place.clear()
         with self._place:
-            ui.label(found.conclusion).classes("text-bold")
-            values = found.values_table(names)
+            ui.label(comparison.conclusion).classes("text-bold")
+            values = comparison.values_table(names)
             show_table(values)
             if values.rows:
                 ui.label(APART).classes("small")
             ui.label("RMSE over the recordings that both have").classes("small q-mt-sm")
-            show_table(found.gaps_table(names))
-            for line in (*found.input_lines, *found.verdict_lines):
+            show_table(comparison.gaps_table(names))
+            for line in (*comparison.input_lines, *comparison.verdict_lines):
                 ui.label(line)
 
     def _give(self) -> None:

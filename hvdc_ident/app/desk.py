@@ -85,8 +85,8 @@ def opened(source: str | None = None, *, trust: bool = False) -> Desk:
 
 def _new_file(folder: Path, name: str) -> Path:
     """Return the path of a study in a folder that does not hold one."""
-    number, found = 1, folder / f"{name}-study" / "study.toml"
-    while found.parent.exists():
+    number, file = 1, folder / f"{name}-study" / "study.toml"
+    while file.parent.exists():
         number += 1
-        found = folder / f"{name}-study-{number}" / "study.toml"
-    return found
+        file = folder / f"{name}-study-{number}" / "study.toml"
+    return file

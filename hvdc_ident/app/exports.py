@@ -79,11 +79,11 @@ class ExportButtons:
                 return written.path.read_bytes(), written.note
 
         try:
-            found = await run.io_bound(made)
+            exported = await run.io_bound(made)
         except HvdcIdentError as error:
             ui.notify(str(error), type="negative", multi_line=True)
             return
-        if found is not None:
-            content, note = found
+        if exported is not None:
+            content, note = exported
             ui.download.content(content, name)
             ui.notify(f"{name}: {note}", type="info", multi_line=True)

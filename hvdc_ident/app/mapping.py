@@ -170,16 +170,16 @@ class Draft:
 
 def proposed(record: Trajectory, model: AnyModel, name: str, data: str) -> tuple[RecordingMap, Matching]:
     """Return the mapping that `new` proposes too, with what three phases give, and the matching behind it, with candidates for the rest."""
-    found = proposal(record, model, name)
+    suggested = proposal(record, model, name)
     lines = [
         SignalLine(m.target.name, m.target.kind, m.column.name, why=m.reason, **m.line.keys)
-        for m in found.columns.mapped
+        for m in suggested.columns.mapped
     ]
-    stated = [line.model_dump(exclude_none=True, exclude_defaults=True) for line in found.phases]
-    kept = {"phases": stated, "values": dict(found.values)}
+    stated = [line.model_dump(exclude_none=True, exclude_defaults=True) for line in suggested.phases]
+    kept = {"phases": stated, "values": dict(suggested.values)}
     return RecordingMap(
         name, data, _ordered(lines), kept=FrozenMap({k: v for k, v in kept.items() if v})
-    ), found.columns
+    ), suggested.columns
 
 
 def columns_with_derived(mapping: RecordingMap, record: Trajectory, where: str) -> Trajectory:
@@ -224,8 +224,8 @@ def write_mapping(seen: Seen, mapping: RecordingMap, was: str, source: str, *, t
     if not table.outputs:
         raise StudyError("no output is assigned", where=seen.path.name, expected="at least one recorded output")
     if seen.text is None:
-        found = hi.new_study(seen.path.parent, (seen.path.parent / mapping.data).resolve(), source, trust=trust)
-        seen, was = Seen.now(found.path), found.recordings[0].name
+        new = hi.new_study(seen.path.parent, (seen.path.parent / mapping.data).resolve(), source, trust=trust)
+        seen, was = Seen.now(new.path), new.recordings[0].name
     text = with_experiment(seen.text or "", was, mapping.keys, seen.path.name)
     return write_study(seen, text)
 

@@ -46,11 +46,11 @@ def planned_run(
     for m in models:
         try:
             ready.append(refitted(study, m))
-            found = hi.simulate(ready[-1].model, experiment, outputs=signals)
+            simulated = hi.simulate(ready[-1].model, experiment, outputs=signals)
         except HvdcIdentError as error:
             trouble[m.name] = str(error)
         else:
-            runs[m.name] = {s: found[s] for s in signals}
+            runs[m.name] = {s: simulated[s] for s in signals}
     return PlannedRun(experiment, tuple(ready), runs, trouble)
 
 
@@ -109,19 +109,19 @@ class NextExperiment:
             return
         self._button.props("loading")
         asked = (self._study, planned.experiment(self._study), self._models, signals)
-        found = await run.io_bound(planned_run, *asked)
+        simulated = await run.io_bound(planned_run, *asked)
         self._button.props(remove="loading")
-        if found is not None:  # None: the server is ending
-            known = {m.name: m for m in found.models}
+        if simulated is not None:  # None: the server is ending
+            known = {m.name: m for m in simulated.models}
             self._models = tuple(known.get(m.name, m) for m in self._models)
-            self._trouble.text = "; ".join(f"{n}: {why}" for n, why in found.trouble.items())
-            self._draw(found, signals)
+            self._trouble.text = "; ".join(f"{n}: {why}" for n, why in simulated.trouble.items())
+            self._draw(simulated, signals)
 
-    def _draw(self, found: PlannedRun, signals: tuple[str, ...]) -> None:
+    def _draw(self, simulated: PlannedRun, signals: tuple[str, ...]) -> None:
         colors = dict(zip([m.name for m in self._models], (NOW, *COLORS), strict=False))
-        curves = tuple(Trace(n, colors[n], dashed=k > 1) for k, n in enumerate(found.runs))
-        time = found.experiment.time
-        inputs = found.experiment.inputs
+        curves = tuple(Trace(n, colors[n], dashed=k > 1) for k, n in enumerate(simulated.runs))
+        time = simulated.experiment.time
+        inputs = simulated.experiment.inputs
         known = self._study.model.inputs
         grids = [Grid(with_unit(n, known[n].unit), (Trace("input", GIVEN),)) for n in inputs]
         units = {n: s.unit for n, s in self._study.model.outputs.items()}
@@ -132,4 +132,4 @@ class NextExperiment:
         for k, signal in enumerate(inputs.values()):
             plot.whole(k, thinned(time, np.asarray(signal(time))))
         for k, name in enumerate(signals, len(inputs)):
-            plot.whole(k, thinned(time, *(line[name] for line in found.runs.values())))
+            plot.whole(k, thinned(time, *(line[name] for line in simulated.runs.values())))

@@ -99,24 +99,24 @@ class Page:
         if self._found is not None:
             tell(self._found)
 
-    def tell(self, found: FoundResults) -> None:
+    def tell(self, results: FoundResults) -> None:
         """Tell all parts of the page that there are these results."""
-        self._found = found
+        self._found = results
         for tell in self._told:
-            tell(found)
+            tell(results)
 
     def on_run(self, tell: Callable[[StudyRun | None], None]) -> None:
         """Have the run told that is at work in the folder of results, or was the last; None where there was none."""
         self._told_run.append(tell)
 
-    def tell_run(self, found: StudyRun | None) -> None:
+    def tell_run(self, study_run: StudyRun | None) -> None:
         """Tell all parts of the page how the run stands."""
         for tell in self._told_run:
-            tell(found)
+            tell(study_run)
 
-    def _show_answers(self, found: FoundResults) -> None:
+    def _show_answers(self, results: FoundResults) -> None:
         """Show the four answers of the report in short; opened, as the report has them."""
-        s = found.summary
+        s = results.summary
         if not (s.sets or s.parameters):
             self._answers.content = ""
             return

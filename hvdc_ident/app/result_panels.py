@@ -41,10 +41,10 @@ class Panel:
     uses: tuple[str, ...]
     build: Callable[[FoundResults, Page], None]
 
-    def key(self, found: FoundResults) -> tuple[Any, ...]:
+    def key(self, shown: FoundResults) -> tuple[Any, ...]:
         """Return what changes whenever the panel has something else to show."""
-        marks = tuple(found.of(n).get("fingerprint") for n in self.uses)
-        return found.folder, tuple(found.study.sources.items()), marks
+        marks = tuple(shown.of(n).get("fingerprint") for n in self.uses)
+        return shown.folder, tuple(shown.study.sources.items()), marks
 
 
 def show_table(table: Table) -> None:
@@ -53,9 +53,9 @@ def show_table(table: Table) -> None:
         ui.html(table_of(table), sanitize=False).classes("w-full")
 
 
-def _identifiability(found: FoundResults, page: Page) -> None:
+def _identifiability(shown: FoundResults, page: Page) -> None:
     """Build the verdicts, and the profile of the parameter that is chosen."""
-    report = found.objects.identified
+    report = shown.objects.identified
     if report.misspecified:
         ui.label(f"The model does not explain these data: {'; '.join(report.misspecification.signs)}.")
     show_table(verdicts_table(report))
@@ -106,10 +106,10 @@ def profile_columns(profile: Profile) -> list[Array]:
     return [at, np.interp(at, dense, between), only(x, rise), np.ones(at.size), only(ends, 1.0)]
 
 
-def _fitted(found: FoundResults, page: Page) -> None:
+def _fitted(shown: FoundResults, page: Page) -> None:
     """Build the values, and recorded, given and fitted waveforms of an experiment."""
-    show_table(values_table(found.summary))
-    results = Results(found.folder)
+    show_table(values_table(shown.summary))
+    results = Results(shown.folder)
     names = [n for n in results.experiments if results.table(f"fit.{n}.csv") is not None]
     if not names:
         return
@@ -159,13 +159,13 @@ def overlay_columns(overlay: Overlay, sets: tuple[str, ...], *, errors: bool = F
     return columns
 
 
-def _diagnosed(found: FoundResults, page: Page) -> None:
+def _diagnosed(shown: FoundResults, page: Page) -> None:
     """Build what the diagnosis says, its findings, and the errors with each set of values."""
-    diagnosis, sizes = found.objects.diagnosis, found.objects.of_diagnosis.sizes
+    diagnosis, sizes = shown.objects.diagnosis, shown.objects.of_diagnosis.sizes
     ui.label("" if diagnosis is None else diagnosis.text or diagnosis.verdict)
-    show_table(findings_table(found.summary))
-    show_table(sets_table(found.summary))
-    models, trouble = found.supposed
+    show_table(findings_table(shown.summary))
+    show_table(sets_table(shown.summary))
+    models, trouble = shown.supposed
     ui.label(trouble).classes("alert")
     if models:
         button = ui.button("Explore it with sliders", on_click=lambda: page.explore(models[0].name))
@@ -173,18 +173,18 @@ def _diagnosed(found: FoundResults, page: Page) -> None:
         button.tooltip(
             "Opens the model with what was found on the tab Explore; its rivals stand there under “model with”."
         )
-    results = Results(found.folder)
+    results = Results(shown.folder)
     told = sizes.experiment if sizes is not None else next(iter(results.experiments), "")
     ui.label(f"Recorded less simulated in {told}, without and with what was found").classes("small q-mt-sm")
     _overlay(results, told, ui.element("div").classes("w-full"), errors=True)
 
 
-def _next(found: FoundResults, page: Page) -> None:
+def _next(shown: FoundResults, page: Page) -> None:
     """Build what to record next, simulated before it is made."""
-    ui.label(advice(found.summary) or found.summary.unadvised or "The results ask for no further record.")
-    models, trouble = found.supposed
+    ui.label(advice(shown.summary) or shown.summary.unadvised or "The results ask for no further record.")
+    models, trouble = shown.supposed
     ui.label(trouble).classes("alert")
-    NextExperiment(found.study, found.objects.identified, found.fitted, models).build()
+    NextExperiment(shown.study, shown.objects.identified, shown.fitted, models).build()
 
 
 PANELS = (

@@ -80,8 +80,8 @@ def _own(study: hi.Study) -> Path:
 
 def first_folder(study: hi.Study) -> Path:
     """Return the folder whose results the page opens with: the study's own, or one beside it where that has none."""
-    found = result_folders(study)
-    return next((p for p in found if _holds_results(p)), found[0])
+    folders = result_folders(study)
+    return next((p for p in folders if _holds_results(p)), folders[0])
 
 
 def _holds_results(folder: Path) -> bool:
@@ -174,8 +174,8 @@ class StudyRun:
     @property
     def stage(self) -> str:
         """The stage that is at work; "" where none has said so yet."""
-        found = _STAGE.match(self.text)
-        return found[1] if found else ""
+        match = _STAGE.match(self.text)
+        return match[1] if match else ""
 
     @property
     def share(self) -> float:

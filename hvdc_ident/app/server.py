@@ -94,20 +94,20 @@ def serve(
 
 
 def _listening(host: str, port: int) -> socket.socket:
-    found = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        found.bind((host, port))
-        found.listen()  # who opens the address at once waits, and is not refused
+        listener.bind((host, port))
+        listener.listen()  # who opens the address at once waits, and is not refused
     except OSError as error:
-        found.close()
+        listener.close()
         raise InputError(
             "the server cannot listen there",
             where=f"{host}, port {port}",
             got=error.strerror or str(error),
             hint="--port 0 takes any that is free",
         ) from None
-    return found
+    return listener
 
 
 @cache
@@ -115,5 +115,5 @@ def tabs() -> tuple[Tab, ...]:
     """Return every tab, in order, found by walking `tabs/`."""
     from hvdc_ident.app import tabs as folder
 
-    found = [importlib.import_module(f"{folder.__name__}.{m.name}").TAB for m in pkgutil.iter_modules(folder.__path__)]
-    return tuple(sorted(found, key=lambda t: t.order))
+    every = [importlib.import_module(f"{folder.__name__}.{m.name}").TAB for m in pkgutil.iter_modules(folder.__path__)]
+    return tuple(sorted(every, key=lambda t: t.order))

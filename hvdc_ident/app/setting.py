@@ -186,14 +186,14 @@ class Setting:
         """Return, by parameter and shown output, the RMS of the derivative times the value. Raises as `hvdc_ident.sensitivities`."""
         names = [n for n in self.model.parameters if n in self.parameters]
         if self.record is not None:
-            found = hi.sensitivities(self.model, self.record, names, values=self.values)
+            derivatives = hi.sensitivities(self.model, self.record, names, values=self.values)
         else:
             signals = {n: c.signal(self.end) for n, c in self.courses.items()}
-            found = hi.sensitivities(
+            derivatives = hi.sensitivities(
                 self.model, self.time, names, inputs=signals, outputs=self.outputs, values=self.values
             )
-        assert found.trajectories is not None  # there is an experiment
-        rms = found.trajectories.norms["rms"].isel(experiment=0)
+        assert derivatives.trajectories is not None  # there is an experiment
+        rms = derivatives.trajectories.norms["rms"].isel(experiment=0)
         shown = [o for o in self.outputs if o in rms["output"]]
         return {n: {o: float(rms.sel(parameter=n, output=o)) for o in shown} for n in names}
 
@@ -212,9 +212,9 @@ def with_effects(setting: Setting, effects: Iterable[Mapping[str, Any]]) -> Sett
     Raises ModelError or UnknownNameError for one that does not fit.
     """
     uses = tuple(FrozenMap(use) for use in effects)
-    found = of_model(setting, setting.base, hi.apply_effects(setting.base, uses) if uses else setting.base, uses)
+    changed = of_model(setting, setting.base, hi.apply_effects(setting.base, uses) if uses else setting.base, uses)
     of_base = FrozenMap({n: t for n, t in setting.titles.items() if n in setting.base.parameters})
-    return replace(found, titles=of_base | size_titles(setting.base, uses))
+    return replace(changed, titles=of_base | size_titles(setting.base, uses))
 
 
 def of_model(
@@ -237,15 +237,15 @@ def effects_with_sizes(setting: Setting) -> list[dict[str, Any]]:
 
 def sizes_of(base: AnyModel, effects: Sequence[EffectUse | Mapping[str, Any]]) -> list[dict[str, str]]:
     """Return, by effect, the parameters that it adds to a model, with their keys among the effect's own. Raises as `with_effects`."""
-    found: list[dict[str, str]] = []
+    sizes: list[dict[str, str]] = []
     before = base
     for k, use in enumerate(effects):
         now = hi.apply_effects(base, effects[: k + 1])
         added = [n for n in now.parameters if n not in before.parameters]
         own = EffectUse.of(use).parameters
-        found.append({n: next((key for key in own if n.endswith(f"_{key}")), n.rpartition("_")[2]) for n in added})
+        sizes.append({n: next((key for key in own if n.endswith(f"_{key}")), n.rpartition("_")[2]) for n in added})
         before = now
-    return found
+    return sizes
 
 
 def size_titles(base: AnyModel, effects: Sequence[EffectUse | Mapping[str, Any]]) -> FrozenMap[str]:

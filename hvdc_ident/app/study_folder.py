@@ -56,10 +56,10 @@ class Seen:
 def stamp(path: Path) -> tuple[int, int, int] | None:
     """Return what tells cheaply that a file is another one than before; None where there is none."""
     try:
-        found = path.stat()
+        stat = path.stat()
     except OSError:
         return None
-    return found.st_mtime_ns, found.st_size, found.st_ino
+    return stat.st_mtime_ns, stat.st_size, stat.st_ino
 
 
 def write_study(seen: Seen, text: str) -> Seen:
@@ -177,14 +177,14 @@ def recordings_in(folder: Path) -> list[str]:
     Folders of results, and those whose names begin with a dot, are left out.
     """
     endings = _endings()
-    found = []
+    paths = []
     for place, folders, files in os.walk(folder):
         here = Path(place)
         folders[:] = [f for f in folders if not f.endswith("-results") and not f.startswith(".")]
         if len(here.relative_to(folder).parts) >= DEEPEST:
             folders.clear()
-        found += [here / f for f in files if Path(f).suffix.lower() in endings and not f.startswith(".")]
-    return sorted(p.relative_to(folder).as_posix() for p in found)
+        paths += [here / f for f in files if Path(f).suffix.lower() in endings and not f.startswith(".")]
+    return sorted(p.relative_to(folder).as_posix() for p in paths)
 
 
 def chosen_recording(folder: Path, name: str) -> Path:

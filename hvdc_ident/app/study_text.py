@@ -242,8 +242,8 @@ def _meaning(study: Mapping[str, Any]) -> dict[str, Any]:
 
 def _plain(experiment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys that an experiment states, its tables with one key for each signal."""
-    found = dict(experiment)
-    for key in (k for k in TABLES if k in found):
-        names = found[key]
-        found[key] = with_dots({n: n for n in names} if isinstance(names, list) else names, tables=key == "columns")
-    return {k: v for k, v in found.items() if v is not None and v != {}}
+    keys = dict(experiment)
+    for key in (k for k in TABLES if k in keys):
+        names = keys[key]
+        keys[key] = with_dots({n: n for n in names} if isinstance(names, list) else names, tables=key == "columns")
+    return {k: v for k, v in keys.items() if v is not None and v != {}}

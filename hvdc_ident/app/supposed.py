@@ -49,13 +49,13 @@ def suppositions(study: hi.Study, diagnosis: Diagnosis | None, folder: Path) -> 
     if diagnosis is None or not diagnosis.augmented_model or not card.is_file():
         return ()
     best = hi.load_model(card)
-    found: Sequence[FoundEffect | Rival] = diagnosis.effects
+    likeliest: Sequence[FoundEffect | Rival] = diagnosis.effects
     gains = {n: v for n, v in diagnosis.parameters_after.items() if n in study.model.parameters}
     plant = study.model.with_values(gains)
-    rivals = [Supposition(_named(found), best, _sizes(study, best), titles=_titles(plant, found))]
+    rivals = [Supposition(_named(likeliest), best, _sizes(study, best), titles=_titles(plant, likeliest))]
     for k, group in enumerate(diagnosis.ambiguity):
-        for other in (r for r in group if k >= len(found) or _place_of(r) != _place_of(found[k])):
-            effects = [*found[:k], other, *found[k + 1 :]]
+        for other in (r for r in group if k >= len(likeliest) or _place_of(r) != _place_of(likeliest[k])):
+            effects = [*likeliest[:k], other, *likeliest[k + 1 :]]
             own = {n: v.value for n, v in other.values.items() if n in gains}
             try:
                 model = hi.apply_effects(plant.with_values(own), [use_of(e) for e in effects])
@@ -85,10 +85,10 @@ def refitted(study: hi.Study, rival: Supposition) -> Supposition:
     ]
     unknowns += [FitParameter.of(n, rival.model.parameters[n]) for n in rival.sizes]
     problem = Problem(ModelSimulator(rival.model), study.experiments, tuple(unknowns))
-    found = hi.fit(problem, starts=1, assess=False)
-    if found.status == "failed":
-        raise ComputationError(f"the model with {rival.name} could not be fitted", got=found.message)
-    return replace(rival, model=rival.model.with_values({u.name: found.values[u.name] for u in unknowns}), fitted=True)
+    fit = hi.fit(problem, starts=1, assess=False)
+    if fit.status == "failed":
+        raise ComputationError(f"the model with {rival.name} could not be fitted", got=fit.message)
+    return replace(rival, model=rival.model.with_values({u.name: fit.values[u.name] for u in unknowns}), fitted=True)
 
 
 def _named(effects: Sequence[FoundEffect | Rival]) -> str:

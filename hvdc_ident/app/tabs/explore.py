@@ -254,18 +254,18 @@ class Explorer:
         self._start.visible = self._progress.visible = False
         ui.keyboard(on_key=self._on_key)
 
-    def _offer_starts(self, found: FoundResults) -> None:
+    def _offer_starts(self, results: FoundResults) -> None:
         """Offer the models that the results come to: the fitted one, and those with what a diagnosis found."""
-        self._starts = {m.name: m for m in found.models}
+        self._starts = {m.name: m for m in results.models}
         names = {"": "given values", **{n: n for n in self._starts}}
         self._start.set_options(names, value=self._setting.start if self._setting.start in names else "")
         self._start.visible = len(names) > 1
         waited = self._awaits_fit or self._setting is self._began  # what somebody has set by hand since is left alone
-        if found.fitted is None or not found.is_of_the_study("fit") or not waited:
+        if results.fitted is None or not results.is_of_the_study("fit") or not waited:
             return
-        again = found.fitted.name == self._setting.start and found.fitted.model.values == self._setting.base.values
+        again = results.fitted.name == self._setting.start and results.fitted.model.values == self._setting.base.values
         if self._awaits_fit or not again:
-            self._begin_with(found.fitted)
+            self._begin_with(results.fitted)
         self._began, self._awaits_fit = self._setting, False
 
     def _open(self, name: str) -> None:
@@ -280,40 +280,40 @@ class Explorer:
         if not name or study is None:
             self._set(replace(self._given, **self._looks()))
             return
-        found = await run.io_bound(refitted, study, self._starts[name])
-        if found is not None:  # None: the server is ending
-            self._starts[name] = found
-            self._begin_with(found)
+        supposition = await run.io_bound(refitted, study, self._starts[name])
+        if supposition is not None:  # None: the server is ending
+            self._starts[name] = supposition
+            self._begin_with(supposition)
 
-    def _begin_with(self, found: Supposition) -> None:
+    def _begin_with(self, supposition: Supposition) -> None:
         """Show a model that the results come to, with its values."""
-        shown = of_model(replace(self._given, **self._looks()), found.model)
-        self._set(replace(shown, start=found.name, titles=found.titles))
+        shown = of_model(replace(self._given, **self._looks()), supposition.model)
+        self._set(replace(shown, start=supposition.name, titles=supposition.titles))
 
     async def _fit(self) -> None:
         """Write what was set here to the study and run its fit; the page is told when that ends."""
         if await self._write(quiet=True):
             self._awaits_fit = self._page.start("fit") is not None
 
-    def _take_run(self, found: StudyRun | None) -> None:
+    def _take_run(self, study_run: StudyRun | None) -> None:
         """Show how the run stands, and why a fit that was asked for here has none."""
         if self._page.desk.study is None:
             return
-        working = found is not None and found.outcome == "running"
+        working = study_run is not None and study_run.outcome == "running"
         self._fit_button.set_enabled(not working)
-        ended = self._awaits_fit and found is not None and not working
-        if ended and found is not None and found.outcome != "done":
+        ended = self._awaits_fit and study_run is not None and not working
+        if ended and study_run is not None and study_run.outcome != "done":
             self._awaits_fit = False
             ui.notify(
-                found.message or "The fit was cancelled.",
+                study_run.message or "The fit was cancelled.",
                 type="negative",
                 multi_line=True,
                 timeout=0,
                 close_button="Close",
             )
         self._progress.visible = working
-        if found is not None and working:
-            self._progress.text = found.text
+        if study_run is not None and working:
+            self._progress.text = study_run.text
 
     def _looks(self) -> dict[str, Any]:
         return {
@@ -495,8 +495,8 @@ class Explorer:
     def _ask(self) -> None:
         self._latest.ask((self._given if self._stale else None, self._setting, self._omega))
 
-    def _take(self, found: tuple[Answer | None, Setting, Answer]) -> None:
-        given, setting, answer = found
+    def _take(self, answers: tuple[Answer | None, Setting, Answer]) -> None:
+        given, setting, answer = answers
         if given is not None:
             self._stale = False
             self._omega = None if given.bode is None else given.bode.omega
@@ -606,9 +606,9 @@ class Explorer:
                 return verdicts, f"{words} No locus of {name}: {error}", NONE
             return verdicts, words, np.concatenate([near(poles) for poles in locus.eigenvalues])
 
-        found = await run.io_bound(slow)
-        if found is not None and setting is self._setting:
-            verdicts, self._margins.text, self._locus = found
+        results = await run.io_bound(slow)
+        if results is not None and setting is self._setting:
+            verdicts, self._margins.text, self._locus = results
             self._show_errors(verdicts)
             self._poles.whole(0, scattered(self._locus, self._ringed, self._now))
         if equations_of(setting.model) is not None:
@@ -621,13 +621,13 @@ def _sensitivity_table(setting: Setting) -> Table:
     """Return the table of sensitivities, the largest first; without rows where they cannot be had."""
     header = ("parameter (RMS of the derivative times the value)", *setting.outputs)
     try:
-        found = setting.sensitivities()
+        derivatives = setting.sensitivities()
     except HvdcIdentError:
         return Table(header, ())  # the page says already why the model does not run
     units = {n: setting.model.outputs[n].unit for n in setting.outputs}
-    order = sorted(found, key=lambda n: -max(found[n].values(), default=0.0))
+    order = sorted(derivatives, key=lambda n: -max(derivatives[n].values(), default=0.0))
     return Table(
-        header, tuple((n, *(quantity(found[n].get(o, 0.0), units[o]) for o in setting.outputs)) for n in order)
+        header, tuple((n, *(quantity(derivatives[n].get(o, 0.0), units[o]) for o in setting.outputs)) for n in order)
     )
 
 

@@ -510,9 +510,9 @@ class Mapper:
 
     def _build_candidates(self, column: Column) -> None:
         """Build a button for each signal that the column may be."""
-        found = self._matching.proposed if self._matching else ()
+        candidates = self._matching.proposed if self._matching else ()
         with ui.row().classes("w-full gap-0"):
-            for match in (m for m in found if m.column.name == column.name):
+            for match in (m for m in candidates if m.column.name == column.name):
                 target = match.target
 
                 def take(signal: str = target.name, kind: Any = target.kind, base: float | None = match.base) -> None:
@@ -588,8 +588,8 @@ class Mapper:
         """Return where the markers stand, s: as stated, else as found, else at the ends."""
         first, last = float(self._time[0]), float(self._time[-1])
         mapping = self._map
-        found = self._draft.experiment.event if self._draft else None
-        event = mapping.event if mapping and mapping.event is not None else found
+        draft_event = self._draft.experiment.event if self._draft else None
+        event = mapping.event if mapping and mapping.event is not None else draft_event
         window = (mapping.window if mapping else None) or (first, last)
         return {"event": first if event is None else event, "from": window[0], "to": window[1]}
 
@@ -628,9 +628,9 @@ class Mapper:
             if draft is None:
                 ui.label(text).classes("alert")
                 return
-            found = draft.summary
-            doubts = {*found.rest_lines, *(f"steady state, {line}" for line in found.steady_state)}
-            lines = str(found).splitlines()
+            summary = draft.summary
+            doubts = {*summary.rest_lines, *(f"steady state, {line}" for line in summary.steady_state)}
+            lines = str(summary).splitlines()
             own = [line for line in lines[1:] if line.startswith(f"experiment {draft.experiment.name}")]
             told = [lines[0], *(line for line in lines if line in doubts), *own]
             moved = event_time(draft.experiment.inputs)

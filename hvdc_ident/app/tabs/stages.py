@@ -105,10 +105,10 @@ class StageDesk:
 
     def _offer_folders(self) -> list[Path]:
         """Offer the folders that hold results, and return those besides the one that is open."""
-        found = result_folders(self._study)
-        self._folders.set_options({str(p): folder_name(self._study, p) for p in found}, value=str(self._folder))
-        self._folders.visible = len(found) > 1
-        return [p for p in found if p != self._folder and p.is_dir() and any(p.glob("*.json"))]
+        folders = result_folders(self._study)
+        self._folders.set_options({str(p): folder_name(self._study, p) for p in folders}, value=str(self._folder))
+        self._folders.visible = len(folders) > 1
+        return [p for p in folders if p != self._folder and p.is_dir() and any(p.glob("*.json"))]
 
     def _choose_folder(self, event: Any) -> None:
         chosen = next((p for p in result_folders(self._study) if str(p) == event.value), None)
@@ -146,9 +146,9 @@ class StageDesk:
         return started
 
     def _end(self) -> None:
-        found = RUNS.of(self._folder)
-        if found is not None:
-            found.cancel()
+        study_run = RUNS.of(self._folder)
+        if study_run is not None:
+            study_run.cancel()
             self._text.text = "ending"
 
     def _write_letter(self) -> None:
@@ -162,18 +162,18 @@ class StageDesk:
             return
         self._busy = True
         try:
-            found = RUNS.of(self._folder)
-            self._show_run(found)
+            study_run = RUNS.of(self._folder)
+            self._show_run(study_run)
             beside = sorted(p for p in self._study.path.resolve().parent.iterdir() if p.is_dir() and p != self._folder)
             marks = signature(self._study, self._folder)
-            seen = (self._folder, marks, found and (found.stage, found.outcome), [stamp(p) for p in beside])
+            seen = (self._folder, marks, study_run and (study_run.stage, study_run.outcome), [stamp(p) for p in beside])
             if seen != self._seen:
                 await self._read(seen)
             if self._read_last is not self._drawn and (self._drawn is None or self._page.is_open(TAB.title)):
                 await self._draw(*self._read_last)
-            if found is not None and found is self._letter and found.outcome != "running":
+            if study_run is not None and study_run is self._letter and study_run.outcome != "running":
                 self._letter = None
-                if found.outcome == "done":
+                if study_run.outcome == "done":
                     self._exports.give(self._folder / "letter.html")
         finally:
             self._busy = False
@@ -191,10 +191,10 @@ class StageDesk:
                     trouble = f"The study as its file is now cannot be read; shown is the one before. {error}"
             return study, standings(study, self._folder), trouble
 
-        found = await run.io_bound(read)
-        if found is None:
+        state = await run.io_bound(read)
+        if state is None:
             return  # the server is ending
-        self._study, stages, self._unreadable = found
+        self._study, stages, self._unreadable = state
         self._seen = seen
         data = {s.stage.name: s.data for s in stages if s.data and s.state in ("done", "stale")}
         shown = FoundResults(self._study, self._folder, data)
@@ -225,35 +225,40 @@ class StageDesk:
         if shown.data and others:
             await self._comparison.offer(self._study, self._folder, others)
 
-    def _show_run(self, found: StudyRun | None) -> None:
-        working = found is not None and found.outcome == "running"
+    def _show_run(self, study_run: StudyRun | None) -> None:
+        working = study_run is not None and study_run.outcome == "running"
         for element in (self._progress, self._cancel):
             element.set_visibility(working)
         for button in (self._all, *self._starts):
             button.set_enabled(not working)
         trouble = self._unreadable
-        if found is not None and working:
-            self._share.value = found.share
-            self._share.props(remove="indeterminate") if found.share else self._share.props("indeterminate")
-            self._times.text = f"{percentage(found.share)}, {found.times}" if found.share else found.times
-            self._text.text = found.text
-        elif found is not None:
-            said = {"failed": found.message, "cancelled": "Cancelled. What was finished is kept; the next run goes on."}
-            trouble = "\n".join(t for t in (trouble, said.get(found.outcome, "")) if t)
+        if study_run is not None and working:
+            self._share.value = study_run.share
+            self._share.props(remove="indeterminate") if study_run.share else self._share.props("indeterminate")
+            self._times.text = (
+                f"{percentage(study_run.share)}, {study_run.times}" if study_run.share else study_run.times
+            )
+            self._text.text = study_run.text
+        elif study_run is not None:
+            said = {
+                "failed": study_run.message,
+                "cancelled": "Cancelled. What was finished is kept; the next run goes on.",
+            }
+            trouble = "\n".join(t for t in (trouble, said.get(study_run.outcome, "")) if t)
         self._trouble.text = trouble
-        self._page.tell_run(found)
+        self._page.tell_run(study_run)
 
-    def _show_stages(self, found: tuple[StageStanding, ...]) -> None:
+    def _show_stages(self, stages: tuple[StageStanding, ...]) -> None:
         at_work = RUNS.of(self._folder)
         working = at_work is not None and at_work.outcome == "running"
-        if (shown := (found, working, at_work and at_work.stage)) == self._stages:
+        if (shown := (stages, working, at_work and at_work.stage)) == self._stages:
             return
         self._stages = shown
         self._list.clear()
         self._starts = []
         with self._list:
             for asked, title in ((True, "Stages that the study asks for"), (False, "Other stages")):
-                group = [s for s in found if s.asked is asked]
+                group = [s for s in stages if s.asked is asked]
                 if group:
                     ui.label(title).classes("text-caption text-grey q-mt-sm")
                 for s in group:
