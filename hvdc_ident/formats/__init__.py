@@ -79,12 +79,12 @@ class Format(Protocol):
 
 @cache
 def _catalogue() -> tuple[tuple[str, Format], ...]:
-    found = {}
+    modules = {}
     for info in pkgutil.iter_modules(__path__):
         if not info.name.startswith("_"):
             module = cast(Format, importlib.import_module(f"{__name__}.{info.name}"))
-            found[module.NAME] = module
-    return tuple(sorted(found.items()))
+            modules[module.NAME] = module
+    return tuple(sorted(modules.items()))
 
 
 def formats() -> dict[str, Format]:
@@ -123,18 +123,18 @@ def read_waveforms(path: str | os.PathLike[str], signals: Iterable[str] | None =
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     path = Path(folder, "step.csv")
     ...     _ = path.write_text("time,u [pu],y\\n0,1,0.4\\n0.1,1.5,0.4\\n")
-    ...     found = read_waveforms(path, ["y", "u"])
-    >>> found.names, found.unit("u"), found["u"].tolist()
+    ...     waveforms = read_waveforms(path, ["y", "u"])
+    >>> waveforms.names, waveforms.unit("u"), waveforms["u"].tolist()
     (('y', 'u'), 'pu', [1.0, 1.5])
     """
     file = _usable_file(path)
     wanted = [signals] if isinstance(signals, str) else None if signals is None else list(signals)
-    found = _format_of(file).read(file, wanted)
-    check_times(found.time, file)
-    found = once(found)
-    _check(found, file)
-    units = _units(list(zip(found.names, found.units, strict=True)))
-    return _from_first_row(replace(found, units=tuple(unit for _, unit in units)))
+    waveforms = _format_of(file).read(file, wanted)
+    check_times(waveforms.time, file)
+    waveforms = once(waveforms)
+    _check(waveforms, file)
+    units = _units(list(zip(waveforms.names, waveforms.units, strict=True)))
+    return _from_first_row(replace(waveforms, units=tuple(unit for _, unit in units)))
 
 
 def _units(signals: list[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -145,17 +145,17 @@ def _units(signals: list[tuple[str, str]]) -> list[tuple[str, str]]:
     return [(name, unit or unit_in_name(name, names)) for name, unit in signals]
 
 
-def _from_first_row(found: Trajectory) -> Trajectory:
+def _from_first_row(waveforms: Trajectory) -> Trajectory:
     """The waveforms with a time since 1970 counted from the first row; others as they are.
 
     Three years are no record's own clock.
     """
-    first = float(found.time[0])
+    first = float(waveforms.time[0])
     if first < LONGEST:
-        return found
-    scale = 1.0 if found.origin.time_unit else unit_since_1970(first)
-    time = scaled(found.time - first, scale)
-    return replace(found, time=time, origin=replace(found.origin, time_unit="date"))
+        return waveforms
+    scale = 1.0 if waveforms.origin.time_unit else unit_since_1970(first)
+    time = scaled(waveforms.time - first, scale)
+    return replace(waveforms, time=time, origin=replace(waveforms.origin, time_unit="date"))
 
 
 def unit_since_1970(number: float) -> float:
@@ -192,8 +192,8 @@ def list_signals(path: str | os.PathLike[str], search: str = "") -> list[tuple[s
     if hasattr(module, "signals"):
         listed = module.signals(file)
     else:
-        found = module.read(file)
-        listed = list(zip(found.names, found.units, strict=True))
+        waveforms = module.read(file)
+        listed = list(zip(waveforms.names, waveforms.units, strict=True))
     return [(name, unit) for name, unit in _units(listed) if fits(name)]
 
 
@@ -220,33 +220,33 @@ def convert(
         )
     if file.exists() and Path(source).exists() and file.samefile(source):
         raise WaveformError("source and target are the same file", where=str(file), hint="another name")
-    found = read_waveforms(source, signals)
+    waveforms = read_waveforms(source, signals)
     if window is not None:
-        found = _cut(found, window, str(source))
+        waveforms = _cut(waveforms, window, str(source))
     if file.suffix.lower() == ".csv":
-        write_csv(found, file)
+        write_csv(waveforms, file)
     else:
         with _whole(file) as temporary:
-            writers[file.suffix.lower()].write(found, temporary)
-    return found
+            writers[file.suffix.lower()].write(waveforms, temporary)
+    return waveforms
 
 
-def _cut(found: Trajectory, window: tuple[float, float], where: str) -> Trajectory:
+def _cut(waveforms: Trajectory, window: tuple[float, float], where: str) -> Trajectory:
     """The rows within the window. Raises WaveformError where there are fewer than two."""
     low, high = window
-    inside = (found.time >= low) & (found.time <= high)
+    inside = (waveforms.time >= low) & (waveforms.time <= high)
     if int(inside.sum()) < 2:
-        start, end = float(found.time[0]), float(found.time[-1])
+        start, end = float(waveforms.time[0]), float(waveforms.time[-1])
         reason = "ends before it begins" if high < low else "holds too few rows"
         reason = "lies outside the record" if low > end or high < start else reason
         raise WaveformError(
             f"the window from {low:g} to {high:g} s {reason}",
             where=where,
-            expected=f"at least 2 of the {len(found)} rows from {start:g} to {end:g} s",
+            expected=f"at least 2 of the {len(waveforms)} rows from {start:g} to {end:g} s",
             got=f"{int(inside.sum())} rows",
             hint=f"{high:g} {low:g}" if high < low else f"{start:g} {end:g}, which is all of it",
         )
-    return found.rows(inside)
+    return waveforms.rows(inside)
 
 
 def write_csv(trajectory: Trajectory, path: str | os.PathLike[str], *, units: bool = False) -> None:
@@ -308,12 +308,12 @@ def event_rows(time: Array) -> NDArray[np.bool_]:
     return np.asarray(first | last)
 
 
-def once(found: Trajectory) -> Trajectory:
+def once(waveforms: Trajectory) -> Trajectory:
     """The waveforms with the first and the last row of every instant alone; `origin` counts what is left out."""
-    keep = event_rows(found.time)
-    before = found.origin
-    origin = replace(before, rows=before.rows or len(found), dropped=before.dropped + int(np.count_nonzero(~keep)))
-    kept = found if keep.all() else found.rows(keep)
+    keep = event_rows(waveforms.time)
+    before = waveforms.origin
+    origin = replace(before, rows=before.rows or len(waveforms), dropped=before.dropped + int(np.count_nonzero(~keep)))
+    kept = waveforms if keep.all() else waveforms.rows(keep)
     return replace(kept, origin=origin)
 
 
@@ -418,19 +418,19 @@ def check_times(t: Array, path: Path, rows: int = 2) -> None:
         )
 
 
-def _check(found: Trajectory, path: Path, rows: int = 2) -> None:
+def _check(waveforms: Trajectory, path: Path, rows: int = 2) -> None:
     """Refuse a trajectory without the properties that every format promises, which its module need not check."""
-    check_times(found.time, path, rows)
+    check_times(waveforms.time, path, rows)
     where = str(path)
-    if not event_rows(found.time).all():
+    if not event_rows(waveforms.time).all():
         raise WaveformError("one time stands more than twice", where=where, expected="two rows at a jump")
-    bad = np.argwhere(np.isinf(found.values))
+    bad = np.argwhere(np.isinf(waveforms.values))
     if bad.size:
         row, column = bad[0]
         raise WaveformError(
-            f"signal '{found.names[column]}' is infinite at {found.time[row]:g} s",
+            f"signal '{waveforms.names[column]}' is infinite at {waveforms.time[row]:g} s",
             where=where,
-            got=str(found.values[row, column]),
+            got=str(waveforms.values[row, column]),
             expected="a finite number, or an empty cell or NaN where nothing was recorded",
             hint="select the signals you need, or cut the time in which it is infinite",
         )

@@ -93,8 +93,8 @@ class Clock:
             self._first = (date, time_of_day, fraction)
         elif date:
             day = _days_between(self._first[0], date)
-        found = day * _DAY + (time_of_day - self._first[1]) + (fraction - self._first[2])
-        return found if match["zone"] else self._through_summer_time(found, text)
+        elapsed = day * _DAY + (time_of_day - self._first[1]) + (fraction - self._first[2])
+        return elapsed if match["zone"] else self._through_summer_time(elapsed, text)
 
     def _day_of(self, time_of_day: float) -> int:
         if time_of_day < self._time_of_day - _DAY / 2:
@@ -134,14 +134,14 @@ def _days_between(first: str, later: str) -> int:
     """The days from one date to another. Raises ValueError where either is none."""
     if not first:
         raise ValueError("a date after times of day without one")
-    found: list[int] = []
+    counts: list[int] = []
     for month_first in (False, True):
         with contextlib.suppress(ValueError):
-            found.append(_day(later, month_first) - _day(first, month_first))
-    if not found:
+            counts.append(_day(later, month_first) - _day(first, month_first))
+    if not counts:
         _day(first, False), _day(later, False)
         raise ValueError("dates of two orders")
-    return min(found, key=lambda days: (days < 0, abs(days)))
+    return min(counts, key=lambda days: (days < 0, abs(days)))
 
 
 def _day(text: str, month_first: bool) -> int:

@@ -31,14 +31,14 @@ MEMORY = 3 * MAX_BYTES
 
 def own_names(labels: Sequence[str]) -> tuple[str, ...]:
     """The labels with those that stand more than once numbered: `a`, `a`, `b` become `a`, `a (2)`, `b`."""
-    labelled, found = set(labels), dict[str, None]()
+    labelled, names = set(labels), dict[str, None]()
     for label in labels:
         name, n = label, 1
-        while name in found or (n > 1 and name in labelled):
+        while name in names or (n > 1 and name in labelled):
             n += 1
             name = f"{label} ({n})"
-        found[name] = None
-    return tuple(found)
+        names[name] = None
+    return tuple(names)
 
 
 def time_name(names: Sequence[str]) -> str | None:
@@ -55,7 +55,7 @@ def guarded(read: Callable[[Path], Trajectory], path: Path) -> Trajectory:
     """
     deadline = START + path.stat().st_size / RATE
     try:
-        found: Trajectory = call(read, path, seconds=deadline, memory=MEMORY)
+        waveforms: Trajectory = call(read, path, seconds=deadline, memory=MEMORY)
     except WaveformError:
         raise
     except TimeoutError:
@@ -67,7 +67,7 @@ def guarded(read: Callable[[Path], Trajectory], path: Path) -> Trajectory:
         raise damaged(path, "reading the file ended the reader", got=said[:200] or str(ended)) from None
     except Exception as error:  # what a library raises over a damaged file may be anything
         raise damaged(path, f"the file cannot be read: {one_line(error)}") from None
-    return found
+    return waveforms
 
 
 def joined(parts: Sequence[Trajectory]) -> Trajectory:
@@ -109,13 +109,13 @@ def joined(parts: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(time, values, names, units, origin)
 
 
-def chosen(found: Trajectory, signals: Sequence[str] | None, path: Path) -> Trajectory:
+def chosen(waveforms: Trajectory, signals: Sequence[str] | None, path: Path) -> Trajectory:
     """The signals, all or those named in that order, over the rows of their own records. Raises UnknownNameError."""
-    kept = found.select([found.names[i] for i in pick(path, signals, found.names)])
-    records = [r for r in found.origin.records if not set(r).isdisjoint(kept.names)]
-    if len(records) == len(found.origin.records):
+    kept = waveforms.select([waveforms.names[i] for i in pick(path, signals, waveforms.names)])
+    records = [r for r in waveforms.origin.records if not set(r).isdisjoint(kept.names)]
+    if len(records) == len(waveforms.origin.records):
         return kept
-    rows = np.logical_or.reduce([found.own_rows(record[0]) for record in records])
+    rows = np.logical_or.reduce([waveforms.own_rows(record[0]) for record in records])
     if len(records) < 2:
         kept = replace(kept, origin=replace(kept.origin, records=(), notes=()))
     return kept.rows(rows)

@@ -95,8 +95,8 @@ def _range(fields: Sequence[str]) -> Range | None:
         return None
     if not (low.is_finite() and high.is_finite() and low < high):
         return None
-    found = Range(float(low), float(high), _digit(low), _digit(high))
-    return found if all(map(math.isfinite, (found.low, found.high, found.low_digit, found.high_digit))) else None
+    limits = Range(float(low), float(high), _digit(low), _digit(high))
+    return limits if all(map(math.isfinite, (limits.low, limits.high, limits.low_digit, limits.high_digit))) else None
 
 
 def _digit(number: Decimal) -> float:
@@ -105,8 +105,8 @@ def _digit(number: Decimal) -> float:
 
 
 def _fields(line: str, n: int) -> list[str]:
-    found = [cell.strip() for cell in line.split(",")][:n]
-    return found + [""] * (n - len(found))
+    cells = [cell.strip() for cell in line.split(",")][:n]
+    return cells + [""] * (n - len(cells))
 
 
 def _analog(number: int, line: str) -> str:
@@ -136,8 +136,8 @@ def _filled_segments(lines: Sequence[str]) -> list[str]:
 
 def _date(line: str) -> str:
     """Return a date in the order of every edition, with as many digits of a second: they tell the unit of the stamps."""
-    found = _FRACTION.search(line)
-    return f"01/01/2000,00:00:00.{'0' * (9 if found and len(found[1]) > _MICROSECONDS else 6)}"
+    fraction = _FRACTION.search(line)
+    return f"01/01/2000,00:00:00.{'0' * (9 if fraction and len(fraction[1]) > _MICROSECONDS else 6)}"
 
 
 def _multiplier(line: str, needed: bool) -> str:

@@ -95,11 +95,11 @@ def _nearest_periods(rates: Array, steps: Array, known: NDArray[np.intp]) -> tup
 
 def _rounded_periods(steps: Array, expected: Array, period: Array, unit: float) -> NDArray[np.bool_]:
     """Return (m,) the steps that add up a period rounded to the unit: all of one rate the same, less than one unit off."""
-    found = np.zeros(steps.size, dtype=bool)
+    rounded = np.zeros(steps.size, dtype=bool)
     for p in np.unique(period):
         own = (period == p) & (np.abs(steps - expected) < unit)
-        found[own] = bool(own.any()) and np.ptp(steps[own]) < 0.5 * unit
-    return found
+        rounded[own] = bool(own.any()) and np.ptp(steps[own]) < 0.5 * unit
+    return rounded
 
 
 def _pause_remarks(time: Array, rows: NDArray[np.intp]) -> tuple[str, ...]:

@@ -64,8 +64,8 @@ class _Record:
 def recognises(path: Path, top: bytes) -> bool:
     """True for a .cff with a section header, or a .cfg whose second line counts channels."""
     if path.suffix.lower() == ".cff":
-        found = _SECTION.search(top)
-        return found is not None and found[1].upper() == b"CFG"
+        section = _SECTION.search(top)
+        return section is not None and section[1].upper() == b"CFG"
     return path.suffix.lower() == ".cfg" and _counts(decoded(top)) is not None
 
 
@@ -149,7 +149,7 @@ def _beside(path: Path) -> Path:
 def _sections(path: Path) -> tuple[str, bytes, str]:
     """Header, data and kind of the data of a .cff; binary data come last and reach as far as their mark says."""
     content = path.read_bytes()
-    found: dict[str, tuple[bytes, str]] = {}
+    sections: dict[str, tuple[bytes, str]] = {}
     mark = _SECTION.search(content)
     while mark:
         kind, form = mark[1].decode("ascii").upper(), (mark[2] or b"").decode("ascii").upper()
@@ -157,12 +157,12 @@ def _sections(path: Path) -> tuple[str, bytes, str]:
         binary = kind == "DAT" and form not in ("", "ASCII")
         mark_after = None if binary else _SECTION.search(content, start)
         end = mark_after.start() if mark_after else start + int(mark[3]) if binary and mark[3] else len(content)
-        found.setdefault(kind, (content[start:end], form))
+        sections.setdefault(kind, (content[start:end], form))
         mark = mark_after
     for kind in ("CFG", "DAT"):
-        if kind not in found:
+        if kind not in sections:
             raise damaged(path, f"no section {kind}", expected=f"a line '--- file type: {kind} ---'")
-    return decoded(found["CFG"][0]), *found["DAT"]
+    return decoded(sections["CFG"][0]), *sections["DAT"]
 
 
 def _checked_counts(path: Path, text: str) -> tuple[int, int, int]:

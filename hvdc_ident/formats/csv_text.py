@@ -441,7 +441,7 @@ def _rows(layout: _Layout) -> Iterator[str]:
 
 def _careful(layout: _Layout, columns: list[int], clock: Clock) -> Array:
     """(n, columns) the numbers, read cell by cell; WaveformError with line and column at the first that is wrong."""
-    found = []
+    rows = []
     width = len(layout.labels)
     comma_line = point_line = 0
     for number, line in _lines(layout.path, layout.encoding):
@@ -469,8 +469,8 @@ def _careful(layout: _Layout, columns: list[int], clock: Clock) -> Array:
                 where=f"{layout.path}, line {number}",
                 expected="one decimal sign and no thousands separator",
             )
-        found.append(row)
-    return np.array(found, dtype=float).reshape(len(found), len(columns))
+        rows.append(row)
+    return np.array(rows, dtype=float).reshape(len(rows), len(columns))
 
 
 def _clock_time(clock: Clock, cell: str, layout: _Layout, line: int) -> float:

@@ -174,12 +174,12 @@ def _resampled(result: _Result, number: int, columns: NDArray[np.int64], time: A
     times = np.asarray(table[:, 0], dtype=float)
     if np.array_equal(times, time):
         return np.asarray(table[:, columns], dtype=float)
-    found = np.asarray(table[:, columns], dtype=float)
-    if len(times) and (found == found[0]).all():
-        return found[:1]
+    values = np.asarray(table[:, columns], dtype=float)
+    if len(times) and (values == values[0]).all():
+        return values[:1]
     if len(times) < 2 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         raise damaged(path, f"matrix 'data_{number}' has times of its own that do not increase", got=_shape(table))
-    return np.column_stack([np.interp(time, times, found[:, j]) for j in range(columns.size)])
+    return np.column_stack([np.interp(time, times, values[:, j]) for j in range(columns.size)])
 
 
 def matrices_of(path: Path) -> dict[str, _Matrix]:
@@ -188,16 +188,16 @@ def matrices_of(path: Path) -> dict[str, _Matrix]:
         data: NDArray[np.uint8] = np.memmap(path, dtype=np.uint8, mode="r")
     except (OSError, ValueError) as error:
         raise damaged(path, f"cannot open the file: {error}") from None
-    found: dict[str, _Matrix] = {}
+    matrices: dict[str, _Matrix] = {}
     place = 0
     while place < data.size:
-        if len(found) >= _MAX_MATRICES:
+        if len(matrices) >= _MAX_MATRICES:
             raise damaged(path, "too many matrices", expected=f"at most {_MAX_MATRICES}")
         matrix, place = _matrix(data, place, path)
-        if matrix.name in found:
+        if matrix.name in matrices:
             raise damaged(path, f"matrix '{matrix.name}' stands twice")
-        found[matrix.name] = matrix
-    return found
+        matrices[matrix.name] = matrix
+    return matrices
 
 
 def _matrix(data: NDArray[np.uint8], place: int, path: Path) -> tuple[_Matrix, int]:

@@ -68,10 +68,10 @@ def waveforms_unguarded(path: Path) -> Trajectory:
     """All waveforms of the file, read in this process, which a damaged file may hang or end."""
     with open(path, "rb") as file:
         newest = file.read(len(_V73)) == _V73
-    found = _split_complex(_version_73(path) if newest else _until_version_7(path))
-    parts = list(_parts(found, path))
+    variables = _split_complex(_version_73(path) if newest else _until_version_7(path))
+    parts = list(_parts(variables, path))
     if not parts:
-        raise _no_time(found, path)
+        raise _no_time(variables, path)
     return joined([checked(part, path) for part in parts])
 
 
@@ -79,15 +79,15 @@ def _until_version_7(path: Path) -> dict[str, Any]:
     """The variables of a file of version 4 to 7.2 by name."""
     from scipy.io import loadmat
 
-    found = {}
+    variables = {}
     for name, value in loadmat(path, simplify_cells=True).items():
         if isinstance(value, np.ndarray) and value.dtype.names == ("s0", "s1", "s2", "arr"):
-            found[value["s0"][0].decode("latin-1")] = _Object()  # scipy calls it 'None'
+            variables[value["s0"][0].decode("latin-1")] = _Object()  # scipy calls it 'None'
         elif not name.startswith("__"):
-            found[name] = value
-    if "dataInfo" in found:
+            variables[name] = value
+    if "dataInfo" in variables:
         raise damaged(path, "a result file of Dymola without its class", expected="a matrix 'Aclass' at its start")
-    return found
+    return variables
 
 
 def _version_73(path: Path) -> dict[str, Any]:
@@ -95,10 +95,10 @@ def _version_73(path: Path) -> dict[str, Any]:
         return {name: _from_hdf5(file[name], file, path, 0) for name in file if not name.startswith("#")}
 
 
-def _split_complex(found: Mapping[str, Any]) -> dict[str, Any]:
+def _split_complex(variables: Mapping[str, Any]) -> dict[str, Any]:
     """The variables with two in place of each complex one, in the structures among them too."""
     parts: dict[str, Any] = {}
-    for name, value in found.items():
+    for name, value in variables.items():
         if isinstance(value, dict):
             parts[name] = _split_complex(value)
         elif isinstance(value, list):
@@ -135,10 +135,10 @@ def _empty(item: Any) -> bool:
     return bool(item.attrs.get("MATLAB_empty", 0))
 
 
-def _parts(found: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
+def _parts(variables: Mapping[str, Any], path: Path) -> Iterator[Trajectory]:
     """The records among the variables, each with a time of its own."""
-    structures = {k: v for k, v in found.items() if isinstance(v, dict)}
-    arrays = {k: np.asarray(v) for k, v in found.items() if _numeric(v)}
+    structures = {k: v for k, v in variables.items() if isinstance(v, dict)}
+    arrays = {k: np.asarray(v) for k, v in variables.items() if _numeric(v)}
     for name, structure in structures.items():
         yield from _structure(name, structure, path)
     time = time_name(list(arrays))
@@ -168,10 +168,10 @@ def _upright(table: NDArray[Any]) -> NDArray[Any] | None:
     return None
 
 
-def _no_time(found: Mapping[str, Any], path: Path) -> WaveformError:
+def _no_time(variables: Mapping[str, Any], path: Path) -> WaveformError:
     """The error for a file without a time, which names the variable that may be it."""
-    arrays = {k: np.asarray(v) for k, v in found.items() if _numeric(v)}
-    opaque = next((name for name, value in found.items() if isinstance(value, _Object)), None)
+    arrays = {k: np.asarray(v) for k, v in variables.items() if _numeric(v)}
+    opaque = next((name for name, value in variables.items() if isinstance(value, _Object)), None)
     if opaque is not None and not arrays:
         return WaveformError(
             f"'{opaque}' is a MATLAB object, whose form is not published",
@@ -222,13 +222,13 @@ def _record(clock: Array, columns: Mapping[str, NDArray[Any]], origin: Origin) -
 
 def _flat(structure: Mapping[str, Any], prefix: str = "") -> dict[str, NDArray[Any]]:
     """The arrays of numbers in a structure and the structures inside it, those under `inner.name`."""
-    found: dict[str, NDArray[Any]] = {}
+    arrays: dict[str, NDArray[Any]] = {}
     for key, value in structure.items():
         if _numeric(value):
-            found[prefix + key] = np.asarray(value)
+            arrays[prefix + key] = np.asarray(value)
         elif isinstance(value, dict):
-            found |= _flat(value, f"{prefix}{key}.")
-    return found
+            arrays |= _flat(value, f"{prefix}{key}.")
+    return arrays
 
 
 def _beside(time: str, arrays: Mapping[str, NDArray[Any]], path: Path, prefix: str = "") -> Trajectory:

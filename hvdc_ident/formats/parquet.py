@@ -40,8 +40,8 @@ def read(path: Path, signals: Sequence[str] | None = None) -> Trajectory:
     time, origin = _seconds(table.column(clock).to_numpy(), clock, path)
     columns = [np.asarray(table.column(names[i]).to_numpy(), dtype=float) for i in wanted]
     values = np.column_stack(columns) if columns else np.empty((time.size, 0))
-    found = tuple(names[i] for i in wanted), tuple(units[i] for i in wanted)
-    return Trajectory(time, values, *found, origin)
+    labels = tuple(names[i] for i in wanted), tuple(units[i] for i in wanted)
+    return Trajectory(time, values, *labels, origin)
 
 
 def write(trajectory: Trajectory, path: Path) -> None:

@@ -84,8 +84,8 @@ def files(path: Path) -> list[Path]:
     """The .inf, and the .out files of the channels that are there."""
     path = _inf(path)
     numbers = sorted({(c.number - 1) // _PER_FILE + 1 for c in _channels(path)})
-    found = (_there(path, number) for number in numbers)
-    return [path, *(file for file in found if file is not None)]
+    outputs = (_there(path, number) for number in numbers)
+    return [path, *(file for file in outputs if file is not None)]
 
 
 def _inf(path: Path) -> Path:
@@ -108,31 +108,31 @@ def _channels(path: Path) -> list[_Channel]:
         )
     if path.stat().st_size > _MAX_HEADER:
         raise damaged(path, "the list of channels is too long", expected=f"at most {_MAX_HEADER >> 20} MiB")
-    found = {}
+    channels = {}
     for match in _CHANNEL.finditer(decoded(path.read_bytes())):
         number, fields = int(match[1]), dict(_FIELD.findall(match[2]))
-        if number in found or not 1 <= number <= _MAX_CHANNELS:
+        if number in channels or not 1 <= number <= _MAX_CHANNELS:
             raise damaged(path, f"channel {number} stands twice or is out of range", got=match[0].strip()[:80])
-        found[number] = (fields.get("Desc", "").strip() or f"PGB{number}", fields.get("Group", ""), fields)
-    if not found:
+        channels[number] = (fields.get("Desc", "").strip() or f"PGB{number}", fields.get("Group", ""), fields)
+    if not channels:
         raise damaged(path, "no channels", expected='lines PGB(1) Output Desc="..."')
-    plain = [name for name, _, _ in found.values()]
-    labels = [f"{group}.{name}" if plain.count(name) > 1 and group else name for name, group, _ in found.values()]
-    units = [fields.get("Units", "").strip() for _, _, fields in found.values()]
-    return [_Channel(n, name, unit) for n, name, unit in zip(found, own_names(labels), units, strict=True)]
+    plain = [name for name, _, _ in channels.values()]
+    labels = [f"{group}.{name}" if plain.count(name) > 1 and group else name for name, group, _ in channels.values()]
+    units = [fields.get("Units", "").strip() for _, _, fields in channels.values()]
+    return [_Channel(n, name, unit) for n, name, unit in zip(channels, own_names(labels), units, strict=True)]
 
 
 def _out_file(path: Path, number: int) -> Path:
     """The .out file of a number. Raises WaveformError where it is missing."""
-    found = _there(path, number)
-    if found is None:
+    file = _there(path, number)
+    if file is None:
         raise WaveformError(
             f"a file of channels {(number - 1) * _PER_FILE + 1} to {number * _PER_FILE} is missing",
             where=str(path),
             expected=f"{path.stem}_{number:02d}.out beside it",
             hint="copy all .out files of the run",
         )
-    return found
+    return file
 
 
 def _there(path: Path, number: int) -> Path | None:
