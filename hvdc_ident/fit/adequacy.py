@@ -99,8 +99,8 @@ class Adequacy:
         White noise is what was stated or, where nothing was, the scatter from row to row, and where no rows show that, what earlier
         rows of the residual do not foretell of it. Of noise that is not known this may be the noise's own colour.
         """
-        found = {o: s.times for o, s in self.outputs.items() if s.verdict in TOO_LARGE and s.times is not None}
-        return FrozenMap(found) | self.foretold
+        times = {o: s.times for o, s in self.outputs.items() if s.verdict in TOO_LARGE and s.times is not None}
+        return FrozenMap(times) | self.foretold
 
     @property
     def widening(self) -> float:
@@ -148,13 +148,13 @@ def adequacy(
 
 def _foretold(outputs: Sequence[str], blocks: Sequence[ResidualBlock]) -> FrozenMap[float]:
     """Return, by output, `foretold` of an `Adequacy`."""
-    found = {}
+    foretold = {}
     for output in outputs:
         parts = [b.residual[part] for b in blocks if b.output == output for part in b.stretches]
         share = innovation_share(autoregression([r - r.mean() for r in parts]))
         if share * MATTERS < 1.0:
-            found[output] = 1.0 / math.sqrt(share)
-    return FrozenMap(found)
+            foretold[output] = 1.0 / math.sqrt(share)
+    return FrozenMap(foretold)
 
 
 def structure_text(foretold: Mapping[str, float]) -> str:
@@ -176,7 +176,7 @@ def sizes_of_runs(
     by_name = {e.name: e for e in experiments}
     outputs = dict.fromkeys(o for line in curves.values() for o in line)
     scale = _Scale(1.0, 1.0 / max(len(outputs), 1), 1.0 / max(sum(map(len, curves.values())), 1))
-    found = {}
+    sizes = {}
     for output in outputs:
         line = {e: c[output] for e, c in curves.items() if output in c}
         of_output = [by_name[e] for e in line]
@@ -188,8 +188,8 @@ def sizes_of_runs(
         rho, effective = independent_samples(
             [records[e][0][part] for e, c in line.items() for part in stretches(c.rows)], 0.0
         )
-        found[output] = _sizes(records, reference, effective, rho, scale)[1]
-    return found
+        sizes[output] = _sizes(records, reference, effective, rho, scale)[1]
+    return sizes
 
 
 @dataclass(frozen=True)

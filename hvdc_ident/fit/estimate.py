@@ -82,8 +82,8 @@ def fit(
     not-converged; failed (no start could be simulated to an end). A run that fails raises nothing: it is in `starts`.
     """
     first = prewhitened(problem, whiten)
-    found = search(first, optimiser, starts, seed, executor, progress, begun, misfit_expected=misfit_expected)
-    points, runs = found.points, found.runs
+    multistart = search(first, optimiser, starts, seed, executor, progress, begun, misfit_expected=misfit_expected)
+    points, runs = multistart.points, multistart.runs
     if all(r.status == "failed" or r.cost is None for r in runs):
         return failed(first, points, runs, f"no start reached an end: {runs[0].message}")
     try:
@@ -202,9 +202,9 @@ def _in_final_weights(
     """Return the problem in its final weights and noise model, its best optimum and the other candidates."""
     local = TrustRegion()
     problem, best, rivals = reweighted(problem, ends, local)
-    found = search_instants(problem, best, local)
-    if found is not best:
-        problem, best, rivals = reweighted(problem, [found, *rivals], local)
+    better = search_instants(problem, best, local)
+    if better is not best:
+        problem, best, rivals = reweighted(problem, [better, *rivals], local)
         rivals = [r for r in rivals if r.cost >= best.cost]
     if whiten == "residual":
         problem, best, rivals = whitened_by_residuals(problem, best, rivals, local)
@@ -389,30 +389,30 @@ def _with_placed(
 
     An interval of another parameter reaches from its lowest end to its highest where the instant moves over its own.
     """
-    found = dict(estimates)
+    widened = dict(estimates)
     for name, instant in placed.items():
         for other, e in estimates.items():
             if other == name or other in placed or e.ci95 is None or None in e.ci95:
                 continue
             k = problem.names.index(other)
             moved = [float(x[k] - theta[k]) for v, _, x in instant.points if instant.low <= v <= instant.high]
-            low, high = found[other].ci95 or e.ci95
+            low, high = widened[other].ci95 or e.ci95
             assert low is not None and high is not None
             reason = f"it moves with {name}, which the rows leave open between {instant.low:.6g} and {instant.high:.6g}"
             wider = max(moved) - min(moved) > SAME * (high - low)
-            found[other] = replace(
-                found[other],
+            widened[other] = replace(
+                widened[other],
                 ci95=(low + min(moved), high + max(moved)),
-                reason="; ".join(filter(None, [found[other].reason, reason if wider else ""])),
+                reason="; ".join(filter(None, [widened[other].reason, reason if wider else ""])),
             )
-        found[name] = replace(
-            found[name],
+        widened[name] = replace(
+            widened[name],
             std=None,
             ci95=(instant.low, instant.high),
             method="between-rows",
             reason=f"{instant.text[0].lower()}{instant.text[1:]}",
         )
-    return found
+    return widened
 
 
 def _with_rivals(

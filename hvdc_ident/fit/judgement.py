@@ -195,11 +195,11 @@ def _errors(e: Experiment, curve: Curve, profile: ToleranceProfile, unit: str) -
     rows = np.zeros(e.time.size, dtype=bool)
     rows[curve.rows] = True
     limited = same_unit(unit, profile.unit)
-    found = {w: _window(e.time, spans[w], rows, curve, profile.limits[w] if limited else None) for w in WINDOWS}
-    judged = [w.within for w in found.values() if w.within is not None]
+    by_window = {w: _window(e.time, spans[w], rows, curve, profile.limits[w] if limited else None) for w in WINDOWS}
+    judged = [w.within for w in by_window.values() if w.within is not None]
     reason = f"the limits are in {profile.unit}, the output is {f'in {unit}' if unit else 'without a unit'}"
     reason = "" if judged else "no row in any window" if limited else reason
-    return WindowErrors(e.event, all(judged) if judged else None, reason, end, source, **found)
+    return WindowErrors(e.event, all(judged) if judged else None, reason, end, source, **by_window)
 
 
 def _window(

@@ -135,17 +135,17 @@ def _parameters(equations: ModelEquations, root: int) -> frozenset[str]:
 def _leaves(equations: ModelEquations, root: int) -> set[int]:
     """Return the leaves that a node depends on, also through conditions."""
     g, waiting = equations.graph, [root]
-    found: set[int] = set()
+    leaves: set[int] = set()
     seen: set[int] = set()
     while waiting:
         for node in g.reachable([waiting.pop()], known=seen):
             seen.add(node)
             kind, *rest = g.nodes[node]
             if kind == "leaf":
-                found.add(node)
+                leaves.add(node)
             elif kind == "switch":
                 waiting.append(g.switches[rest[0]])
-    return found
+    return leaves
 
 
 def _is_of_time(equations: ModelEquations, switch: int) -> bool:
@@ -162,8 +162,8 @@ def _of_experiment(problem: Problem, e: Experiment) -> JumpInstants | None:
     model = getattr(problem.simulator, "model", None)
     if not is_white_box(model) or e.domain != "time" or not (model.delays or "time" in used_names(model)):
         return None
-    found: JumpInstants = _instants_of(with_recording(model, e), tuple(e.outputs))
-    return found
+    instants: JumpInstants = _instants_of(with_recording(model, e), tuple(e.outputs))
+    return instants
 
 
 def moving(problem: Problem) -> tuple[int, ...]:
@@ -189,18 +189,18 @@ def _passing(problem: Problem, theta: Array, place: int) -> Array:
     """Return the values of one unknown at which an instant passes a row, sorted, between the ends of its range."""
     low, high = problem.unknowns[place].drawn
     name = problem.names[place]
-    found = [np.empty(0)]
+    passing = [np.empty(0)]
     for e in problem.fitted_experiments:
         own = {unknown_of(e.name, n): n for n in e.nuisance}.get(name, "" if place >= len(problem.free) else name)
         rows = np.unique(e.time[e.compared])
         if own == TIME_SHIFT:
-            found.append(np.subtract.outer(rows, _breaks(e, e.inputs)).reshape(-1))
+            passing.append(np.subtract.outer(rows, _breaks(e, e.inputs)).reshape(-1))
         instants = _of_experiment(problem, e) if own else None
         for jump in instants.jumps if instants is not None else ():
             if own == TIME_SHIFT or own in jump.parameters:
                 assert instants is not None
-                found.append(_crossings(problem, e, theta, own, instants, jump, (low, high)))
-    values = np.unique(np.concatenate(found))
+                passing.append(_crossings(problem, e, theta, own, instants, jump, (low, high)))
+    values = np.unique(np.concatenate(passing))
     values = values[(values > low) & (values < high)]
     apart = np.diff(values, prepend=-np.inf) > 1e-12 * (high - low)
     return np.asarray(values[apart])
@@ -328,12 +328,12 @@ def placed_instants(problem: Problem, theta: Array, rise: float) -> dict[str, Pl
     rise: of the cost, the other unknowns found again, at the ends of an interval. Left out is a parameter of which the smooth part
     of the cost tells more than the rows, and one whose instant may pass any row, for the jump is lost in the noise.
     """
-    found = {}
+    instants = {}
     for name in moving_parameters(problem):
         placed = _placed(problem, theta, problem.names.index(name), rise)
         if placed is not None:
-            found[name] = placed
-    return found
+            instants[name] = placed
+    return instants
 
 
 def _placed(problem: Problem, theta: Array, place: int, rise: float) -> PlacedInstant | None:
@@ -392,10 +392,10 @@ def search_instants(problem: Problem, best: LocalMinimum, method: Optimiser) -> 
             theta = _best_stretch(problem, theta, k, places)
         if np.array_equal(theta, best.theta):
             break
-        found = _refined(problem, LocalMinimum(theta, best.cost), method)
-        if not found.cost < best.cost:
+        refined = _refined(problem, LocalMinimum(theta, best.cost), method)
+        if not refined.cost < best.cost:
             break
-        best = found
+        best = refined
     if not moving_parameters(problem):
         return best
     return _centred(problem, _refined(problem, best, method), places)
@@ -453,8 +453,8 @@ def _best_stretch(problem: Problem, theta: Array, place: int, places: Sequence[i
     best = tried(float(theta[place]))
     first, last, step = 0, middles.size, max(1, -(-middles.size // MOST_STRETCHES))
     while True:
-        found = [(k, tried(float(middles[k]))) for k in range(first, last, step)]
-        k, lowest = min(found, key=lambda pair: pair[1].cost)
+        tries = [(k, tried(float(middles[k]))) for k in range(first, last, step)]
+        k, lowest = min(tries, key=lambda pair: pair[1].cost)
         best = min(best, lowest, key=lambda end: end.cost)
         if step == 1:
             return best.theta

@@ -205,8 +205,8 @@ def _is_still(experiment: Experiment, output: str) -> bool:
     """Return whether a record has rows at rest before its event and shows no noise there."""
     assert experiment.measured is not None
     values = experiment.measured[output]
-    found = noise_estimate(experiment.time, values, experiment.event)
-    return bool(found.source) and found.std <= noise_floor(values)
+    estimate = noise_estimate(experiment.time, values, experiment.event)
+    return bool(estimate.source) and estimate.std <= noise_floor(values)
 
 
 def stated_by(experiment: Experiment, output: str) -> float | None:
@@ -219,10 +219,10 @@ def stated_by(experiment: Experiment, output: str) -> float | None:
 
 def _stated(output: str, experiments: Sequence[Experiment]) -> float | None:
     """Return the root mean square of the standard deviations stated; None where one is missing or all are the floor."""
-    found = [n for e in experiments if (n := stated_by(e, output)) is not None]
-    if len(found) < len(experiments) or source_of(experiments, output) == MISFIT:
+    stds = [n for e in experiments if (n := stated_by(e, output)) is not None]
+    if len(stds) < len(experiments) or source_of(experiments, output) == MISFIT:
         return None
-    return math.sqrt(sum(n**2 for n in found) / len(found))
+    return math.sqrt(sum(n**2 for n in stds) / len(stds))
 
 
 def sigmas(experiment: Experiment, experiments: Sequence[Experiment], weights: Mapping[str, float]) -> dict[str, float]:
@@ -424,34 +424,34 @@ def _colours(pools: Mapping[str, _Pool]) -> dict[str, Colour]:
     return {o: sharper[o] if alone[o].tanh and sharper[o].tanh else alone[o] for o in short}
 
 
-def _agrees(found: FirstOrder, given: float | None) -> bool:
+def _agrees(first_order: FirstOrder, given: float | None) -> bool:
     """Return whether a given standard deviation is compatible with the records."""
-    return given is not None and 2.0 * float(found.profile.max() - found.at(given).max()) < SURE**2
+    return given is not None and 2.0 * float(first_order.profile.max() - first_order.at(given).max()) < SURE**2
 
 
 def _noise(pool: _Pool, colour: Colour) -> OutputNoise:
     """Return the noise of an output. colour: its coefficient."""
     given, std = pool.given, white_std(pool.records)
-    found = OutputNoise(std, (), 0.0, pool.step, GIVEN, pool.rows, stated=given, shown=std, moving=pool.moving)
+    noise = OutputNoise(std, (), 0.0, pool.step, GIVEN, pool.rows, stated=given, shown=std, moving=pool.moving)
     still = given is None and std <= pool.floor
     if not pool.rows and pool.scatter is not None and not pool.step:
-        return _from_scatter(found, *pool.scatter)
+        return _from_scatter(noise, *pool.scatter)
     if pool.step and (still or is_coarse(pool.records, pool.step)):
         # A level tells its own flicker only: none in the middle of a step, most at its edge. So all rows are asked beside those at rest.
         told = below_rounding(pool.records, pool.step, pool.flicker)
         if given is not None and given >= told.std:
-            return replace(found, std=given)
-        return replace(found, std=told.std, error=told.error, source=ROUNDED, freedom=max(round(told.freedom), 1))
+            return replace(noise, std=given)
+        return replace(noise, std=told.std, error=told.error, source=ROUNDED, freedom=max(round(told.freedom), 1))
     if still:
-        return replace(found, std=None, source=MISFIT)
+        return replace(noise, std=None, source=MISFIT)
     freedom = max(pool.rows - 2 * len(pool.records), 1)
     if pool.first is not None and colour.tanh:
         std = pool.first.std(colour)
     elif pool.first is not None:
         level, known = pool.first.level
         std, freedom = max(level, std), max(round(known), 1)
-    found = replace(
-        found,
+    noise = replace(
+        noise,
         std=std,
         model=(colour.rho,) if colour.tanh else pool.longer,
         error=colour.error,
@@ -460,35 +460,35 @@ def _noise(pool: _Pool, colour: Colour) -> OutputNoise:
         shown=std,
     )
     if given is None:
-        return replace(found, by_record=FrozenMap(_by_record(pool, found)))
+        return replace(noise, by_record=FrozenMap(_by_record(pool, noise)))
     if colour.tanh and pool.first is not None:
         differs = not _agrees(pool.first, given)
     else:
-        differs = max(std, given) > min(std, given) * (1.0 + SURE * found.std_error)
+        differs = max(std, given) > min(std, given) * (1.0 + SURE * noise.std_error)
     if differs and std > given:
-        return replace(found, contradicted=LOUDER)
-    return replace(found, std=given, source=GIVEN, freedom=0, contradicted=QUIETER if differs and pool.rows else "")
+        return replace(noise, contradicted=LOUDER)
+    return replace(noise, std=given, source=GIVEN, freedom=0, contradicted=QUIETER if differs and pool.rows else "")
 
 
-def _from_scatter(found: OutputNoise, scatter: float, freedom: float) -> OutputNoise:
+def _from_scatter(noise: OutputNoise, scatter: float, freedom: float) -> OutputNoise:
     """Return the noise where no rows before an event tell it: as stated, unless that is plainly less than what all rows show."""
-    shown = replace(found, std=scatter, source=SCATTER, freedom=int(freedom), shown=scatter)
-    if found.stated is None:
+    shown = replace(noise, std=scatter, source=SCATTER, freedom=int(freedom), shown=scatter)
+    if noise.stated is None:
         return shown
     # What is not followed from row to row is in the scatter too, as far as its orders agree all the same: three standard errors.
-    if scatter > found.stated * math.exp((SURE + 3.0) * shown.std_error):
+    if scatter > noise.stated * math.exp((SURE + 3.0) * shown.std_error):
         return replace(shown, contradicted=LOUDER)
-    return replace(found, std=found.stated)
+    return replace(noise, std=noise.stated)
 
 
-def _by_record(pool: _Pool, found: OutputNoise) -> dict[str, tuple[float, int]]:
+def _by_record(pool: _Pool, noise: OutputNoise) -> dict[str, tuple[float, int]]:
     """Return by experiment its standard deviation and degrees of freedom, where one of them is not that of all; else nothing."""
-    if pool.step > 0.0 or len(pool.own) < 2 or found.std is None:
+    if pool.step > 0.0 or len(pool.own) < 2 or noise.std is None:
         return {}
-    scale = found.std / white_std(pool.records)
+    scale = noise.std / white_std(pool.records)
     own = {n: (scale * std, rows - 2) for n, (std, rows) in pool.own.items()}
     differ = any(
-        s <= 0.0 or abs(math.log(s / found.std)) > SURE * replace(found, freedom=rows).std_error
+        s <= 0.0 or abs(math.log(s / noise.std)) > SURE * replace(noise, freedom=rows).std_error
         for s, rows in own.values()
     )
     return own if differ and all(s > pool.floor for s, _ in own.values()) else {}
@@ -500,10 +500,10 @@ def models_before_event(experiments: Sequence[Experiment], outputs: Sequence[str
     Raises StudyError for an output with fewer than 20 such rows, or whose record shows no noise there.
     """
     recorded = [e for e in experiments if e.domain == "time" and e.measured is not None]
-    found = noise_of(recorded)
+    noise = noise_of(recorded)
     for output in outputs:
-        rows = found[output].rows if output in found else 0
-        if rows < FEWEST or found[output].shown <= 0.0:
+        rows = noise[output].rows if output in noise else 0
+        if rows < FEWEST or noise[output].shown <= 0.0:
             raise StudyError(
                 f"no noise of '{output}' before the event to whiten with",
                 expected=f"at least {FEWEST} rows before the event, at rest and with noise in them",
@@ -514,4 +514,4 @@ def models_before_event(experiments: Sequence[Experiment], outputs: Sequence[str
             segments(
                 e.time[_rest(e, output, None).rows] if output in e.outputs else e.time[:0], f"experiment '{e.name}'"
             )
-    return {o: found[o].model for o in outputs}
+    return {o: noise[o].model for o in outputs}

@@ -72,7 +72,7 @@ class PassedNoise:
     def answers(self, output: str, at: Array) -> Array:
         """Return (m, k) the deviations of an output at instants (m,), each an independent cause of standard deviation 1, in its unit."""
         behind = at[:, None] - self.time
-        found = []
+        deviations = []
         inputs = zip(self.noise, self.held, self.between, self.steps[output], self.rest[output], strict=True)
         for noise, held, between, step, rest in inputs:
             played = (
@@ -81,11 +81,11 @@ class PassedNoise:
             played[:, 0] = 0.0  # the first row is the level
             before = self.level > 0.0
             size = np.where(before, noise.before, noise.std)
-            found.append(played * size + np.outer(rest - played.sum(axis=1), self.level * size))
+            deviations.append(played * size + np.outer(rest - played.sum(axis=1), self.level * size))
             unknown = between > 0.0
-            found.append(_held(behind, step, self.spacing)[:, :-1][:, unknown] * between[unknown])
-            found.append(noise.common * (rest - played[:, ~before].sum(axis=1, keepdims=True)))
-        return np.hstack(found)
+            deviations.append(_held(behind, step, self.spacing)[:, :-1][:, unknown] * between[unknown])
+            deviations.append(noise.common * (rest - played[:, ~before].sum(axis=1, keepdims=True)))
+        return np.hstack(deviations)
 
 
 def _joined(behind: Array, width: Array, step: Array, spacing: float) -> Array:

@@ -88,11 +88,11 @@ class Problem:
 
     def _passed(self, experiments: Sequence[Experiment]) -> dict[str, PassedNoise]:
         values, free = self.values(self.start), () if approximate(self.simulator) else tuple(f.name for f in self.free)
-        found = {}
+        passed = {}
         for e in experiments:
             with suppress(SimulationError):  # the fit says so where it is run
-                found[e.name] = passed_noise(self.simulator, e, values, free)
-        return found
+                passed[e.name] = passed_noise(self.simulator, e, values, free)
+        return passed
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the definition alone: another process works out what is cached anew."""

@@ -376,12 +376,12 @@ def _parts(blocks: Sequence[ResidualBlock], times: Sequence[Array], treatment: T
 @lru_cache(maxsize=12)
 def _parts_of(passed: PassedNoise, outputs: _Outputs, treatment: Treatment) -> tuple[_Part, ...]:
     whole, order = _causes(passed, outputs, treatment)
-    found = []
+    parts = []
     for at in np.array_split(order, -(-order.size // ROWS_TOGETHER)):
         covariance = whole[at] @ whole[at].T
         covariance[np.diag_indices(at.size)] += 1.0
-        found.append(_Part(at, cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)))
-    return tuple(found)
+        parts.append(_Part(at, cholesky(covariance, lower=True, overwrite_a=True, check_finite=False)))
+    return tuple(parts)
 
 
 def _causes(passed: PassedNoise, outputs: _Outputs, treatment: Treatment) -> tuple[Array, NDArray[np.intp]]:

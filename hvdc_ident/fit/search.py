@@ -142,18 +142,18 @@ def search(
     if not isinstance(method, TrustRegion):
         method = Refined(method)
     if begun:
-        found = _taken_up(problem, method, begun, executor, progress)
+        so_far = _taken_up(problem, method, begun, executor, progress)
     else:
-        found = Search((), ())
+        so_far = Search((), ())
         count, number = starts or STARTS, 0
         while True:
-            points = _round(problem, count - len(found.points), seed, number)
-            runs = _runs(problem, method, points, count, found.runs, executor, progress)
-            found = Search((*found.points, *points), (*found.runs, *runs))
+            points = _round(problem, count - len(so_far.points), seed, number)
+            runs = _runs(problem, method, points, count, so_far.runs, executor, progress)
+            so_far = Search((*so_far.points, *points), (*so_far.runs, *runs))
             count, number = 2 * count, number + 1
-            if starts or not _worth_more(problem, found, misfit_expected=misfit_expected):
+            if starts or not _worth_more(problem, so_far, misfit_expected=misfit_expected):
                 break
-    return _continued(problem, method, found)
+    return _continued(problem, method, so_far)
 
 
 def _round(problem: Problem, count: int, seed: int, number: int) -> list[Array]:
@@ -192,26 +192,26 @@ def _runs(
     return runs[len(before) :]
 
 
-def _worth_more(problem: Problem, found: Search, *, misfit_expected: bool) -> bool:
+def _worth_more(problem: Problem, so_far: Search, *, misfit_expected: bool) -> bool:
     """Return whether further starts are called for, and the simulations allow them.
 
     None where all ended at the lowest cost. Where that leaves more than noise a lower one is missing, or the model lacks something:
     starts go on until hardly one would lead to an optimum not seen yet (`unvisited`), or most lead to one of their own, so that more
     would not find them again. Else up to `MOST_STARTS` where the lowest cost was reached once.
     """
-    ends = within_own_stretches(problem, found.ends)
+    ends = within_own_stretches(problem, so_far.ends)
     differences = len(problem.unknowns) if approximate(problem.simulator) else 0
-    if sum(r.evaluations for r in found.runs) * (1 + differences) >= SIMULATIONS or not ends:
+    if sum(r.evaluations for r in so_far.runs) * (1 + differences) >= SIMULATIONS or not ends:
         return False
     try:
         slack = _slack_at(problem, ends[0], differences > 0)
         higher = higher_ends(problem, ends, slack)
         if not higher:
             return False
-        if len(higher) == len(ends) - 1 and len(found.points) < MOST_STARTS:
+        if len(higher) == len(ends) - 1 and len(so_far.points) < MOST_STARTS:
             return True
         levels = 1 + sum(e.cost > before.cost + slack for before, e in zip([ends[0], *higher], higher, strict=False))
-        most_alone = len(found.points) >= MOST_STARTS and 2 * levels > len(ends)
+        most_alone = len(so_far.points) >= MOST_STARTS and 2 * levels > len(ends)
         known_well = misfit_expected or most_alone or unvisited(levels, len(ends)) <= UNVISITED
         return not known_well and leaves_more_than_noise(problem, ends[0].theta)
     except SimulationError:
@@ -311,18 +311,18 @@ def _stayed(problem: Problem, theta: Array, why: str) -> OptimiserResult:
     return OptimiserResult(theta, cost, "failed" if cost is None else "max-evaluations", why, 1)
 
 
-def _continued(problem: Problem, method: Optimiser, found: Search) -> Search:
+def _continued(problem: Problem, method: Optimiser, so_far: Search) -> Search:
     """Return the search with the lowest run continued where it used up its evaluations."""
-    costs = [np.inf if r.cost is None else r.cost for r in found.runs]
+    costs = [np.inf if r.cost is None else r.cost for r in so_far.runs]
     lowest = int(np.argmin(costs))
-    run = found.runs[lowest]
+    run = so_far.runs[lowest]
     if run.status != "max-evaluations" or run.cost is None or method != TrustRegion():
-        return found
+        return so_far
     end = TrustRegion(max_evaluations=LONGER).run(problem, run.theta)
     if end.cost is None:
-        return found
+        return so_far
     longer = replace(end, evaluations=run.evaluations + end.evaluations)
-    return Search(found.points, (*found.runs[:lowest], longer, *found.runs[lowest + 1 :]))
+    return Search(so_far.points, (*so_far.runs[:lowest], longer, *so_far.runs[lowest + 1 :]))
 
 
 def same_place(problem: Problem, theta: Array, other: Array) -> bool:
