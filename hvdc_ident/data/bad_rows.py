@@ -108,27 +108,27 @@ def bad_rows(
     if time.size < FEWEST:
         return ()
     values = {n: np.array(v, dtype=float) for n, v in columns.items()}
-    found: list[BadRows] = []
+    bad: list[BadRows] = []
 
     def take(stretches: Iterator[BadRows]) -> None:
         for stretch in stretches:
-            found.append(stretch)
+            bad.append(stretch)
             for name in stretch.columns:
                 values[name][stretch.first : stretch.last + 1] = np.nan
 
     take(_marks(values))
     known = [_Column.of(n, time, v, event) for n, v in values.items() if np.isfinite(v).any()]
-    found += _constant(known, time.size)
+    bad += _constant(known, time.size)
     if not has_clock(time):  # a simulation of variable steps may repeat a row as often as it likes
-        return tuple(found)
+        return tuple(bad)
     noisy = [c for c in known if c.shows_noise]
     for kind in (_zeros, _stuck, _repeated, _filled):
         take(kind([_still(c, values[c.name]) for c in noisy], time.size))
     # A column of a slower rate than its neighbours has no two rows in a row: its changes are not known.
     moving = {c.name: v for c in known if not c.holds and np.isfinite(np.diff(v := values[c.name])).any()}
     take(_spikes(time, moving))
-    found += _angle_steps(moving, {n: turn for n, turn in (angles or {}).items() if n in moving})
-    return tuple(sorted(found, key=lambda b: (b.first, b.last, b.kind)))
+    bad += _angle_steps(moving, {n: turn for n, turn in (angles or {}).items() if n in moving})
+    return tuple(sorted(bad, key=lambda b: (b.first, b.last, b.kind)))
 
 
 def without_bad_rows(record: Trajectory, judged: Iterable[str]) -> Trajectory:
@@ -146,13 +146,13 @@ def without_bad_rows(record: Trajectory, judged: Iterable[str]) -> Trajectory:
 def gaps(time: Array) -> tuple[BadRows, ...]:
     """Return the steps of time that are longer than any about them by far: rows are missing, or the clock jumped."""
     steps = np.diff(time)
-    found: list[BadRows] = []
+    long_steps: list[BadRows] = []
     for k in np.flatnonzero(steps > MISSED * np.median(steps)) if steps.size >= FEWEST else ():
         around = np.concatenate([steps[max(k - NEAR, 0) : k], steps[k + 1 : k + 1 + NEAR]])
         if steps[k] > MISSED * around.max():
             what = f"no rows in {steps[k]:.4g} s, {steps[k] / np.median(around):.3g} steps of time: some are missing, or the clock jumped"
-            found.append(BadRows("gap", (), int(k), int(k) + 1, what))
-    return tuple(found)
+            long_steps.append(BadRows("gap", (), int(k), int(k) + 1, what))
+    return tuple(long_steps)
 
 
 def has_clock(time: Array) -> bool:
@@ -235,13 +235,13 @@ def _marks(values: Mapping[str, Array]) -> Iterator[BadRows]:
 def _constant(columns: Sequence[_Column], rows: int) -> list[BadRows]:
     """Return the columns that do not move in any row, to the last of the digits in which another shows noise."""
     digits = [_decimals(c.values) for c in columns if c.shows_noise]
-    found = []
+    constant = []
     for c in columns:
         known = c.values[np.isfinite(c.values)]
         if digits and known.size and np.ptp(known) == 0.0 and (known[0] == 0.0 or _decimals(known) >= min(digits)):
             what = f"{c.name} does not move in these {known.size} rows: stuck, or not this unit's"
-            found.append(BadRows("constant", (c.name,), 0, rows - 1, what))
-    return found
+            constant.append(BadRows("constant", (c.name,), 0, rows - 1, what))
+    return constant
 
 
 def _decimals(values: Array) -> int:
@@ -407,7 +407,7 @@ def _spikes(time: Array, moving: Mapping[str, Array]) -> Iterator[BadRows]:
 
 def _angle_steps(moving: Mapping[str, Array], angles: Mapping[str, float]) -> list[BadRows]:
     """Return the rows at which an angle steps while no other column moves. A step by a whole turn is none: a reader takes it out."""
-    found = []
+    steps = []
     for name, turn in angles.items():
         v = moving[name]
         slope = float(np.nanmedian(np.diff(v)))
@@ -422,5 +422,5 @@ def _angle_steps(moving: Mapping[str, Array], angles: Mapping[str, float]) -> li
                 and _others_still(moving, name, k, min(k + 1, changes.size - 1))
             ):
                 what = f"{name} steps by {signed[k]:.4g} while no other column moves: a step of the clock or of its reference"
-                found.append(BadRows("angle step", (name,), k, k + 1, what))
-    return found
+                steps.append(BadRows("angle step", (name,), k, k + 1, what))
+    return steps

@@ -276,35 +276,35 @@ def _instants(time: ArrayLike, where: str) -> Array:
     expected = "finite, non-decreasing instants in s, at least one"
     kept = isinstance(time, np.ndarray) and time.dtype == np.float64 and not time.flags.writeable
     try:
-        found = np.asarray(time) if kept else np.array(time, dtype=float)
+        instants = np.asarray(time) if kept else np.array(time, dtype=float)
     except (TypeError, ValueError):
         raise WaveformError(
             "an experiment's times are no numbers", where=where, expected=expected, got=str(time)[:60]
         ) from None
-    if found.ndim != 1 or found.size == 0 or not np.isfinite(found).all() or (np.diff(found) < 0).any():
-        got = f"shape {found.shape}" if found.ndim != 1 or found.size == 0 else ""
+    if instants.ndim != 1 or instants.size == 0 or not np.isfinite(instants).all() or (np.diff(instants) < 0).any():
+        got = f"shape {instants.shape}" if instants.ndim != 1 or instants.size == 0 else ""
         raise WaveformError("an experiment's times are wrong", where=where, expected=expected, got=got)
-    found.setflags(write=False)
-    return found
+    instants.setflags(write=False)
+    return instants
 
 
 def _samples(name: str, values: ArrayLike, time: Array, where: str) -> Array:
     """Return (n,) recorded samples. Raises WaveformError where they are no numbers or not as many as the times."""
     place = f"{where} '{name}'"
     try:
-        found = np.asarray(values, dtype=float)
+        samples = np.asarray(values, dtype=float)
     except (TypeError, ValueError):
         raise WaveformError(
             "the samples are no numbers", where=place, expected=f"{time.size} numbers", got=str(values)[:60]
         ) from None
-    if found.shape != time.shape:
+    if samples.shape != time.shape:
         raise WaveformError(
             "the samples are not as many as the times",
             where=place,
             expected=f"shape {time.shape}",
-            got=f"{found.shape}",
+            got=f"{samples.shape}",
         )
-    return found
+    return samples
 
 
 def _signal(name: str, value: SignalLike, time: Array, where: str) -> InputSignal:

@@ -70,7 +70,7 @@ def _next_step(values: Array, places: Sequence[int], floor: float) -> int | None
 
     n = values.size
     known = _columns(n, places)
-    none, best, found = -math.inf, -math.inf, 0
+    none, best, row = -math.inf, -math.inf, 0
     for rho in _COEFFICIENTS.tolist():
         for white in _WHITE if rho else (0.0,):
             factor = _factor(n, rho, white)
@@ -87,10 +87,10 @@ def _next_step(values: Array, places: Sequence[int], floor: float) -> int | None
             place = int(np.argmax(taken))
             likely = size - 0.5 * n * math.log(max(power - float(taken[place]), least, _NONE))
             if likely > best:
-                best, found = likely, place + 1
+                best, row = likely, place + 1
     freedom = max(n - known.shape[1] - 1, 1)
     t = float(stdtrit(freedom, 1.0 - 0.5 * UNLIKELY / n))
-    return found if 2.0 * (best - none) > n * math.log1p(t * t / freedom) else None
+    return row if 2.0 * (best - none) > n * math.log1p(t * t / freedom) else None
 
 
 def _factor(count: int, rho: float, white: float) -> Array:

@@ -114,8 +114,8 @@ def noise_estimate(time: ArrayLike, values: ArrayLike, event: float | None) -> N
         flicker = flicker_of([v], step)
         if flicker == 0.0 and not np.any(quiet.values):
             return NoiseEstimate(source=ROUNDED)
-        found = below_rounding(records, step, flicker)
-        return NoiseEstimate(found.std, found.freedom, ROUNDED)
+        below = below_rounding(records, step, flicker)
+        return NoiseEstimate(below.std, below.freedom, ROUNDED)
     if white_std(records) <= noise_floor(v):
         return NoiseEstimate(source=ESTIMATED)
     if not is_even(t):
@@ -141,11 +141,11 @@ def noise_before(time: Array, values: Array, event: float | None) -> NoiseEstima
 
 def input_noise(time: ArrayLike, values: ArrayLike, event: float | None) -> InputNoise:
     """Return the noise that the record of an input shows, as `noise_estimate` finds it."""
-    found, v = noise_estimate(time, values, event), np.asarray(values, dtype=float)
-    if found.source != ROUNDED:
-        return InputNoise(found.std, found.std)
+    estimate, v = noise_estimate(time, values, event), np.asarray(values, dtype=float)
+    if estimate.source != ROUNDED:
+        return InputNoise(estimate.std, estimate.std)
     step = resolution(v)
-    below = math.sqrt(max(found.std**2 - step**2 / 12.0, 0.0))
+    below = math.sqrt(max(estimate.std**2 - step**2 / 12.0, 0.0))
     return InputNoise(math.hypot(step / math.sqrt(12.0), below), below, step / math.sqrt(12.0))
 
 
@@ -354,14 +354,17 @@ def _of_first_order(records: Array, coefficients: Array, white: float = 0.0) -> 
     return FirstOrder(count * (n - 2), sizes, squares)
 
 
-def common_colours(found: Sequence[FirstOrder], stds: Sequence[float | None] | None = None) -> list[Colour]:
+def common_colours(first_orders: Sequence[FirstOrder], stds: Sequence[float | None] | None = None) -> list[Colour]:
     """Return the coefficient of each output, drawn to what they have in common as far as they agree (empirical Bayes).
 
-    found: by output. stds: standard deviations that are known, which sharpen a coefficient. artanh(rho) of the outputs scatters
+    first_orders: by output. stds: standard deviations that are known, which sharpen a coefficient. artanh(rho) of the outputs scatters
     normally about a common one, of which any rho is as likely; by how much is what makes the data likeliest. Each is the mean of
     what is then likely.
     """
-    profiles = [f.profile if s is None else f.at(s) for f, s in zip(found, stds or [None] * len(found), strict=True)]
+    profiles = [
+        f.profile if s is None else f.at(s)
+        for f, s in zip(first_orders, stds or [None] * len(first_orders), strict=True)
+    ]
     likely = np.exp([p - p.max() for p in profiles])
     prior = 1.0 - RHO**2
     best, chosen = -np.inf, likely

@@ -35,9 +35,9 @@ def phase_sets(record: Trajectory) -> tuple[PhaseSet, ...]:
 
     What they are is told by their unit, else by the first letter of the name: i is a current, u, v and e are voltages.
     """
-    found: list[PhaseSet] = []
+    sets: list[PhaseSet] = []
     for names in _alike(record.names):
-        taken = {name for known in found for name in known.names}
+        taken = {name for known in sets for name in known.names}
         quantity = _quantity(record, names)
         if quantity is None or taken.intersection(names):
             continue
@@ -45,8 +45,8 @@ def phase_sets(record: Trajectory) -> tuple[PhaseSet, ...]:
         nominal = min(NOMINAL, key=lambda f: abs(abs(turns) - f))
         if abs(abs(turns) - nominal) <= _OFF * nominal:
             a, b, c = names
-            found.append(PhaseSet((a, b, c) if turns > 0 else (a, c, b), quantity, nominal))
-    return tuple(found)
+            sets.append(PhaseSet((a, b, c) if turns > 0 else (a, c, b), quantity, nominal))
+    return tuple(sets)
 
 
 def _alike(names: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:

@@ -158,8 +158,8 @@ def compatible(one: Quantity, other: Quantity) -> bool:
 
 def read_columns(names: Sequence[str], units: Sequence[str]) -> tuple[Reading, ...]:
     """Return the columns of one file as their names and units say them. units: as the file states them, "" where it does not."""
-    found = [_Words(name, unit) for name, unit in zip(names, units, strict=True)]
-    return tuple(_settled([w.reading for w in found], [w.tie for w in found]))
+    each = [_Words(name, unit) for name, unit in zip(names, units, strict=True)]
+    return tuple(_settled([w.reading for w in each], [w.tie for w in each]))
 
 
 @dataclass(frozen=True)
@@ -243,23 +243,23 @@ class _Words:
             self._plain, self._side = False, "angle" if word[1] == "a" else "magnitude"
             self._place.append((number, word))
             return True
-        found = _PHASOR.fullmatch(word)
-        if found is not None:
-            of: Quantity = "current" if found["of"] == "i" else "voltage"
+        phasor = _PHASOR.fullmatch(word)
+        if phasor is not None:
+            of: Quantity = "current" if phasor["of"] == "i" else "voltage"
             self._subjects.append((number, of))
-            which, side = found["which"] or "", "ang" if found["phi"] else found["side"] or ""
+            which, side = phasor["which"] or "", "ang" if phasor["phi"] else phasor["side"] or ""
             if side in ("ph", "phase"):  # the phase voltage, or its phase
                 self._plain = False
             elif side:
                 self._side = "magnitude" if side in ("mag", "magnitude", "m") else "angle"
-            elif found["channel"] in ("pm", "mp") and not which:
+            elif phasor["channel"] in ("pm", "mp") and not which:
                 self._side = self._side or "magnitude"  # `VPM` beside `VPA`
             if word[1:] in ("pa", "ap"):
                 self._side, which = "angle", ""
-            elif which == "a" and not side and not found["channel"]:
-                self.tie = _Tie("va", found["of"])
-            elif which in ("0", "1", "2") and not found["channel"]:
-                self.tie = _Tie("number", found["of"], which)
+            elif which == "a" and not side and not phasor["channel"]:
+                self.tie = _Tie("va", phasor["of"])
+            elif which in ("0", "1", "2") and not phasor["channel"]:
+                self.tie = _Tie("number", phasor["of"], which)
             self._phase = _WHICH.get(which, which) or self._phase
             return True
         numbered = _NUMBERED.fullmatch(word)
@@ -318,11 +318,11 @@ def _words(name: str) -> list[str]:
     for letter, word in (("θ", "theta"), ("φ", "phi"), ("δ", "delta")):
         plain = plain.replace(letter, word)
     plain = re.sub(r"\bd\s*\(?\s*f\s*\)?\s*/\s*d\s*t\b", "dfdt", plain, flags=re.IGNORECASE)
-    found: list[str] = []
+    split: list[str] = []
     for part in (p for p in _SPLIT.split(plain) if p):
         parts = [part] if _says(part.casefold()) else [p for p in _HUMPS.split(part) if p]
-        found += [part] if len(parts) > 1 and not any(_says(p.casefold()) for p in parts) else parts
-    return found
+        split += [part] if len(parts) > 1 and not any(_says(p.casefold()) for p in parts) else parts
+    return split
 
 
 def _says(word: str) -> bool:
@@ -339,16 +339,16 @@ def _says(word: str) -> bool:
 
 def _settled(readings: list[Reading], ties: Sequence[_Tie]) -> list[Reading]:
     """Return the readings with what several columns together decide."""
-    found = list(readings)
+    settled = list(readings)
     for k, (reading, tie) in enumerate(zip(readings, ties, strict=True)):
         beside = [
             (r, t) for j, (r, t) in enumerate(zip(readings, ties, strict=True)) if j != k and _same_place(r, reading)
         ]
         if tie.kind == "va":
-            found[k] = _phase_or_angle(reading, beside)
+            settled[k] = _phase_or_angle(reading, beside)
         elif tie.kind == "number":
-            found[k] = _sequence_or_phase(reading, tie, beside)
-    return found
+            settled[k] = _sequence_or_phase(reading, tie, beside)
+    return settled
 
 
 def _phase_or_angle(reading: Reading, beside: Sequence[tuple[Reading, _Tie]]) -> Reading:

@@ -232,10 +232,12 @@ def _rounded_likelihood(rows: Array) -> Array:
         half = 0.5 / _BELOW[:, None, None]
         away = np.abs(edges)  # of the two tails the small one, which has all its digits
         chance = np.maximum(ndtr(half - away) - ndtr(-half - away), 1e-300)
-        found = np.log(chance) @ counts
-        near = np.flatnonzero((found > found.max() - _UNLIKELY).any(axis=0))
+        likelihood = np.log(chance) @ counts
+        near = np.flatnonzero((likelihood > likelihood.max() - _UNLIKELY).any(axis=0))
         first, last = max(near[0] - 1, 0), min(near[-1] + 1, places.size - 1)
         if last - first > _PLACES // 3:
             width = (high - low) / (_PLACES - 1)
-            return np.asarray(np.log(np.exp(found - found.max()).sum(axis=1) * width + 1e-300) + found.max())
+            return np.asarray(
+                np.log(np.exp(likelihood - likelihood.max()).sum(axis=1) * width + 1e-300) + likelihood.max()
+            )
         low, high = float(places[first]), float(places[last])

@@ -360,8 +360,8 @@ def event_time(inputs: Mapping[str, InputSignal], means: Mapping[str, float] = F
     the scatter from point to point. means: by name the length in s of the mean that an input was smoothed by, as what is made of
     phases is: its noise is the same from point to point, and only values so far apart tell how large it is.
     """
-    found = [_mean_leaves(s, means[n]) if n in means else _first_change(s) for n, s in inputs.items()]
-    instants = [t for t in found if t is not None]
+    changes = [_mean_leaves(s, means[n]) if n in means else _first_change(s) for n, s in inputs.items()]
+    instants = [t for t in changes if t is not None]
     return min(instants) if instants else None
 
 

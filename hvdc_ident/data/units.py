@@ -129,9 +129,9 @@ def _single(text: str) -> Unit | None:
 
 def _plain(text: str) -> str:
     """Return the text without the brackets people put around a unit, blanks, and letters of one look and two codes."""
-    found = unicodedata.normalize("NFKC", text).strip()
-    if len(found) > 1 and (found[0], found[-1]) in (("[", "]"), ("(", ")"), ("<", ">")):
-        found = found[1:-1]
-    if found.lower().startswith("in "):
-        found = found[3:]
-    return re.sub(r"\s+", "", found)
+    unit = unicodedata.normalize("NFKC", text).strip()
+    if len(unit) > 1 and (unit[0], unit[-1]) in (("[", "]"), ("(", ")"), ("<", ">")):
+        unit = unit[1:-1]
+    if unit.lower().startswith("in "):
+        unit = unit[3:]
+    return re.sub(r"\s+", "", unit)
