@@ -132,8 +132,10 @@ def _structure(model: Model | None, problem: Problem, seed: int) -> StructuralAn
     if not others:
         return StructuralAnalysis("decided", "instants of jumps", instants)
     given = {f.name: f.given for f in problem.free if f.name in instants}
-    found = structural_analysis(model, replace(problem, free=others, held=problem.held | given), seed)
-    return replace(found, admissible=tuple(f.name for f in problem.free if f.name in {*instants, *found.admissible}))
+    analysis = structural_analysis(model, replace(problem, free=others, held=problem.held | given), seed)
+    return replace(
+        analysis, admissible=tuple(f.name for f in problem.free if f.name in {*instants, *analysis.admissible})
+    )
 
 
 def _check(assessment: Assessment) -> None:

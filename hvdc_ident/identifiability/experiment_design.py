@@ -202,13 +202,13 @@ def half_widths(matrix: Array, per_std: Array, names: Sequence[str], error: floa
     of a scaled coordinate whose standard deviation is 1, in the parameter's unit.
     """
     kept = independent(matrix, error)
-    found: dict[str, float | None] = dict.fromkeys(names)
+    halves: dict[str, float | None] = dict.fromkeys(names)
     if kept:
         std = standard_deviations(matrix[np.ix_(kept, kept)])
         for i, s in zip(kept, std.tolist(), strict=True):
             if s <= HOPELESS:
-                found[names[i]] = s * float(per_std[i])
-    return FrozenMap(found)
+                halves[names[i]] = s * float(per_std[i])
+    return FrozenMap(halves)
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,10 +320,10 @@ def recommend(
         return f"No experiment is advised: none of those tried can be simulated ({tried.failed[0]})."
     count = len({r.design for r in ranked})
     widths = _Widths.of(whole, thresholds, told)
-    found = widths.aim(ranked)
-    if found is None:
+    aimed = widths.aim(ranked)
+    if aimed is None:
         return widths.why_none(count)
-    aim, ranked = found
+    aim, ranked = aimed
     best = ranked[0]
     by_determinant = max(
         ranked, key=lambda r: (r.criteria.directions, r.criteria.log_determinant, -len(r.design.moves))
@@ -383,7 +383,7 @@ class _Widths:
         """The least width by parameter that any of the experiments would give if it were made once more."""
         each = [self.with_gain(gain) for gain in self.whole.information.by_experiment.values()]
         halves = {n: [half for w in each if (half := w[n]) is not None] for n in self.now}
-        return FrozenMap({n: min(found, default=math.inf) for n, found in halves.items()})
+        return FrozenMap({n: min(widths, default=math.inf) for n, widths in halves.items()})
 
     def narrows(self, name: str, then: float | None) -> bool:
         """Return whether a width is less than what repetition gives, by more than it is uncertain; any width is less than none."""
@@ -393,10 +393,10 @@ class _Widths:
         """Return the widest of the open intervals that a design narrows, and the designs, the best for it first; None where none does."""
         after = [self.with_gain(r.gain) for r in ranked]
         for name in self.open:
-            found = [replace(r, half_width=w[name]) for r, w in zip(ranked, after, strict=True)]
-            found.sort(key=lambda r: r.order)
-            if self.narrows(name, found[0].half_width):
-                return name, found
+            designs = [replace(r, half_width=w[name]) for r, w in zip(ranked, after, strict=True)]
+            designs.sort(key=lambda r: r.order)
+            if self.narrows(name, designs[0].half_width):
+                return name, designs
         return None
 
     @property
@@ -465,14 +465,14 @@ class _Ranking:
         """Return the information of each output of the run, in scaled coordinates."""
         problem, names = self.whole.problem, self.whole.names
         run = problem.simulator.simulate(design.experiment(self.template), problem.values(self.whole.theta), names)
-        found = {}
+        information = {}
         for output in run.trajectory.names:
             gradient = run.gradient(output) * self.whole.slope[: len(names)]
             if not np.isfinite(gradient).all():
                 raise SimulationError(f"the sensitivity of '{output}' is not finite")
             gradient = gradient / self._sigma(output, run.trajectory[output], run.trajectory.unit(output))
-            found[output] = gradient.T @ gradient
-        return found
+            information[output] = gradient.T @ gradient
+        return information
 
     def _sigma(self, output: str, values: Array, unit: str) -> float:
         """The noise expected on an output, in its unit: as recorded so far; of a new one, as on others of its unit, or

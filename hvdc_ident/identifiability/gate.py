@@ -250,8 +250,8 @@ def _interval(line: Verdict) -> tuple[float, float] | None:
 
 def _at_bound(report: IdentifiabilityReport, selection: Gate) -> FrozenMap[Estimate]:
     """Return the held ones that stand on a bound, with their one-sided limit."""
-    found = {}
+    on_bound = {}
     for n, line in report.parameters.items():
         if line.verdict == "at-bound" and n in selection.held:
-            found[n] = Estimate(line.value, None, _interval(line), "one-sided", unit=line.unit, reason=line.reason)
-    return FrozenMap(found)
+            on_bound[n] = Estimate(line.value, None, _interval(line), "one-sided", unit=line.unit, reason=line.reason)
+    return FrozenMap(on_bound)

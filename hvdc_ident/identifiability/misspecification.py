@@ -150,7 +150,7 @@ def noise_half_widths(whole: LocalAnalysis, fitted: Sequence[str], others: Seque
     matrix = whole.information.select(names).matrix
     slope = dict(zip(whole.problem.names, whole.slope.tolist(), strict=True))
     order = [names[i] for i in pivoted_order(matrix)]
-    selected, found = [n for n in order if n in fitted], dict[str, float]()
+    selected, widths = [n for n in order if n in fitted], dict[str, float]()
     for n in (n for n in order if n in others):
         proposal = [*selected, n]
         part = whole.information.select(proposal).matrix
@@ -159,8 +159,8 @@ def noise_half_widths(whole: LocalAnalysis, fitted: Sequence[str], others: Seque
         halves = np.sqrt(2.0 * TWO_SIDED) * standard_deviations(part)
         if all(h * slope[m] < _room(free[m], whole.value(m)) for m, h in zip(proposal, halves.tolist(), strict=True)):
             selected = proposal
-            found[n] = float(halves[-1] * slope[n])
-    return found
+            widths[n] = float(halves[-1] * slope[n])
+    return widths
 
 
 def _room(free: FitParameter, value: float) -> float:

@@ -196,14 +196,14 @@ def at_given_values(problem: Problem) -> tuple[LocalAnalysis, FitResult]:
 
 def failing_experiments(problem: Problem) -> dict[str, SimulationError]:
     """Return the experiments that cannot be simulated at the start values, each with its error."""
-    found = {}
+    errors = {}
     for e in problem.fitted_experiments:
         alone = problem.with_(experiments=[e])
         try:
             alone.cost(alone.start)
         except SimulationError as error:
-            found[e.name] = error
-    return found
+            errors[e.name] = error
+    return errors
 
 
 def _failure(problem: Problem, message: str) -> SimulationError:
@@ -252,27 +252,27 @@ class CramerRaoBounds(Coded):
     @property
     def lines(self) -> list[str]:
         """Lines of text."""
-        found = ["First answer, from the curvature at the given values; the search for the optimum follows."]
+        lines = ["First answer, from the curvature at the given values; the search for the optimum follows."]
         misses = self.chi2_per_dof is not None and self.chi2_per_dof > MATTERS
         if self.chi2_per_dof is not None:
             left = ": no interval holds there, and none is told" if misses else ""
-            found.append(f"Misfit of the given values: chi2/dof {self.chi2_per_dof:.3g}{left}.")
+            lines.append(f"Misfit of the given values: chi2/dof {self.chi2_per_dof:.3g}{left}.")
         width = max(map(len, self.parameters), default=0)
         for name, p in self.parameters.items():
             at = f"{name:{width}}  {quantity(p.value, p.unit)}"
             if p.std is None:
-                found.append(f"{at}: not determined there, held")
+                lines.append(f"{at}: not determined there, held")
             elif misses:
-                found.append(
+                lines.append(
                     f"{at}: determined there" + (f" with {listed(p.conditional_on)} held" if p.conditional_on else "")
                 )
             else:
                 share = f" ({100.0 * HALF_95 * p.std / abs(p.value):.2g} %)" if p.value else ""
                 held = f" with {listed(p.conditional_on)} held" if p.conditional_on else ""
-                found.append(
+                lines.append(
                     f"{at}: expected 95 % confidence interval \u00b1{quantity(HALF_95 * p.std, p.unit, 2)}{share}{held}"
                 )
-        return [*found, *(f"{words[:1].upper()}{words[1:]}." for words in self.combinations)]
+        return [*lines, *(f"{words[:1].upper()}{words[1:]}." for words in self.combinations)]
 
 
 def cramer_rao_bounds(problem: Problem) -> CramerRaoBounds:

@@ -322,17 +322,17 @@ def profiles_of(
         progress=assessment.progress,
     )
     names = [n for n in optimum.names if n not in assessment.placed]
-    found = walked(optimum.theta, names, threshold=limits)
-    assessment.notes += [f"A better optimum was found: {r}." for r in found.restarts]
-    optimum = LocalAnalysis(problem, found.theta)
+    walk = walked(optimum.theta, names, threshold=limits)
+    assessment.notes += [f"A better optimum was found: {r}." for r in walk.restarts]
+    optimum = LocalAnalysis(problem, walk.theta)
     instants = {
         n: _profile_of_instant(assessment.placed[n], optimum.value(n)) for n in optimum.names if n in assessment.placed
     }
 
     def walk_again(to: Mapping[str, float]) -> FrozenMap[Profile]:
-        return walked(found.theta, list(to), threshold=to).by_name
+        return walked(walk.theta, list(to), threshold=to).by_name
 
-    return optimum, joint_limits(optimum, found.by_name, limits, walk_again, seed=assessment.seed) | instants
+    return optimum, joint_limits(optimum, walk.by_name, limits, walk_again, seed=assessment.seed) | instants
 
 
 def _open_combination(assessment: Assessment, optimum: LocalAnalysis, opened: Sequence[str]) -> Combination | None:
@@ -348,8 +348,8 @@ def _open_combination(assessment: Assessment, optimum: LocalAnalysis, opened: Se
         return None
     logs = [assessment.free[n].min > 0 for n in opened]
     null = vectors[:, :1].T / d
-    found = combinations_of(null, opened, logs, [optimum.value(n) for n in opened], "practical")
-    return found[0] if len(found[0].members) > 1 else None
+    combinations = combinations_of(null, opened, logs, [optimum.value(n) for n in opened], "practical")
+    return combinations[0] if len(combinations[0].members) > 1 else None
 
 
 def _with_held_free(assessment: Assessment, profile: Profile) -> Profile:

@@ -60,21 +60,21 @@ def in_words(direction: Array, names: Sequence[str], logs: Sequence[bool], value
     """
     members = [i for i in range(len(names)) if abs(direction[i]) > SMALL * np.abs(direction).max()]
     pivot = members[0]
-    found = []
+    words = []
     for i in members[1:]:
         ratio = float(direction[i] / direction[pivot])
         slope = ratio * (values[i] if logs[i] else 1.0) / ((values[pivot] if logs[pivot] else 1.0) or 1.0)
         power, both = round(-2.0 * ratio) / 2.0, logs[i] and logs[pivot]
         if both and power and abs(power + ratio) < NEAR:
-            found.append(_product(names[pivot], names[i], power))
+            words.append(_product(names[pivot], names[i], power))
         elif abs(abs(slope) - 1.0) < NEAR:
-            found.append(f"{names[i]} - {names[pivot]}" if slope > 0 else f"{names[pivot]} + {names[i]}")
+            words.append(f"{names[i]} - {names[pivot]}" if slope > 0 else f"{names[pivot]} + {names[i]}")
         elif both:
-            found.append(_product(names[pivot], names[i], -ratio))
+            words.append(_product(names[pivot], names[i], -ratio))
         else:
             sign = "-" if slope > 0 else "+"
-            found.append(f"{names[i]} {sign} {abs(slope):.3g}*{names[pivot]} (near these values)")
-    return tuple(found)
+            words.append(f"{names[i]} {sign} {abs(slope):.3g}*{names[pivot]} (near these values)")
+    return tuple(words)
 
 
 def _product(pivot: str, name: str, power: float) -> str:
@@ -101,24 +101,24 @@ def combinations_of(
     kind: Literal["structural", "practical"],
 ) -> tuple[Combination, ...]:
     """Return one combination for each null direction, (k, p) in scaled coordinates, with its members and words."""
-    found = []
+    combinations = []
     for row in null:
         direction = {n: float(v) for n, v in zip(names, row, strict=True) if abs(v) > SMALL * np.abs(row).max()}
         members, seen = tuple(direction), in_words(row, names, logs, values)
         words = only_seen(members, seen)
-        found.append(Combination(members, seen, words, directions=(tuple(direction.values()),), kind=kind))
-    return tuple(found)
+        combinations.append(Combination(members, seen, words, directions=(tuple(direction.values()),), kind=kind))
+    return tuple(combinations)
 
 
 def partners(combinations: Sequence[Combination], held: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     """Return the held members of its combinations for each member that is not held."""
-    found: dict[str, tuple[str, ...]] = {}
+    by_member: dict[str, tuple[str, ...]] = {}
     for c in combinations:
         stuck = tuple(n for n in c.members if n in held)
         for n in c.members:
             if n not in held and stuck:
-                found[n] = tuple(dict.fromkeys((*found.get(n, ()), *stuck)))
-    return found
+                by_member[n] = tuple(dict.fromkeys((*by_member.get(n, ()), *stuck)))
+    return by_member
 
 
 @dataclass(frozen=True)
@@ -203,9 +203,9 @@ class _Runs:
 
     def unseen(self, members: Sequence[int]) -> list[Point]:
         """The directions among some parameters, the others known, that are not seen, where there are fewest; points that agree."""
-        found = [self._unseen_at(theta, jacobian, members) for theta, jacobian in self.points]
-        fewest = min((len(p.directions) for p in found), default=0)
-        alike = [p for p in found if len(p.directions) == fewest]
+        points = [self._unseen_at(theta, jacobian, members) for theta, jacobian in self.points]
+        fewest = min((len(p.directions) for p in points), default=0)
+        alike = [p for p in points if len(p.directions) == fewest]
         return max(([q for q in alike if q.groups == p.groups] for p in alike), key=len, default=[])
 
     def _unseen_at(self, theta: Array, jacobian: Array, members: Sequence[int]) -> Point:
@@ -230,10 +230,10 @@ class _Runs:
             return None
 
         start = [self.problem.free[k].start for k in members]
-        found = combinations_seen(names, points, start, more, CONSTANT)
+        combinations = combinations_seen(names, points, start, more, CONSTANT)
         held = frozenset(names[k] for k in held_of(points[0].directions))
         nearest = min(points, key=lambda p: float(np.abs(p.theta - start).max()))
-        return tuple(c if c.seen else _local(c, names, nearest) for c in found), held
+        return tuple(c if c.seen else _local(c, names, nearest) for c in combinations), held
 
     @property
     def note(self) -> str:
@@ -311,33 +311,33 @@ def structural_analysis(model: Model | None, problem: Problem, seed: int = 0) ->
 
 def _where_neither_sees(result: StructuralResult, runs: _Runs) -> tuple[list[Combination], set[str], list[str]]:
     """Return the combinations that runs tell no further than the equations, what to hold, and the parameters that runs tell."""
-    found: list[Combination] = []
+    combinations: list[Combination] = []
     held, apart = set[str](), set[str]()
     for c in result.combinations:
         if len(c.members) == 1:
             continue
         members = [result.parameters.index(n) for n in c.members]
         if all(len(p.directions) >= c.free for p in runs.unseen(members)):
-            found.append(c)
+            combinations.append(c)
             held |= set(c.members) - set(identifiable_subset(result, c.members))
             continue
         parts, stuck = runs.combinations(members)
-        found += parts
+        combinations += parts
         held |= stuck
         apart |= set(c.members) - {n for part in parts for n in part.members} or set(c.members)
-    return found, held, [n for n in result.parameters if n in apart]
+    return combinations, held, [n for n in result.parameters if n in apart]
 
 
 def moves(experiments: Sequence[Experiment]) -> dict[str, Literal["step", "free"]]:
     """Return the kind of move by input: in steps alone, or in any other way; constant inputs are left out."""
-    found: dict[str, Literal["step", "free"]] = {}
+    kinds: dict[str, Literal["step", "free"]] = {}
     for e in experiments:
         for name, signal in e.inputs.items():
             if signal.is_constant:
                 continue
             jumps = bool((np.diff(signal.values)[np.diff(signal.times) > 0] == 0).all())
-            found[name] = "step" if jumps and found.get(name, "step") == "step" else "free"
-    return found
+            kinds[name] = "step" if jumps and kinds.get(name, "step") == "step" else "free"
+    return kinds
 
 
 def _behind_switches(model: Model, outputs: Sequence[str]) -> set[str]:

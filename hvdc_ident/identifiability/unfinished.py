@@ -85,7 +85,7 @@ def _verdicts(assessment: Assessment) -> Mapping[str, Verdict]:
     """Return the verdicts that nothing tried later would change."""
     judged = None if assessment.pilot is None else assessment.pilot.adequacy
     misfit = judged is not None and judged.widening != 1.0
-    found = {}
+    verdicts = {}
     for n, v in assessment.verdicts.items():
         if misfit and v.verdict in HIDDEN_BY_MISFIT:
             continue
@@ -94,8 +94,8 @@ def _verdicts(assessment: Assessment) -> Mapping[str, Verdict]:
             known = assessment.pilot.values if assessment.pilot is not None else {}
             value = known.get(n, assessment.free[n].given)
         told = replace(v.noted(assessment.remark), value=value)
-        found[n] = told.under_misfit() if judged is not None and judged.systematic else told
-    return found
+        verdicts[n] = told.under_misfit() if judged is not None and judged.systematic else told
+    return verdicts
 
 
 def _unsettled(assessment: Assessment, name: str, starts: StartsSoFar | None, walks: ProfilesSoFar | None) -> Unsettled:
