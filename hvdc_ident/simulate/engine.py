@@ -87,7 +87,7 @@ class _Equations:
             for name, start in self._late.address.items():
                 self.address[NAMES.index(name)] = start
             second = self.structure.second
-            self._second = [np.array([found[k] for found in second], dtype=np.int64) for k in (0, 1)]
+            self._second = [np.array([entry[k] for entry in second], dtype=np.int64) for k in (0, 1)]
         width, address = self.structure.sizes.width, dict(zip(NAMES, self.address.tolist(), strict=True))
         given: dict[str, int] = {
             **self.structure.head(rosenbrock),
@@ -129,8 +129,8 @@ class Engine:
 
         model: whose values and origin tell which steady state (default: the model that the engine was made for).
         """
-        found = self._equilibria.start(model or self.structure.model, p, u, time, search=search)
-        return found.y, found.w
+        steady = self._equilibria.start(model or self.structure.model, p, u, time, search=search)
+        return steady.y, steady.w
 
     def constants(self, p: Array) -> Array:
         """Delay times, sampling periods and compute times, with their rows over the parameters."""

@@ -136,13 +136,13 @@ class ModelEquations:
         self.rhs = [*self.derivatives, *self.residuals]
 
     def _slide(self, switch: int) -> None:
-        found = sliding(
+        slide = sliding(
             self.graph, switch, self.derivatives, self.residuals, self.observed, self.sources, self.partial, self.rate
         )
-        self.twin, self.surface = found.twin, found.surface
-        self.derivatives, self.residuals = found.derivatives, found.residuals
-        self.observed, self.sources = found.observed, found.sources
-        self.graph.switches[:] = found.switches
+        self.twin, self.surface = slide.twin, slide.surface
+        self.derivatives, self.residuals = slide.derivatives, slide.residuals
+        self.observed, self.sources = slide.observed, slide.sources
+        self.graph.switches[:] = slide.switches
         self.rhs = [*self.derivatives, *self.residuals]
 
     def _observed(self, name: str, node: Callable[[sp.Expr], int]) -> int:

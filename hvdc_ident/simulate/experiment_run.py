@@ -64,10 +64,10 @@ def _with_offsets_and_starts(model: Model, names: tuple[str, ...]) -> tuple[Mode
     names: inputs, to which a constant is added all along, the steady start included (0 unless given); states, which
     begin at a value instead of at rest. A state that the model calls free has its parameter already.
     """
-    found = {}
+    by_name = {}
     for name in names:
         if name in model.states:
-            found[name] = f"{name}_start"
+            by_name[name] = f"{name}_start"
             state = model.states[name]
             if state.start != "free":
                 start = Parameter(state.guess or 0.0, state.unit, description=f"{name} at the start")
@@ -75,14 +75,14 @@ def _with_offsets_and_starts(model: Model, names: tuple[str, ...]) -> tuple[Mode
                 model = replace(
                     model,
                     states=model.states | {name: free},
-                    parameters=model.parameters | {found[name]: start},
+                    parameters=model.parameters | {by_name[name]: start},
                 )
             continue
-        found[name] = offset = fresh(model, f"{name}_offset")
+        by_name[name] = offset = fresh(model, f"{name}_offset")
         constant = Parameter(0.0, model.inputs[name].unit, description=f"constant added to {name}")
         model = replace(model, parameters=model.parameters | {offset: constant})
         model = rewritten(model, name, "offset", lambda m, u, offset=offset: (m, u + symbol(offset)))  # type: ignore[misc]
-    return model, FrozenMap(found)
+    return model, FrozenMap(by_name)
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,9 +186,9 @@ def simulate(
     wanted = tuple(parameter.get(n, n) for n in sensitivities)
     seen = tuple(plant.outputs if outputs is None else outputs)
     try:
-        found = run(plant, wanted, seen, np.array(p), signals, experiment.time, tol, method)
+        answer = run(plant, wanted, seen, np.array(p), signals, experiment.time, tol, method)
     except (SimulationError, SteadyStateError) as e:
         raise e.at(where) from None
     units = tuple(plant.outputs[n].unit if n in plant.outputs else "" for n in seen)
-    trajectory = Trajectory(experiment.time, found.values, seen, units)
-    return Simulation(trajectory, tuple(sensitivities), found.slopes, found.statistics)
+    trajectory = Trajectory(experiment.time, answer.values, seen, units)
+    return Simulation(trajectory, tuple(sensitivities), answer.slopes, answer.statistics)

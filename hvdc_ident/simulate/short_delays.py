@@ -82,16 +82,16 @@ def run(
     short = {name: (length, rows) for name, length, rows in lengths if length == 0.0 or length < shortest}
     if not short:
         return answer(model, sensitivities, p)
-    found = answer(_without(model, tuple(short)), sensitivities, p)
-    base, cost = found, [found.statistics]
+    so_far = answer(_without(model, tuple(short)), sensitivities, p)
+    base, cost = so_far, [so_far.statistics]
     for name, (length, rows) in short.items():
         if shortest == 0.0 or not (length or rows.any()):
             continue
         longer, parameter = _with_time(model, name, tuple(n for n in short if n != name))
         end = answer(longer, (*sensitivities, parameter), np.append(p, shortest))
-        found = _between(found, base, end, length / shortest, shortest, rows)
+        so_far = _between(so_far, base, end, length / shortest, shortest, rows)
         cost.append(end.statistics)
-    return replace(found, statistics=_sum(cost))
+    return replace(so_far, statistics=_sum(cost))
 
 
 def _answer(code: Engine, out: Array, statistics: Statistics) -> DelayedRun:
@@ -128,9 +128,9 @@ def _with_time(model: Model, name: str, others: tuple[str, ...]) -> tuple[Model,
 
 
 def _between(
-    found: DelayedRun, base: DelayedRun, end: DelayedRun, share: float, shortest: float, rows: Array
+    so_far: DelayedRun, base: DelayedRun, end: DelayedRun, share: float, shortest: float, rows: Array
 ) -> DelayedRun:
-    """Return `found` with what a delay adds. base: all short ones at 0. end: this one at `shortest` s, its time the last parameter.
+    """Return `so_far` with what a delay adds. base: all short ones at 0. end: this one at `shortest` s, its time the last parameter.
 
     share: its time over `shortest`. rows: (parameters,) derivatives of its time.
     """
@@ -139,7 +139,7 @@ def _between(
     first, second = 2.0 * rise - by_time, by_time - rise
     slope = (first + 2.0 * share * second) / shortest
     slopes = share * (end.slopes[:, :, :-1] - base.slopes) + slope[:, :, None] * rows
-    return replace(found, values=found.values + share * (first + share * second), slopes=found.slopes + slopes)
+    return replace(so_far, values=so_far.values + share * (first + share * second), slopes=so_far.slopes + slopes)
 
 
 def _sum(runs: Sequence[Statistics]) -> Statistics:

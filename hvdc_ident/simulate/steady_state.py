@@ -118,14 +118,14 @@ class Equilibria:
         reference = self.reference(model, u)
         if reference is None or not reference.sign:
             return self.search(p, u, time, None if reference is None else reference.v, search=search)
-        found = self._directly(reference, p, u, time)
-        if found is not None:
-            return found
+        state = self._directly(reference, p, u, time)
+        if state is not None:
+            return state
         path = self._connected(model, reference, p, u, time, search)
         if path.ends == "arrived":
-            found = self._newton(path.v, p, u, time)
-            if found is not None:
-                return found
+            state = self._newton(path.v, p, u, time)
+            if state is not None:
+                return state
         if not search:
             raise self._not_at_once()
         if path.ends == "fold":
@@ -140,9 +140,9 @@ class Equilibria:
         limit = self._region.limit
         begins = self._begins(p, u, time)
         for begin in begins if first is None else (first, *begins):
-            found = self._newton(begin, p, u, time)
-            if found is not None and (np.abs(found.y[: self.n]) <= limit[: self.n]).all():
-                return found
+            state = self._newton(begin, p, u, time)
+            if state is not None and (np.abs(state.y[: self.n]) <= limit[: self.n]).all():
+                return state
             if not search:
                 raise self._not_at_once()
         return self._slowly(p, u, self._filled(self._guesses[0], p, u, time) if first is None else first, time)
@@ -185,7 +185,7 @@ class Equilibria:
             return np.abs(v[places] - guesses) / (1.0 + np.abs(guesses))
 
         begun = (self._newton(begin, p, u, 0.0) for begin in self._begins(p, u, 0.0))
-        ends = [found.v for found in begun if found is not None and (np.abs(found.v) <= self._region.limit).all()]
+        ends = [end.v for end in begun if end is not None and (np.abs(end.v) <= self._region.limit).all()]
         if not any(moved(v).max() <= 1.0 for v in ends):
             slow = self._fallback_ends(p, u, self._filled(self._guesses[0], p, u, 0.0), 0.0)
             ends += [v for v, _, _, shares in slow if self._region.holds(shares, v)]
@@ -219,9 +219,9 @@ class Equilibria:
             begun = self._referenced(p_root, u_root, path.v) if path is not None and path.ends == "arrived" else None
         if begun is None or not begun.sign or (np.array_equal(p_root, p_own) and np.array_equal(u_root, u_own)):
             return begun
-        found = self._directly(begun, p_own, u_own, 0.0)
-        if found is not None:
-            return ReferenceEquilibrium(p_own, u_own, found.v, found.sign)
+        state = self._directly(begun, p_own, u_own, 0.0)
+        if state is not None:
+            return ReferenceEquilibrium(p_own, u_own, state.v, state.sign)
         path = self._follow_first(_ways(begun, p_own, u_own, 0.0), begun.v, begun.sign)
         return ReferenceEquilibrium(p_own, u_own, path.v, begun.sign) if path.ends == "arrived" else begun
 
@@ -233,8 +233,8 @@ class Equilibria:
         return None if reference is None else dict(zip(at.names, reference.v.tolist(), strict=True))
 
     def _referenced(self, p: Array, u: Array, v: Array) -> ReferenceEquilibrium:
-        found = self._newton(v, p, u, 0.0, HALVES)
-        return ReferenceEquilibrium(p, u, v, 0.0 if found is None else found.sign)
+        state = self._newton(v, p, u, 0.0, HALVES)
+        return ReferenceEquilibrium(p, u, v, 0.0 if state is None else state.sign)
 
     # --- paths ---
 
@@ -387,11 +387,11 @@ class Equilibria:
         Corrections that halve are Kantorovich's condition as far as their own direction shows it: with an exponential rate
         they also halve on the way to another branch. From that one the way back ends elsewhere.
         """
-        found = self._newton(reference.v, p, u, time, HALVES, reference.sign)
-        if found is None:
+        state = self._newton(reference.v, p, u, time, HALVES, reference.sign)
+        if state is None:
             return None
-        back = self._newton(found.v, reference.p, reference.u, 0.0, HALVES, reference.sign)
-        return found if back is not None and _alike(back.v, reference.v) else None
+        back = self._newton(state.v, reference.p, reference.u, 0.0, HALVES, reference.sign)
+        return state if back is not None and _alike(back.v, reference.v) else None
 
     def _judged(self, v: Array, p: Array, u: Array, time: float) -> tuple[Array, Array, Array]:
         """(residual, Jacobian, scaled residuals) of the rest equations at v."""
@@ -419,11 +419,11 @@ class Equilibria:
             moves = sorted(
                 product((0.0, *AWAY, *(-a for a in AWAY)), repeat=min(len(references), 2)), key=np.linalg.norm
             )
-            found = [own.copy() for _ in moves]
-            for guess, move in zip(found, moves, strict=True):
+            guesses = [own.copy() for _ in moves]
+            for guess, move in zip(guesses, moves, strict=True):
                 for k, share in zip(references, move, strict=False):
                     guess[k] += share * (1.0 + abs(own[k]))
-            return found
+            return guesses
         random = np.random.default_rng(0)
         fills = [np.zeros(len(given)), np.ones(len(given)), *(random.normal(size=(4, len(given))))]
         return [np.array([f if g is None else g for g, f in zip(given, fill, strict=True)] + tail) for fill in fills]
@@ -496,12 +496,12 @@ class Equilibria:
                 begin[:nx] += sign * far * along
                 solved = self._newton(begin, p, u, time)
                 ends += [] if solved is None else [solved.v]
-        found: list[Array] = []
+        others: list[Array] = []
         for x in ends:
             _, _, shares = self._judged(x, p, u, time)
-            if self._region.holds(shares, x) and not _alike(x, v) and not any(_alike(x, k) for k in found):
-                found.append(x)
-        return found
+            if self._region.holds(shares, x) and not _alike(x, v) and not any(_alike(x, k) for k in others):
+                others.append(x)
+        return others
 
     def far(self, v: Array) -> list[str]:
         """The states that are out of question, by their guesses."""
@@ -674,9 +674,9 @@ def with_guesses(model: Model) -> Model:
     Written to a card it keeps its branch, for a card says nothing of where a model comes from. Raises SteadyStateError.
     """
     at = equilibria(model)
-    found = dict(zip(at.names, at.start(model, *_values(model)).v.tolist(), strict=True))
+    values = dict(zip(at.names, at.start(model, *_values(model)).v.tolist(), strict=True))
     # What rounding leaves of 0 is no guess: it would tell the state's size.
-    place = {n: 0.0 if abs(v) < ACCURACY else v for n, v in found.items()}
+    place = {n: 0.0 if abs(v) < ACCURACY else v for n, v in values.items()}
     states = {n: replace(s, guess=place[n]) for n, s in model.states.items()}
     algebraic = {n: replace(a, start=place[n]) if n in place else a for n, a in model.algebraic.items()}
     return replace(model, states=FrozenMap(states), algebraic=FrozenMap(algebraic))

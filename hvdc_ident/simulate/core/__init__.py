@@ -48,12 +48,12 @@ NUMBERS = {
 
 def _fields(*lists: str) -> tuple[str, ...]:
     """Return the names that the header's lists of fields hold, in their order."""
-    found: list[str] = []
+    names: list[str] = []
     for name in lists:
         body = re.search(rf"#define {name}\(.*?\)((?:.*\\\n)*.*)", _HEADER)
         assert body is not None
-        found += re.findall(r"\b[A-Z]+\((\w+)\)", body[1])
-    return tuple(found)
+        names += re.findall(r"\b[A-Z]+\((\w+)\)", body[1])
+    return tuple(names)
 
 
 HEAD_FIELDS = _fields("SIZES", "FUNCTIONS", "SECOND_DERIVATIVES")
@@ -83,16 +83,16 @@ def library() -> ctypes.CDLL:
     for build, needed in BUILDS.items():
         path = FOLDER / LIBRARY.format(build=build)
         if path.exists() and all(features.get(f) for f in needed):
-            found = ctypes.CDLL(str(path))
-            found.hvdc_ident_room.restype = found.hvdc_ident_fields.restype = ctypes.c_int64
-            if found.hvdc_ident_fields() != len(RUN_FIELDS):
+            core = ctypes.CDLL(str(path))
+            core.hvdc_ident_room.restype = core.hvdc_ident_fields.restype = ctypes.c_int64
+            if core.hvdc_ident_fields() != len(RUN_FIELDS):
                 raise InstallationError(
                     "the installation is incomplete: the compiled core is of another version",
                     where=str(path),
                     hint=REBUILD,
                 )
-            found.hvdc_ident_judge.restype = found.hvdc_ident_repeat.restype = None
-            return found
+            core.hvdc_ident_judge.restype = core.hvdc_ident_repeat.restype = None
+            return core
     raise InstallationError(
         "the installation is incomplete: the compiled core is not there",
         where=str(FOLDER),
