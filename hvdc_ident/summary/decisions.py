@@ -66,16 +66,16 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
     stages = {
         n: data for n, data in stages.items() if all(data.get(k) == heading.get(k) for k in ("sources", "software"))
     }
-    found = StageResults.read(stages)
-    counting = counting_of(found.fit, found.diagnosis)
-    judgements = judgements_of(found)
-    about = _about(found)
+    results = StageResults.read(stages)
+    counting = counting_of(results.fit, results.diagnosis)
+    judgements = judgements_of(results)
+    about = _about(results)
     limits: Yardstick = "tolerance" if about.tolerance else "windows"
     sets = {name: _set(j, limits, swing) for name, j in judgements.items()}
     plain = [n for n in sets if n != "effect"]
     judged = plain[-1] if plain else None
-    parameters = _parameters(found, counting)
-    diagnosis = found.diagnosis
+    parameters = _parameters(results, counting)
+    diagnosis = results.diagnosis
     return RunSummary(
         study=str(heading.get("study", "")),
         model=str(heading.get("model", "")),
@@ -86,7 +86,7 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
         about=judged,
         limits=limits,
         sets=sets,
-        signals=_signals(judgements, judged, limits, found),
+        signals=_signals(judgements, judged, limits, results),
         tolerance=dict(about.tolerance),
         profile=dict(about.profile),
         counting=counting,
@@ -101,24 +101,24 @@ def summarise(stages: Mapping[str, Json], swing: Swing = no_swing, heading: Json
         remainder=RemainderSummary() if diagnosis is None else _remainder(diagnosis, counting),
         conditional={
             "given": False,
-            "fitted": conditional(found.fit, diagnosis, effect=False),
-            "effect": conditional(found.fit, diagnosis, effect=True),
+            "fitted": conditional(results.fit, diagnosis, effect=False),
+            "effect": conditional(results.fit, diagnosis, effect=True),
         },
-        fit="" if found.fit is None else found.fit.status,
-        search_doubt="" if found.fit is None else found.fit.search_doubt,
-        next=_next(found, parameters),
-        unadvised="" if added_to(diagnosis) else found.identified.not_recommended,
+        fit="" if results.fit is None else results.fit.status,
+        search_doubt="" if results.fit is None else results.fit.search_doubt,
+        next=_next(results, parameters),
+        unadvised="" if added_to(diagnosis) else results.identified.not_recommended,
         failures=_failures(stages),
-        noise_from_misfit=noise_from_misfit(found),
+        noise_from_misfit=noise_from_misfit(results),
     )
 
 
-def noise_from_misfit(found: StageResults) -> tuple[str, ...]:
+def noise_from_misfit(results: StageResults) -> tuple[str, ...]:
     """Return the outputs whose noise is taken from the misfit by any of the results."""
-    fit, diagnosis = found.fit, found.diagnosis
+    fit, diagnosis = results.fit, results.diagnosis
     by_fit = of_misfit(fit.noise_source) if fit is not None else ()
     by_diagnosis = () if diagnosis is None else of_misfit({o: n.get("source", "") for o, n in diagnosis.noise.items()})
-    return tuple(dict.fromkeys((*found.identified.pilot.outputs_of_misfit, *by_fit, *by_diagnosis)))
+    return tuple(dict.fromkeys((*results.identified.pilot.outputs_of_misfit, *by_fit, *by_diagnosis)))
 
 
 # --- which values count ---
@@ -192,19 +192,19 @@ def conditional(fit: FitResult | None, diagnosis: Diagnosis | None, *, effect: b
 # --- whether the model follows ---
 
 
-def judgements_of(found: StageResults) -> dict[str, Judgement]:
+def judgements_of(results: StageResults) -> dict[str, Judgement]:
     """Return the judgement of the model with each set of values that there is."""
     each: dict[str, Judgement] = {}
-    for context in (found.simulated, found.of_fit, found.of_diagnosis):
+    for context in (results.simulated, results.of_fit, results.of_diagnosis):
         for name, judgement in context.judgement.sets.items():
             each.setdefault(name, judgement)
-    wanted = {"given": True, "fitted": bool(found.fitted), "effect": bool(added_to(found.diagnosis))}
+    wanted = {"given": True, "fitted": bool(results.fitted), "effect": bool(added_to(results.diagnosis))}
     return {n: each[n] for n in SETS if wanted[n] and n in each and each[n].signals}
 
 
-def _about(found: StageResults) -> Judgements:
+def _about(results: StageResults) -> Judgements:
     """Return the tolerance and the profile that the errors were held against, by the last stage that judged."""
-    each = (context.judgement for context in (found.of_diagnosis, found.of_fit, found.simulated))
+    each = (context.judgement for context in (results.of_diagnosis, results.of_fit, results.simulated))
     return next((j for j in each if j.sets), Judgements())
 
 
@@ -256,10 +256,10 @@ def _worst(judgement: Judgement, swing: Swing) -> Signal | None:
 
 
 def _signals(
-    judgements: Mapping[str, Judgement], judged: str | None, limits: Yardstick, found: StageResults
+    judgements: Mapping[str, Judgement], judged: str | None, limits: Yardstick, results: StageResults
 ) -> tuple[SignalSummary, ...]:
-    units = {**found.of_diagnosis.units, **found.simulated.units, **found.of_fit.units}
-    experiments = {**found.simulated.experiments, **found.of_fit.experiments}
+    units = {**results.of_diagnosis.units, **results.simulated.units, **results.of_fit.units}
+    experiments = {**results.simulated.experiments, **results.of_fit.experiments}
     errors: dict[Signal, dict[str, SignalJudgement]] = {}
     for name, judgement in judgements.items():
         for output, experiment, about in lines_of(judgement):
@@ -289,15 +289,15 @@ def _error(about: SignalJudgement, limits: Yardstick) -> SignalError:
 # --- the values ---
 
 
-def _parameters(found: StageResults, counting: Counting) -> tuple[ParameterSummary, ...]:
-    fit, diagnosis, identified = found.fit, found.diagnosis, found.identified
-    lines = found.of_fit.candidates or found.of_identified.candidates or found.simulated.candidates
+def _parameters(results: StageResults, counting: Counting) -> tuple[ParameterSummary, ...]:
+    fit, diagnosis, identified = results.fit, results.diagnosis, results.identified
+    lines = results.of_fit.candidates or results.of_identified.candidates or results.simulated.candidates
     if not lines and diagnosis is not None:
         known = diagnosis.estimates_after
         lines = {
             n: Candidate(v, unit=known[n].unit if n in known else "") for n, v in diagnosis.parameters_before.items()
         }
-    fitted, estimates = found.fitted, found.estimates
+    fitted, estimates = results.fitted, results.estimates
     later: Mapping[str, Estimate] = {} if diagnosis is None else diagnosis.estimates_after
     bounds = {n: e for n, e in estimates.items() if fitted and n not in fitted and e.method == "one-sided"}
     after = diagnosis.parameters_after if diagnosis is not None and counting.kind else {}
@@ -353,7 +353,7 @@ def _quantities(sizes: Mapping[str, EffectSize]) -> dict[str, Quantity]:
 def _findings(diagnosis: Diagnosis) -> tuple[FindingSummary, ...]:
     own = {(e.effect, e.at, e.source): e.text for e in diagnosis.effects}
     depend = diagnosis.values_by_place
-    found = []
+    findings = []
     for f in diagnosis.findings:
         places = tuple(
             PlaceSummary(
@@ -372,10 +372,10 @@ def _findings(diagnosis: Diagnosis) -> tuple[FindingSummary, ...]:
         delay = f.equivalent_delay.value if f.equivalent_delay is not None else None
         text, listed_places = (said or f.text).rstrip("."), () if f.effect == "parameter" else places
         sizes = _quantities(f.parameters)
-        found.append(
+        findings.append(
             FindingSummary(f.effect, f.same_as or (f.effect,), text, f.probability, sizes, listed_places, delay)
         )
-    return tuple(found)
+    return tuple(findings)
 
 
 def _effects(diagnosis: Diagnosis) -> tuple[AddedEffect, ...]:
@@ -427,13 +427,13 @@ def _share(value: Any) -> float | None:
 # --- what to do next ---
 
 
-def _next(found: StageResults, parameters: tuple[ParameterSummary, ...]) -> tuple[NextStep, ...]:
+def _next(results: StageResults, parameters: tuple[ParameterSummary, ...]) -> tuple[NextStep, ...]:
     """Return what to do, the first thing first.
 
     Advice on narrower intervals is of the model without an effect: it is void once one was put in, and needless where every value
     is known closely enough for any change to be told.
     """
-    fit, diagnosis, steps = found.fit, found.diagnosis, []
+    fit, diagnosis, steps = results.fit, results.diagnosis, []
     if diagnosis is not None and (advice := _advice((diagnosis.separating_experiment or {}).get("text"))):
         steps.append(NextStep("separate", advice))
     if diagnosis is not None and diagnosis.augmented_model:
@@ -441,12 +441,12 @@ def _next(found: StageResults, parameters: tuple[ParameterSummary, ...]) -> tupl
     misfit = fit is not None and fit.adequacy is not None and fit.adequacy.verdict == "does-not-fit"
     if diagnosis is None and misfit:
         steps.append(NextStep("diagnose"))
-    own = {} if found.estimates else found.identified.parameters
+    own = {} if results.estimates else results.identified.parameters
     known = bool(parameters) and all(p.determined or _closely(own.get(p.name)) for p in parameters)
-    wanted = found.identified.recommended
+    wanted = results.identified.recommended
     if not added_to(diagnosis) and not known and wanted is not None and (advice := _advice(wanted.text)):
         steps.append(NextStep("narrow", advice))
-    if found.estimates and not steps:
+    if results.estimates and not steps:
         steps.append(NextStep("export"))
     return tuple(steps)
 
@@ -464,8 +464,10 @@ def _advice(text: str | None) -> str:
 
 def _failures(stages: Mapping[str, Json]) -> dict[str, str]:
     """Return the reason of every stage that failed, by its name."""
-    found = {n: str(s["failed"]) for n, s in ((stages.get("run") or {}).get("stages") or {}).items() if s.get("failed")}
+    reasons = {
+        n: str(s["failed"]) for n, s in ((stages.get("run") or {}).get("stages") or {}).items() if s.get("failed")
+    }
     for name, data in stages.items():
-        if (data.get("status") in ("failed", "unfinished") or "not_tried" in data) and data.get("stage") not in found:
-            found[str(data.get("stage") or name)] = str(data.get("message", ""))
-    return found
+        if (data.get("status") in ("failed", "unfinished") or "not_tried" in data) and data.get("stage") not in reasons:
+            reasons[str(data.get("stage") or name)] = str(data.get("message", ""))
+    return reasons

@@ -257,10 +257,10 @@ def port_line(port: PortImpedance) -> str:
     return f"port {port.name}: {side} over the band, least real part {least.value:.4g} at {_hertz(least.omega)}"
 
 
-def other_lines(found: LinearResult) -> list[str]:
+def other_lines(result: LinearResult) -> list[str]:
     """Return the comparison with another model, the reduced model and the formulas of transfer functions."""
     lines = []
-    if (c := found.comparison) is not None:
+    if (c := result.comparison) is not None:
         fails = " (the winding condition fails: no controller of one need suit the other)" if c.nu_gap.winding else ""
         room = "" if c.attainable is None else f", attainable margin {c.attainable:.4g}"
         gain = (
@@ -269,42 +269,42 @@ def other_lines(found: LinearResult) -> list[str]:
             else f"; the gains differ by up to {_at(Crossing(c.difference.omega, c.difference.value))}"
         )
         lines.append(f"against {c.second}: nu-gap {c.nu_gap.value:.4g}{fails}{room}{gain}")
-    if (r := found.reduced) is not None:
+    if (r := result.reduced) is not None:
         dc = ", dc gain matched" if r.found.match_dc else ""
         size = f"error {r.error.value:.4g}, bound {r.found.bound:.4g}{dc}"
         lines.append(f"reduced from {r.states_before} to {r.found.order} states: {size}")
     lines += [
-        f"{f.output} from {f.input}: {f.reason or f'({f.numerator}) / ({f.denominator})'}" for f in found.formulas
+        f"{f.output} from {f.input}: {f.reason or f'({f.numerator}) / ({f.denominator})'}" for f in result.formulas
     ]
     return lines
 
 
-def _point_lines(found: LinearResult) -> Iterator[str]:
+def _point_lines(result: LinearResult) -> Iterator[str]:
     """Yield the verdict on stability, the inputs and outputs at the point, and the limits that are active."""
-    if verdict := found.verdict:
+    if verdict := result.verdict:
         yield f"operating point: {verdict}"
-    m = found.linear
+    m = result.linear
     sides = (("inputs", m.input_names, m.u0, m.input_units), ("outputs", m.output_names, m.y0, m.output_units))
     for kind, names, values, units in sides:
         shown = [f"{n} = {quantity(v, u, 6)}" for n, v, u in zip(names, values, units, strict=True)][:VALUES_SHOWN]
         more = f" and {len(names) - VALUES_SHOWN} more" if len(names) > VALUES_SHOWN else ""
         yield from [f"{kind}: {', '.join(shown)}{more}"] if shown else []
-    for limit in found.point.active_limits:
+    for limit in result.point.active_limits:
         yield f"active limit: {limit.signal} is held by {limit.level} ({limit.kind} limit)"
-    if not found.point.active_limits and found.point.margins:
+    if not result.point.active_limits and result.point.margins:
         yield "active limits: none"
 
 
-def _mode_lines(found: LinearResult) -> Iterator[str]:
+def _mode_lines(result: LinearResult) -> Iterator[str]:
     """Yield the oscillating modes, the least damped first, and how many decay without oscillation, with the slowest of them."""
-    swinging = [m.mode for m in found.swinging]
+    swinging = [m.mode for m in result.swinging]
     for m in swinging[:MODES_SHOWN]:
         shares = sorted(m.participation, key=lambda n: -m.participation[n])[:3]
         yield f"mode at {m.frequency_hz:.4g} Hz, damping {100 * m.damping:.3g} %: {', '.join(shares)}"
     if len(swinging) > MODES_SHOWN:
         better = swinging[MODES_SHOWN].damping
         yield f"and {len(swinging) - MODES_SHOWN} more modes, of damping {100 * better:.3g} % and above"
-    real = [m.mode for m in found.modes if m.mode.eigenvalue.imag == 0.0 and "sliding mean" not in m.mode.kind]
+    real = [m.mode for m in result.modes if m.mode.eigenvalue.imag == 0.0 and "sliding mean" not in m.mode.kind]
     if real:
         slowest = max(real, key=lambda m: m.eigenvalue.real)
         rate = slowest.eigenvalue.real

@@ -171,7 +171,7 @@ def note_text(p: ParameterSummary) -> str:
 
 def remarks(fit: FitResult, candidates: Iterable[str]) -> dict[str, str]:
     """Return by candidate why it is held, or what its interval rests on; nothing of one without a remark."""
-    found = {}
+    noted = {}
     for name in candidates:
         notes = [f"held: {fit.held[name]}"] if fit.held.get(name) else []
         if (own := fit.estimates.get(name)) is not None:
@@ -182,19 +182,19 @@ def remarks(fit: FitResult, candidates: Iterable[str]) -> dict[str, str]:
             if alone and low is not None and high is not None and high - low > WIDER * (alone[1] - alone[0]):
                 notes.append(f"as if the residuals were independent: {interval_text(alone)}")
         if notes:
-            found[name] = "; ".join(notes)
-    return found
+            noted[name] = "; ".join(notes)
+    return noted
 
 
 def condition(s: RunSummary, subject: str = "They") -> str:
     """Return what the values that count rest on, in sentences; empty where the search was sure and what is left is noise."""
-    found = []
+    sentences = []
     if s.counting.name == "fit" and s.search_doubt:
-        found.append(f"{subject} may not be the best there are: {s.search_doubt}.")
+        sentences.append(f"{subject} may not be the best there are: {s.search_doubt}.")
         subject = "They"
     if s.counting.name and s.counts_conditional:
-        found.append(f"{subject} hold only if nothing else is missing: {why_conditional(s)}.")
-    return " ".join(found)
+        sentences.append(f"{subject} hold only if nothing else is missing: {why_conditional(s)}.")
+    return " ".join(sentences)
 
 
 def why_conditional(s: RunSummary) -> str:
@@ -247,13 +247,13 @@ def place_texts(f: FindingSummary, join: Callable[[Iterable[str]], str] = ", ".j
     sources: dict[str, set[str]] = {}
     for p in f.places:
         sources.setdefault(join(p.at), set()).add(p.source)
-    found: dict[str, float] = {}
+    probabilities: dict[str, float] = {}
     for p in f.places:
         at = join(p.at)
         at += f" from {p.source}" if p.source and len(sources[at]) > 1 else ""
         at += f" (then {sizes_text(p.values)})" if p.values else ""
-        found[at] = found.get(at, 0.0) + p.probability
-    return found
+        probabilities[at] = probabilities.get(at, 0.0) + p.probability
+    return probabilities
 
 
 def remainder_sentence(s: RunSummary) -> str:

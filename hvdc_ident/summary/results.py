@@ -42,7 +42,7 @@ class Results:
         """The JSON files that have the heading of a result. Raises InputError for a broken one, or none at all."""
         if not self.folder.is_dir():
             raise InputError("no folder of results", where=str(self.folder), next=(NextStep("run"),))
-        found = {}
+        by_name = {}
         for path in sorted(self.folder.glob("*.json")):
             try:
                 data = json.loads(path.read_text(encoding="utf-8"))
@@ -50,10 +50,10 @@ class Results:
                 hint = "run the study again"
                 raise InputError("a result that cannot be read", where=str(path), got=str(e)[:100], hint=hint) from None
             if isinstance(data, dict) and {"schema", "study", "model", "software"} <= set(data):
-                found[path.stem] = data
-        if not found:
+                by_name[path.stem] = data
+        if not by_name:
             raise InputError("no results in the folder", where=str(self.folder), next=(NextStep("run"),))
-        return found
+        return by_name
 
     def get(self, stage: str) -> dict[str, Any]:
         """The JSON of a stage, empty where it has not run."""
@@ -84,15 +84,15 @@ class Results:
     @property
     def responses(self) -> tuple[ComparedResponse, ...]:
         """The measured frequency responses beside the model's: of the fit, else of the linear model at the given values."""
-        found = self.objects.of_fit.responses
-        return found or (() if self.linear is None else self.linear.given.responses)
+        of_fit = self.objects.of_fit.responses
+        return of_fit or (() if self.linear is None else self.linear.given.responses)
 
     @property
     def rest_levels(self) -> tuple[InitialValue, ...]:
         """The levels before the events, from a stage of the present state of the study where there is one."""
-        found = [s for s in self.stages.values() if s.get("rest_levels")]
-        present = [s for s in found if s.get("sources") == self.heading.get("sources")]
-        return read_fields(_Levels, next(iter([*present, *found]), {})).rest_levels
+        with_levels = [s for s in self.stages.values() if s.get("rest_levels")]
+        present = [s for s in with_levels if s.get("sources") == self.heading.get("sources")]
+        return read_fields(_Levels, next(iter([*present, *with_levels]), {})).rest_levels
 
     def fingerprint(self, stage: str) -> str:
         """Return the fingerprint of a result; "" where the stage has not come to its end."""

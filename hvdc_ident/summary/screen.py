@@ -43,5 +43,5 @@ def blocks(s: RunSummary, door: Door, truth: str = "", more: str = "") -> Iterat
 
 def lines_of(s: RunSummary, truth: Sequence[str] = (), more: Sequence[str] = ()) -> list[str]:
     """Return the screen of a terminal in lines."""
-    found = blocks(s, "shell", "\n".join(truth), "\n".join(more))
-    return "\n\n".join(text for block in found if (text := str(block))).splitlines()
+    screen = blocks(s, "shell", "\n".join(truth), "\n".join(more))
+    return "\n\n".join(text for block in screen if (text := str(block))).splitlines()

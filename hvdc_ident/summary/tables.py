@@ -66,13 +66,13 @@ def sets_table(s: RunSummary) -> Table:
     unit = f", {signal.unit}" if signal is not None and signal.unit else ""
     limits = "in the tolerance" if s.limits == "tolerance" else "in the windows"
     rows = []
-    for name, found in s.sets.items():
+    for name, summary in s.sets.items():
         e = signal.errors.get(name) if signal is not None else None
         sizes = ("", "", "")
         if e is not None:
             times = "" if e.times_noise is None else factor_text(e.times_noise)
             sizes = (figures(e.rmse, 2), times, figures(e.peak, 2))
-        rows.append((WORDS[name], *sizes, count_text(found.on_noise), count_text(found.in_limits)))
+        rows.append((WORDS[name], *sizes, count_text(summary.on_noise), count_text(summary.in_limits)))
     return Table(("", f"RMSE{unit}", "× noise", f"peak{unit}", "on the noise", limits), tuple(rows)).without_empty()
 
 

@@ -13,9 +13,9 @@ from hvdc_ident.text import figures, listed, probability_text, quantity
 
 def truth_table(s: RunSummary, truth: Mapping[str, Any]) -> Table:
     """Return the candidates with their given values, those that were found, and the true ones. truth: {name: {value, unit}}."""
-    found = values_table(s)
+    values = values_table(s)
     true = {n: figures(p["value"]) for n, p in truth.items()}
-    return Table((*found.header, "true"), tuple((*row, true.get(row[0], "")) for row in found.rows))
+    return Table((*values.header, "true"), tuple((*row, true.get(row[0], "")) for row in values.rows))
 
 
 def found_effect(s: RunSummary) -> str:
