@@ -129,16 +129,16 @@ _NEEDLESS = re.compile(
 def _compact(drawn: str) -> str:
     """The same drawing in fewer bytes, with the colours of the page: tenths of a point, no names that nothing refers to."""
     drawn = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", drawn, count=1, flags=re.DOTALL)
-    drawn = re.sub(r">\s+<", "><", _TAG.sub(lambda found: _compact_tag(found[0]), drawn))
+    drawn = re.sub(r">\s+<", "><", _TAG.sub(lambda match: _compact_tag(match[0]), drawn))
     while "<g></g>" in drawn:
         drawn = drawn.replace("<g></g>", "")
     return drawn
 
 
 def _compact_tag(tag: str) -> str:
-    tag = _PATH.sub(lambda found: f' d="{_short(found[1])}"', tag)
+    tag = _PATH.sub(lambda match: f' d="{_short(match[1])}"', tag)
     tag = _DIGITS.sub("", _NEEDLESS.sub("", tag)).replace("xlink:href", "href")
-    return _COLOUR.sub(lambda found: f"var(--{NAMED[found[0]]})", tag)
+    return _COLOUR.sub(lambda match: f"var(--{NAMED[match[0]]})", tag)
 
 
 def _short(path: str) -> str:
@@ -163,7 +163,7 @@ def _short(path: str) -> str:
 def on_paper(page: str) -> str:
     """The page with plain colours in its figures, for a program that does not read the names of a style sheet there."""
     plain = {name: colour for colour, name in reversed(NAMED.items())}
-    return re.sub(r"var\(--(\w+)\)", lambda found: plain.get(found[1], found[0]), page)
+    return re.sub(r"var\(--(\w+)\)", lambda match: plain.get(match[1], match[0]), page)
 
 
 def visible(time: Array, values: Array, points: int = POINTS) -> tuple[Array, Array]:

@@ -117,14 +117,14 @@ def _verdict(s: RunSummary) -> tuple[str, str]:
 def _basis(s: RunSummary) -> str:
     """One line on what the columns compare with what."""
     parts, last = [], [*s.sets.values()][-1]
-    if any(found.on_noise.judged for found in s.sets.values()):
+    if any(one.on_noise.judged for one in s.sets.values()):
         parts.append(
             "On the noise: the error has at most twice the noise’s power, or what chance allows so few independent rows. "
             "Behind FAIL: signals that fail."
         )
         if rest := not_judged(s, last, limits=False):
             parts.append(f"On the noise, {text(rest)}.")
-    windowed = next((found for found in reversed([*s.sets.values()]) if found.in_limits.judged), None)
+    windowed = next((one for one in reversed([*s.sets.values()]) if one.in_limits.judged), None)
     if s.tolerance:
         units = {x.output: x.unit for x in s.signals}
         each = ", ".join(f"{text(o)} {number(v)} {text(units.get(o, ''))}".rstrip() for o, v in s.tolerance.items())

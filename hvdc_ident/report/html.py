@@ -45,9 +45,9 @@ def number(value: Any, digits: int = 4) -> str:
 
 def typeset(shown: str) -> str:
     """Return text with numbers in it as HTML: with minus signs, and powers of ten; PASS and FAIL as badges."""
-    raised = _POWER.sub(lambda found: f"·10<sup>{int(found[1])}</sup>", text(shown))
+    raised = _POWER.sub(lambda match: f"·10<sup>{int(match[1])}</sup>", text(shown))
     signed = _MINUS.sub("−", raised)
-    return _BADGE.sub(lambda found: badge(found[0] == "PASS"), signed)
+    return _BADGE.sub(lambda match: badge(match[0] == "PASS"), signed)
 
 
 def estimate(value: float | None, interval: Sequence[float | None] | None) -> tuple[str, str]:
@@ -73,18 +73,18 @@ def badge(passed: bool | None) -> str:
     return "–" if passed is None else f"<b class='{'pass' if passed else 'fail'}'>{'PASS' if passed else 'FAIL'}</b>"
 
 
-def table_of(found: Table) -> str:
+def table_of(table: Table) -> str:
     """Return a table of text, numbers and markup as HTML; a number has four digits, and None is a dash.
 
     A column without anything in it is left out.
     """
     plain = Table(
-        found.header, tuple(tuple(_plain(c) if isinstance(c, Markup) else c for c in row) for row in found.rows)
+        table.header, tuple(tuple(_plain(c) if isinstance(c, Markup) else c for c in row) for row in table.rows)
     )
     kinds = ["" if not numbers else ' class="n"' for numbers in plain.numeric]
-    rows = [[_cell(c) for c in row] for row in found.rows]
-    kept = [k for k in range(len(found.header)) if not rows or any(row[k] for row in rows)]
-    head = "".join(f"<th{kinds[k]}>{typeset(found.header[k])}</th>" for k in kept)
+    rows = [[_cell(c) for c in row] for row in table.rows]
+    kept = [k for k in range(len(table.header)) if not rows or any(row[k] for row in rows)]
+    head = "".join(f"<th{kinds[k]}>{typeset(table.header[k])}</th>" for k in kept)
     body = "\n".join("<tr>" + "".join(f"<td{kinds[k]}>{row[k]}</td>" for k in kept) + "</tr>" for row in rows)
     return f'<div class="wide"><table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{body}\n</tbody></table></div>'
 

@@ -87,11 +87,11 @@ class Overlay:
         columns = {"x": shown.time, "measured": shown[f"{self.output}.measured"]}
         columns |= {n: t[self.output] for n, t in same.items()}
         rows = np.unique(np.concatenate([visible_rows(c) for c in columns.values()]))
-        found = [PlottedCurve("recorded", RECORDED, "measured")]
+        curves = [PlottedCurve("recorded", RECORDED, "measured")]
         for name in same:
-            found.append(PlottedCurve(WORDS[name], STYLES[name][0], name))
-            found.append(PlottedCurve(f"error, {WORDS[name]}", STYLES[name][0], "measured", minus=name, lower=True))
-        return {n: v[rows] for n, v in columns.items()}, found, ("time, s", self.title, with_unit("error", self.unit))
+            curves.append(PlottedCurve(WORDS[name], STYLES[name][0], name))
+            curves.append(PlottedCurve(f"error, {WORDS[name]}", STYLES[name][0], "measured", minus=name, lower=True))
+        return {n: v[rows] for n, v in columns.items()}, curves, ("time, s", self.title, with_unit("error", self.unit))
 
 
 def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[str] = tuple(STAGES)) -> Overlay | None:
@@ -117,8 +117,10 @@ def overlay_of(results: Results, experiment: str, output: str, sets: Sequence[st
 
 def worst_signal(results: Results, name: str | None, sets: Sequence[str]) -> Overlay | None:
     """The worst signal of the model with a set of values, with the runs that the folder holds of some; None where there is none."""
-    found = results.summary.sets.get(name or "")
-    return None if found is None or found.worst is None else overlay_of(results, found.worst[1], found.worst[0], sets)
+    judged = results.summary.sets.get(name or "")
+    return (
+        None if judged is None or judged.worst is None else overlay_of(results, judged.worst[1], judged.worst[0], sets)
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,10 +28,10 @@ def sections() -> tuple[Section, ...]:
     """Every part of the page below its first screen, in order, found by walking `sections/`."""
     from hvdc_ident.report import sections as folder
 
-    found = [
+    every = [
         importlib.import_module(f"{folder.__name__}.{m.name}").SECTION for m in pkgutil.iter_modules(folder.__path__)
     ]
-    return tuple(sorted(found, key=lambda s: s.order))
+    return tuple(sorted(every, key=lambda s: s.order))
 
 
 def page(folder: Path) -> str:

@@ -29,34 +29,34 @@ SHOWN = 5e-3
 
 
 def _render(results: Results) -> str:
-    found = results.objects.diagnosis
-    if found is None:
+    diagnosis = results.objects.diagnosis
+    if diagnosis is None:
         return ""
     s = results.summary
-    notes = "".join(f"<p class='small'>{text(n)}</p>" for n in found.notes)
+    notes = "".join(f"<p class='small'>{text(n)}</p>" for n in diagnosis.notes)
     compared = "For specialists: what else was tried, and how far behind it is on the scale of the Bayesian information criterion (BIC)."
     return "".join(
         [
-            f"<p><strong>{text(capital(found.verdict))}.</strong> {text(found.text)}</p>",
+            f"<p><strong>{text(capital(diagnosis.verdict))}.</strong> {text(diagnosis.text)}</p>",
             _effects(s),
             _findings(s),
-            _curve(found),
-            _gap(s, found),
+            _curve(diagnosis),
+            _gap(s, diagnosis),
             _slider(results.objects.of_diagnosis.sizes),
             folded(
                 "Where model and recordings differ",
-                _where(s, found),
+                _where(s, diagnosis),
                 "Signals, times, frequencies and levels of the gap.",
             ),
-            folded("Hypotheses compared", _sets(found) + _candidates(found), compared),
+            folded("Hypotheses compared", _sets(diagnosis) + _candidates(diagnosis), compared),
             notes,
         ]
     )
 
 
-def _curve(found: Diagnosis) -> str:
+def _curve(diagnosis: Diagnosis) -> str:
     """The curve of what has no name, where one was found."""
-    other = found.fallback or {}
+    other = diagnosis.fallback or {}
     if not other.get("curve"):
         return ""
     name = f"what is added to {other['at']} over {other['curve']['over']}"
@@ -85,9 +85,9 @@ def _findings(s: RunSummary) -> str:
     return "<h3>What may be missing, and where</h3>" + table_of(findings_table(s))
 
 
-def _sets(found: Diagnosis) -> str:
+def _sets(diagnosis: Diagnosis) -> str:
     parts = []
-    for group in (g for g in found.ambiguity if len(g) > 1):
+    for group in (g for g in diagnosis.ambiguity if len(g) > 1):
         late = ["" if r.late is None else quantity(r.late, "s", 3) for r in group]
         rows = [
             (r.name, ", ".join(r.at), r.source, delay, r.delta_bic)
@@ -99,11 +99,11 @@ def _sets(found: Diagnosis) -> str:
     return "".join(parts)
 
 
-def _gap(s: RunSummary, found: Diagnosis) -> str:
+def _gap(s: RunSummary, diagnosis: Diagnosis) -> str:
     """Figure of the pooled residual before and after, and a sentence on the held-out recordings."""
-    if not found.gap.pooled:
+    if not diagnosis.gap.pooled:
         return ""
-    picture = svg(gap_bars(found.gap.pooled), "residual of the three models in noise units")
+    picture = svg(gap_bars(diagnosis.gap.pooled), "residual of the three models in noise units")
     caption = "Residual of all signals together in units of the noise, on fitted and on held-out recordings."
     gained = gained_sentence(s)
     line = f"<p>{text(gained)}</p>" if gained else ""
@@ -149,8 +149,8 @@ def _at_sizes(sizes: SizeCurves, chosen: int) -> str:
     return drawn
 
 
-def _where(s: RunSummary, found: Diagnosis) -> str:
-    place = found.location
+def _where(s: RunSummary, diagnosis: Diagnosis) -> str:
+    place = diagnosis.location
     outputs, experiments = _shares(place.get("outputs")), _shares(place.get("experiments"))
     window, band, region = place.get("time_window"), place.get("band_hz"), place.get("region")
     parts = [f"Share of the gap by output: {outputs}; by experiment: {experiments}."] if outputs else []
@@ -167,12 +167,12 @@ def _where(s: RunSummary, found: Diagnosis) -> str:
     return f"<p>{' '.join(parts)}</p>" if parts else ""
 
 
-def _shares(found: dict[str, float] | None) -> str:
-    return ", ".join(f"{text(n)} {percentage(v)}" for n, v in list((found or {}).items())[:5] if v >= SHOWN)
+def _shares(shares: dict[str, float] | None) -> str:
+    return ", ".join(f"{text(n)} {percentage(v)}" for n, v in list((shares or {}).items())[:5] if v >= SHOWN)
 
 
-def _candidates(found: Diagnosis) -> str:
-    lines = [c for c in found.candidates if c.delta_bic is not None][:CANDIDATES_SHOWN]
+def _candidates(diagnosis: Diagnosis) -> str:
+    lines = [c for c in diagnosis.candidates if c.delta_bic is not None][:CANDIDATES_SHOWN]
     if not lines:
         return ""
     rows = [(c.effect, ", ".join(c.at), c.source, c.score, c.p, c.delta_bic, c.holdout_rmse) for c in lines]

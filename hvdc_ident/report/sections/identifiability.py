@@ -158,9 +158,9 @@ def _next(advice: Recommendation | None) -> str:
     return lead + folded("Experiments compared", rows_of(header, rows) + note, about)
 
 
-def profiles(found: Mapping[str, Profile], parameters: Mapping[str, Verdict]) -> Figure:
+def profiles(by_name: Mapping[str, Profile], parameters: Mapping[str, Verdict]) -> Figure:
     """One small plot a parameter: rise over its threshold against the parameter, in its unit; 1 is the 95 % level."""
-    rows = -(-len(found) // COLUMNS)
+    rows = -(-len(by_name) // COLUMNS)
     high = 1.9 * rows
     edges = {
         "left": 0.085,
@@ -171,7 +171,7 @@ def profiles(found: Mapping[str, Profile], parameters: Mapping[str, Verdict]) ->
         "hspace": 0.62,
     }
     fig = figure(7.4, high, edges)
-    for place, (name, profile) in enumerate(found.items(), start=1):
+    for place, (name, profile) in enumerate(by_name.items(), start=1):
         axes = fig.add_subplot(rows, COLUMNS, place)
         draw_profile(axes, profile, parameters[name])
         axes.set_ylabel("")

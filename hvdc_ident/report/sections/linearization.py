@@ -40,16 +40,16 @@ CHECKS = {
 
 def _render(results: Results) -> str:
     """The linear model at the fitted values where there is one, beside the one at the given values."""
-    found = results.linear
-    if found is None or not found.given.modes:
+    linear = results.linear
+    if linear is None or not linear.given.modes:
         return ""
-    shown = found.at_fitted or found.given
+    shown = linear.at_fitted or linear.given
     return (
-        _which(found, results)
+        _which(linear, results)
         + _point(shown)
-        + _modes(found.given.modes, found.at_fitted)
+        + _modes(linear.given.modes, linear.at_fitted)
         + _limits(shown.point)
-        + _bode(found)
+        + _bode(linear)
         + _margins(shown.margins)
         + _ports(shown.ports)
         + _locus(shown.locus)
@@ -57,14 +57,14 @@ def _render(results: Results) -> str:
     )
 
 
-def _which(found: Linearisation, results: Results) -> str:
+def _which(linear: Linearisation, results: Results) -> str:
     """At which values the linear models stand."""
-    if found.at_fitted is not None:
-        lines = [f"At the <strong>{text(found.fitted_note)}</strong>, beside the given values."]
+    if linear.at_fitted is not None:
+        lines = [f"At the <strong>{text(linear.fitted_note)}</strong>, beside the given values."]
     else:
-        lines = [f"At the <strong>given</strong> values{': ' if found.why_none else ''}{text(found.why_none)}."]
+        lines = [f"At the <strong>given</strong> values{': ' if linear.why_none else ''}{text(linear.why_none)}."]
     fit, diagnosis = (results.fingerprint(stage) for stage in ("fit", "discrepancy"))
-    taken = found.fitted
+    taken = linear.fitted
     if fit and (taken is None or taken.fit != fit):
         lines.append("A fit has run since: `hvdc-ident linearize` takes it in.")
     elif taken is not None and taken.diagnosis != diagnosis:
@@ -72,11 +72,11 @@ def _which(found: Linearisation, results: Results) -> str:
     return f"<p>{' '.join(lines)}</p>"
 
 
-def _point(found: LinearResult) -> str:
-    about = f"Largest scaled residual {number(found.point.residual, 2)}; the Jacobian differs from {CHECKS[found.method]} by "
-    about += f"{number(found.jacobian_error, 2)}."
-    notes = "".join(f"<p>{text(note)}</p>" for note in found.notes)
-    return f"<p>{len(found.modes)} modes; operating point <strong>{text(found.verdict)}</strong>. {about}</p>{notes}"
+def _point(linear: LinearResult) -> str:
+    about = f"Largest scaled residual {number(linear.point.residual, 2)}; the Jacobian differs from {CHECKS[linear.method]} by "
+    about += f"{number(linear.jacobian_error, 2)}."
+    notes = "".join(f"<p>{text(note)}</p>" for note in linear.notes)
+    return f"<p>{len(linear.modes)} modes; operating point <strong>{text(linear.verdict)}</strong>. {about}</p>{notes}"
 
 
 def _modes(given: Sequence[NamedMode], fitted: LinearResult | None) -> str:
@@ -120,10 +120,10 @@ def _limits(point: OperatingPoint) -> str:
     return f"<p>Active limits: {text(held)}.{' The nearest others:' if near else ''}</p>{listed}"
 
 
-def _bode(found: Linearisation) -> str:
+def _bode(linear: Linearisation) -> str:
     """Gain and phase of every channel; with a model at the fitted values that one is solid and the given one dashed."""
-    fitted = found.at_fitted
-    models = [("", found.given)] if fitted is None else [(", fitted", fitted), (", given", found.given)]
+    fitted = linear.at_fitted
+    models = [("", linear.given)] if fitted is None else [(", fitted", fitted), (", given", linear.given)]
     drawn = [(label, m.frequency_response) for label, m in models if m.frequency_response is not None]
     if not drawn:
         return ""
@@ -156,9 +156,9 @@ def _limit(margin: Crossing, factor: float = 1.0) -> tuple[str, str]:
     return shown(factor * margin.value), "infinite" if np.isinf(margin.omega) else shown(margin.omega / (2 * np.pi))
 
 
-def _margins(found: StudyMargins | None) -> str:
+def _margins(margins: StudyMargins | None) -> str:
     """The margins of each loop, of all at once, and of plant and controller."""
-    if found is None:
+    if margins is None:
         return ""
     rows = [
         (
@@ -170,10 +170,10 @@ def _margins(found: StudyMargins | None) -> str:
             shown(m.modulus.value, 3),
             shown(m.disk.value, 3),
         )
-        for name, m in found.each.items()
+        for name, m in margins.each.items()
     ]
     header = ["loop opened at", "gain", "at, Hz", "lower gain", "at, Hz", "phase, degrees", "at, Hz", "delay, ms"]
-    return f"<h3>Margins</h3>{rows_of([*header, 'modulus', 'disk'], rows)}{_said(found.common_lines())}"
+    return f"<h3>Margins</h3>{rows_of([*header, 'modulus', 'disk'], rows)}{_said(margins.common_lines())}"
 
 
 def _ports(ports: Sequence[PortImpedance]) -> str:
@@ -200,25 +200,23 @@ def _ports(ports: Sequence[PortImpedance]) -> str:
     return f"<h3>Impedance at ports</h3>{picture}{_said(map(port_line, ports))}"
 
 
-def _locus(found: RootLocus | None) -> str:
+def _locus(loci: RootLocus | None) -> str:
     """The eigenvalues along a parameter, and where stability is lost or won."""
-    if found is None:
+    if loci is None:
         return ""
     fig = figure(7.5, 3.6, {"left": 0.1, "right": 0.99, "bottom": 0.14, "top": 0.97})
     axes = fig.subplots()
-    locus(found, ax=axes)
+    locus(loci, ax=axes)
     axes.set_title("")  # the caption says it
     # Linear about the origin and logarithmic outside: eigenvalues lie decades apart.
-    slowest = np.abs(found.eigenvalues)
+    slowest = np.abs(loci.eigenvalues)
     near = float(slowest[slowest > 0].min(initial=1.0))
     for scale in (axes.set_xscale, axes.set_yscale):
         scale("symlog", linthresh=near)
-    unit = f" {text(found.unit)}" if found.unit else ""
-    span = (
-        f"{text(found.parameter)} from {number(found.values[0])} (dots) to {number(found.values[-1])}{unit} (squares)"
-    )
-    picture = captioned(svg(fig, f"Eigenvalues along {found.parameter}"), f"Eigenvalues along {span}.")
-    return f"<h3>Eigenvalues along a parameter</h3>{picture}{_said(locus_lines(found))}"
+    unit = f" {text(loci.unit)}" if loci.unit else ""
+    span = f"{text(loci.parameter)} from {number(loci.values[0])} (dots) to {number(loci.values[-1])}{unit} (squares)"
+    picture = captioned(svg(fig, f"Eigenvalues along {loci.parameter}"), f"Eigenvalues along {span}.")
+    return f"<h3>Eigenvalues along a parameter</h3>{picture}{_said(locus_lines(loci))}"
 
 
 def _said(lines: Iterable[str]) -> str:

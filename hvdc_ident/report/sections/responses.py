@@ -37,17 +37,17 @@ def _response(r: ComparedResponse) -> str:
 
 def _remarks(r: ComparedResponse) -> str:
     """Remarks on a model that is unstable where it was measured, and on a response off by a sign or a unit."""
-    found = [
+    remarks = [
         f"With the {text(n)} values the model is unstable where this was measured."
         for n, m in r.models.items()
         if m.stable is False
     ]
-    found += [
+    remarks += [
         f"{text(e.channel)}: the measured response is {number(e.factor)} times the given model's: sign, unit or base?"
         for e in (r.models["given"].errors if "given" in r.models else ())
         if e.factor is not None
     ]
-    return f"<p>{' '.join(found)}</p>" if found else ""
+    return f"<p>{' '.join(remarks)}</p>" if remarks else ""
 
 
 def _bode(r: ComparedResponse) -> str:

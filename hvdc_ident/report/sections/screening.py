@@ -16,14 +16,18 @@ def _render(results: Results) -> str:
     data = results.get("screening")
     if not data.get("measures"):
         return ""
-    found = ScreeningResult.from_dict(data)
-    columns = COLUMNS[found.method]
-    rows = [(o, e, p, *(shown(m[n], 3) for n in columns)) for o, e in found.series for p, m in found.of(o, e).items()]
-    method = "Morris' elementary effects" if found.method == "morris" else "Sobol's indices"
+    screening = ScreeningResult.from_dict(data)
+    columns = COLUMNS[screening.method]
+    rows = [
+        (o, e, p, *(shown(m[n], 3) for n in columns))
+        for o, e in screening.series
+        for p, m in screening.of(o, e).items()
+    ]
+    method = "Morris' elementary effects" if screening.method == "morris" else "Sobol's indices"
     against = "the recordings" if data["against"] == "data" else "the model's own run"
     head = (
-        f"<p>{method} of the RMSE against {against}, every parameter over its whole range; {found.evaluations} runs, "
-        f"{found.failed} failed.</p>"
+        f"<p>{method} of the RMSE against {against}, every parameter over its whole range; {screening.evaluations} runs, "
+        f"{screening.failed} failed.</p>"
     )
     return head + rows_of(["output", "experiment", "parameter", *columns.values()], rows)
 

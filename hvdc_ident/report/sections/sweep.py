@@ -29,67 +29,67 @@ def _render(results: Results) -> str:
     data = results.get("sweep")
     if not data.get("points") or not data.get("parameters"):
         return ""
-    found = SweepResult.from_dict(data)
-    names = ", ".join(map(text, found.parameters))
+    sweep = SweepResult.from_dict(data)
+    names = ", ".join(map(text, sweep.parameters))
     against = {"data": "the recordings", "base": "the run at the base values"}.get(
-        found.against, f"model {found.against}"
+        sweep.against, f"model {sweep.against}"
     )
-    lines = [f"<p>{len(found)} points of {names} against {text(against)}.</p>"]
-    if found.failed:
-        reasons = list(dict.fromkeys(found.failed.values()))[:3]
-        lines.append(f"<p>{len(found.failed)} points failed: {'; '.join(map(text, reasons))}.</p>")
-    good = np.array([k for k in range(len(found)) if k not in found.failed], dtype=int)
+    lines = [f"<p>{len(sweep)} points of {names} against {text(against)}.</p>"]
+    if sweep.failed:
+        reasons = list(dict.fromkeys(sweep.failed.values()))[:3]
+        lines.append(f"<p>{len(sweep.failed)} points failed: {'; '.join(map(text, reasons))}.</p>")
+    good = np.array([k for k in range(len(sweep)) if k not in sweep.failed], dtype=int)
     if not good.size:
         return "".join(lines)
     rows = good[:: max(1, good.size // ROWS_DRAWN)]
-    return "\n".join([*lines, _best(found), *(_figures(found, name, rows) for name in found.parameters)])
+    return "\n".join([*lines, _best(sweep), *(_figures(sweep, name, rows) for name in sweep.parameters)])
 
 
-def _best(found: SweepResult) -> str:
+def _best(sweep: SweepResult) -> str:
     rows = []
-    for line in found.bests:
+    for line in sweep.bests:
         extremes = [figures(line.smallest, 3), figures(line.largest, 3)]
         flat = extremes[0] == extremes[1]  # of a flat line none is the best
         at = ["–" if flat else figures(v, 5) for v in line.at.values()]
         rows.append((line.output, line.experiment, *at, *extremes, line.unit))
-    header = ["output", "experiment", *(f"best {n}" for n in found.parameters), "smallest RMSE", "largest", "unit"]
+    header = ["output", "experiment", *(f"best {n}" for n in sweep.parameters), "smallest RMSE", "largest", "unit"]
     return rows_of(header, rows)
 
 
-def _figures(found: SweepResult, name: str, rows: Array) -> str:
+def _figures(sweep: SweepResult, name: str, rows: Array) -> str:
     """The figures over one parameter. rows: (n,) the points that are drawn."""
-    values = found.values(name)[rows]
-    curve = len(found.parameters) == 1
+    values = sweep.values(name)[rows]
+    curve = len(sweep.parameters) == 1
     order = np.argsort(values, kind="stable") if curve else np.arange(values.size)
     drawn = []
-    for unit in dict.fromkeys(found.series_units):
+    for unit in dict.fromkeys(sweep.series_units):
         chosen = {
-            f"{o}, {e}": found.error(o, e)[rows][order]
-            for (o, e), own in zip(found.series, found.series_units, strict=True)
+            f"{o}, {e}": sweep.error(o, e)[rows][order]
+            for (o, e), own in zip(sweep.series, sweep.series_units, strict=True)
             if own == unit
         }
-        fig = sweep_errors(name, found.units[name], values[order], chosen, unit, found.base[name], curve)
+        fig = sweep_errors(name, sweep.units[name], values[order], chosen, unit, sweep.base[name], curve)
         caption = f"Root mean square error over {text(name)}; the dotted line is the given value."
         drawn.append(captioned(svg(fig, f"RMSE over {name}"), caption))
-    if "poles" in found.wanted:
+    if "poles" in sweep.wanted:
         caption = f"Poles over {text(name)}, those slower than 2000 1/s."
-        drawn.append(captioned(svg(sweep_poles(name, values, found.poles[rows]), f"poles over {name}"), caption))
-    if "bode" in found.wanted:
-        drawn += _bode(found, name, rows)
+        drawn.append(captioned(svg(sweep_poles(name, values, sweep.poles[rows]), f"poles over {name}"), caption))
+    if "bode" in sweep.wanted:
+        drawn += _bode(sweep, name, rows)
     return "\n".join(drawn)
 
 
-def _bode(found: SweepResult, name: str, rows: Array) -> list[str]:
+def _bode(sweep: SweepResult, name: str, rows: Array) -> list[str]:
     """One figure a channel, up to a few, with a curve for every so many points."""
-    positive = found.omega > 0
+    positive = sweep.omega > 0
     some = rows[np.unique(np.linspace(0, rows.size - 1, min(rows.size, CURVES)).astype(int))]
-    inputs, outputs = found.channels
+    inputs, outputs = sweep.channels
     drawn = []
     for b, a in [(b, a) for b in range(len(outputs)) for a in range(len(inputs))][:CHANNELS]:
         label = f"{outputs[b]} over {inputs[a]}"
-        responses, phases = (x[some][:, positive, b, a] for x in (found.response, found.phase_deg))
+        responses, phases = (x[some][:, positive, b, a] for x in (sweep.response, sweep.phase_deg))
         phases = phases + 360.0 * np.round((phases[:1, :1] - phases[:, :1]) / 360.0)  # all begin within half a turn
-        fig = sweep_bode(name, found.values(name)[some], found.omega[positive], responses, phases, label)
+        fig = sweep_bode(name, sweep.values(name)[some], sweep.omega[positive], responses, phases, label)
         caption = f"Frequency response of {text(label)} over {text(name)}, gain above phase."
         drawn.append(captioned(svg(fig, f"frequency response of {label} over {name}"), caption))
     return drawn
