@@ -213,14 +213,14 @@ def _groups(d: Description) -> FrozenMap[FrozenMap[Variable]]:
 def tested_capabilities(model: FmuModel, known: Capabilities | None = None) -> Capabilities:
     """Return the capabilities of an FMU with the results of short test runs, or the error of those that fail."""
     described = known or read_capabilities(model.fmu.path)
-    found = {}
+    results = {}
     for subject, test in {"two short runs": _two_runs, "derivatives at the start": _derivatives}.items():
         try:
-            found[subject] = test(model, described)
+            results[subject] = test(model, described)
         except HvdcIdentError as e:
-            found[subject] = f"failed: {e.what}" + (f" ({e.got})" if e.got else "")
-    found |= {subject: str(model.pool.learned.get(key, "")) for subject, key in LEARNED.items()}
-    return replace(described, found=FrozenMap({k: v for k, v in found.items() if v}))
+            results[subject] = f"failed: {e.what}" + (f" ({e.got})" if e.got else "")
+    results |= {subject: str(model.pool.learned.get(key, "")) for subject, key in LEARNED.items()}
+    return replace(described, found=FrozenMap({k: v for k, v in results.items() if v}))
 
 
 def _two_runs(model: FmuModel, described: Capabilities) -> str:

@@ -38,8 +38,8 @@ def compiler() -> list[str] | None:
     named = shlex.split(os.environ.get("CC", ""))
     if named:
         return named if shutil.which(named[0]) else None
-    found = next((c for c in COMPILERS if shutil.which(c)), None)
-    return [found] if found else None
+    command = next((c for c in COMPILERS if shutil.which(c)), None)
+    return [command] if command else None
 
 
 def binary_folder(version: int) -> str:
@@ -115,13 +115,13 @@ class Build:
 def _described_builds(document: Document, builds: Element | None) -> list[Build]:
     """Return the builds that an FMU describes, one for each model identifier. builds: root of its description in FMI 3.0."""
     if document.version == 2:
-        found: dict[str | None, Build] = {}
+        by_identifier: dict[str | None, Build] = {}
         for kind in ("ModelExchange", "CoSimulation"):
             for element in document.root.iterfind(kind):
                 identifier, files = element.get("modelIdentifier"), _named(element, "SourceFiles/File")
                 if files:
-                    found.setdefault(identifier, Build(identifier, ("",), files))
-        return list(found.values())
+                    by_identifier.setdefault(identifier, Build(identifier, ("",), files))
+        return list(by_identifier.values())
     return [
         Build(
             b.get("modelIdentifier"),

@@ -177,8 +177,8 @@ class Document:
     @property
     def interfaces(self) -> dict[Interface, Mapping[str, str]]:
         """Attributes of the interfaces that are offered, model exchange first."""
-        found = {ELEMENTS[e.tag]: e.attrib for e in self.root if e.tag in ELEMENTS}
-        return {k: found[k] for k in INTERFACES if k in found}
+        offered = {ELEMENTS[e.tag]: e.attrib for e in self.root if e.tag in ELEMENTS}
+        return {k: offered[k] for k in INTERFACES if k in offered}
 
     @cached_property
     def variables(self) -> list[Declared]:
@@ -192,7 +192,7 @@ class Document:
         starts = {
             e.get("valueReference"): e.get("start") for e in elements if e.get("causality") == "structuralParameter"
         }
-        found, aliases = list[Declared](), list[Declared]()
+        declared, aliases = list[Declared](), list[Declared]()
         for e in elements:
             where = f"{self.path}, variable '{e.get('name')}'"
             value = e if self.version == 3 else next((c for c in e if c.tag in IN_TWO), e)
@@ -205,13 +205,13 @@ class Document:
             variable = self._variable(e, value, declared_types.get(kind, {}), where)
             sizes = [starts.get(d.get("valueReference"), d.get("start")) for d in e if d.tag == "Dimension"]
             shape = tuple(_whole(size, "a size of the array", where) for size in sizes)
-            found.append(Declared(variable, shape, value.get("derivative")))
+            declared.append(Declared(variable, shape, value.get("derivative")))
             for other in e:
                 if other.tag == "Alias":
                     text = other.get("description", variable.description)
                     alias = replace(variable, name=other.get("name", ""), description=text)
-                    aliases.append(found[-1]._replace(variable=alias))
-        return found + aliases
+                    aliases.append(declared[-1]._replace(variable=alias))
+        return declared + aliases
 
     def _variable(self, e: Element, value: Element, declared: Mapping[str, str], where: str) -> Variable:
         """Return a variable, with the attributes of its declared type where it has none. value: the element of its type."""
@@ -235,8 +235,8 @@ class Document:
 
     def derivatives(self) -> list[tuple[Variable, Declared | None]]:
         """Return the derivatives in the model structure, each with the state that it is of, None where it does not say."""
-        found = self._listed("Derivatives/Unknown" if self.version == 2 else "ContinuousStateDerivative")
-        return [(d.variable, self._referred(d.derivative) if d.derivative is not None else None) for d in found]
+        derivatives = self._listed("Derivatives/Unknown" if self.version == 2 else "ContinuousStateDerivative")
+        return [(d.variable, self._referred(d.derivative) if d.derivative is not None else None) for d in derivatives]
 
     def indicators(self) -> int:
         """Return the number of event indicators."""
@@ -441,8 +441,8 @@ def _whole(text: str | None, what: str, where: str) -> int:
 
 def _numbers(attributes: Mapping[str, str], names: Mapping[str, str]) -> dict[str, float]:
     """Return the numbers among attributes, by the keys of their names."""
-    found = {key: _number(attributes.get(name)) for key, name in names.items()}
-    return {key: x for key, x in found.items() if x is not None}
+    numbers = {key: _number(attributes.get(name)) for key, name in names.items()}
+    return {key: x for key, x in numbers.items() if x is not None}
 
 
 def _number(text: object) -> float | None:

@@ -250,11 +250,11 @@ class Differentiation:
 
         def agrees(v: Varied, column: Array) -> Differences[RunRequest, bool]:
             h = CONFIRMING_STEP * v.size
-            found, curvature = yield from difference_pair(v.line(self.run, outputs), h)
-            strength = rms(found)
+            slope, curvature = yield from difference_pair(v.line(self.run, outputs), h)
+            strength = rms(slope)
             doubt = rms(curvature) * h + 2.0 * noise / h
             conclusive = (doubt <= CONFIRMING_DOUBT * strength) | (strength <= 2.0 * noise / h)
-            return bool((conclusive & (rms(column - found) <= doubt + SUFFICIENT * strength)).all())
+            return bool((conclusive & (rms(column - slope) <= doubt + SUFFICIENT * strength)).all())
 
         held = together([agrees(v, out["gradients"][:, :, j]) for j, v in enumerate(varied)], self._rows)
         return {v.name: holds for v, holds in zip(varied, held, strict=True)}

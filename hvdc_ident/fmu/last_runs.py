@@ -29,9 +29,9 @@ class LastRuns(Generic[Run]):
 
     def taken(self, key: bytes) -> Run | None:
         """Return a run, which is no longer kept; None where there is none."""
-        found = self._runs.pop(key, None)
-        self._bytes -= 0 if found is None else found.size
-        return found
+        run = self._runs.pop(key, None)
+        self._bytes -= 0 if run is None else run.size
+        return run
 
     def keep(self, key: bytes, run: Run) -> None:
         """Keep a run as the last one."""

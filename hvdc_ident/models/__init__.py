@@ -27,11 +27,11 @@ __all__ = ["is_shipped", "load_model", "shipped_models", "summaries"]
 
 @cache
 def _shipped_by_name() -> FrozenMap[tuple[str, Callable[[], Model]]]:
-    found: dict[str, tuple[str, Callable[[], Model]]] = {}
+    shipped: dict[str, tuple[str, Callable[[], Model]]] = {}
     for name in sorted(m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")):
         module: Any = importlib.import_module(f"{__name__}.{name}")
-        found |= {name.replace("_", "-"): (str(module.SUMMARY), module.model)} | getattr(module, "VARIANTS", {})
-    return FrozenMap(found)
+        shipped |= {name.replace("_", "-"): (str(module.SUMMARY), module.model)} | getattr(module, "VARIANTS", {})
+    return FrozenMap(shipped)
 
 
 def shipped_models() -> tuple[str, ...]:
@@ -52,9 +52,9 @@ def summaries() -> dict[str, str]:
 @cache
 def _shipped(name: str) -> Model:
     known = _shipped_by_name()
-    found = known[name][1]() if name in known else _of_a_family(name)
-    assert found is not None  # is_shipped said so
-    return found
+    model = known[name][1]() if name in known else _of_a_family(name)
+    assert model is not None  # is_shipped said so
+    return model
 
 
 @cache
@@ -62,9 +62,9 @@ def _of_a_family(name: str) -> Model | None:
     """Return the member of a family of models that goes by the name; None where none does."""
     for module_name in (m.name for m in pkgutil.iter_modules(__path__) if not m.name.startswith("_")):
         module: Any = importlib.import_module(f"{__name__}.{module_name}")
-        found = module.family(name) if hasattr(module, "family") else None
-        if is_white_box(found):
-            return found
+        member = module.family(name) if hasattr(module, "family") else None
+        if is_white_box(member):
+            return member
     return None
 
 
@@ -162,8 +162,8 @@ def _from_python(path: Path, trust: bool) -> Model:
         raise ModelError("the model file is not there", where=str(path))
     namespace: dict[str, object] = {"__name__": "hvdc_ident_user_model", "__file__": str(path)}
     exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), namespace)
-    found = namespace.get("model")
-    result = found() if callable(found) else found
+    defined = namespace.get("model")
+    result = defined() if callable(defined) else defined
     if not is_white_box(result):
         raise ModelError(
             "the file defines no model",

@@ -373,7 +373,7 @@ def _control_derivatives() -> dict[str, str]:
 
 def _guesses(rated: Rating) -> dict[str, float]:
     """Every state near the steady state of the start values: powers known, dc voltages 1, no reactive power."""
-    found = {"Vc1": 1.0, "Vc2": 1.0, "Idc": rated.power, "xq1": 0.0, "xq2": 0.0, "Vdc1_m_g": 1.0, "Vdc2_m_g": 1.0}
+    guesses = {"Vc1": 1.0, "Vc2": 1.0, "Idc": rated.power, "xq1": 0.0, "xq2": 0.0, "Vdc1_m_g": 1.0, "Vdc2_m_g": 1.0}
     x = 10.0 * rated.Zg / math.sqrt(101.0)
     grid = complex(x / 10.0, x)
     for i, power in ((1, -rated.power), (2, rated.power)):
@@ -385,8 +385,8 @@ def _guesses(rated: Rating) -> dict[str, float]:
         i_dq, turn = i_grid * cmath.exp(-1j * psi), cmath.exp(-1j * psi)
         v_star = (v - complex(R_TRANSFORMER, X_TRANSFORMER + X_ARM) * i_grid) * turn / RATIO
         inner = abs(v) - v_star - 1j * (X_TRANSFORMER + X_ARM) * i_dq
-        found |= {f"Ir{i}": i_dq.real, f"Ii{i}": -i_dq.imag, f"psi{i}": psi, f"xpll{i}": math.pi / 16.0}
-        found |= {f"xd{i}": inner.real, f"xqi{i}": inner.imag, f"fd{i}": abs(v), f"fq{i}": 0.0}
-        found |= {f"Vf{i}": abs(v), f"Vf{i}_s": 0.0, f"Vac{i}_m_g": abs(v), f"Q{i}_m_g": 0.0}
-        found |= {"xv": i_dq.real} if i == 1 else {"xp": power, "P2_m_g": power}
-    return found | {n[:-1] + "f": v for n, v in found.items() if n.endswith("_m_g")}
+        guesses |= {f"Ir{i}": i_dq.real, f"Ii{i}": -i_dq.imag, f"psi{i}": psi, f"xpll{i}": math.pi / 16.0}
+        guesses |= {f"xd{i}": inner.real, f"xqi{i}": inner.imag, f"fd{i}": abs(v), f"fq{i}": 0.0}
+        guesses |= {f"Vf{i}": abs(v), f"Vf{i}_s": 0.0, f"Vac{i}_m_g": abs(v), f"Q{i}_m_g": 0.0}
+        guesses |= {"xv": i_dq.real} if i == 1 else {"xp": power, "P2_m_g": power}
+    return guesses | {n[:-1] + "f": v for n, v in guesses.items() if n.endswith("_m_g")}

@@ -74,63 +74,65 @@ def _parameters(stations: list[str]) -> dict[str, Parameter]:
         return Parameter(value, unit, min=0.0, description=text)
 
     share = len(stations) / 2  # of the link's two capacitances, which its gains are designed for
-    found = {
+    parameters = {
         "KPVDC": at_least_0(24.0 * share, "pu", "proportional gain of the dc voltage control"),
         "KIVDC": at_least_0(734.7 * share, "pu/s", "integral gain of the dc voltage control"),
     }
     for i in stations[1:]:
-        found[f"KPP{i}"] = at_least_0(0.0, "pu", f"proportional gain of the active power control, station {i}")
-        found[f"KIP{i}"] = at_least_0(30.0, "pu/s", f"integral gain of the active power control, station {i}")
+        parameters[f"KPP{i}"] = at_least_0(0.0, "pu", f"proportional gain of the active power control, station {i}")
+        parameters[f"KIP{i}"] = at_least_0(30.0, "pu/s", f"integral gain of the active power control, station {i}")
     for i in stations:
-        found[f"KPQ{i}"] = at_least_0(0.0, "pu", f"proportional gain of the reactive power control, station {i}")
-        found[f"KIQ{i}"] = at_least_0(30.0, "pu/s", f"integral gain of the reactive power control, station {i}")
-        found[f"C{i}"] = at_least_0(0.2, "s", f"dc capacitance of station {i}")
+        parameters[f"KPQ{i}"] = at_least_0(0.0, "pu", f"proportional gain of the reactive power control, station {i}")
+        parameters[f"KIQ{i}"] = at_least_0(30.0, "pu/s", f"integral gain of the reactive power control, station {i}")
+        parameters[f"C{i}"] = at_least_0(0.2, "s", f"dc capacitance of station {i}")
     for a, b in _lines(stations):
-        found[f"Rdc{a}_{b}"] = at_least_0(1 / 4096, "pu", f"dc line resistance between stations {a} and {b}, 1 ohm")
-    found["Zg"] = at_least_0(0.01, "pu", "grid impedance of every station, 10 GVA")
-    found["XR"] = at_least_0(10.0, "", "X/R of the grids")
-    return found
+        parameters[f"Rdc{a}_{b}"] = at_least_0(
+            1 / 4096, "pu", f"dc line resistance between stations {a} and {b}, 1 ohm"
+        )
+    parameters["Zg"] = at_least_0(0.01, "pu", "grid impedance of every station, 10 GVA")
+    parameters["XR"] = at_least_0(10.0, "", "X/R of the grids")
+    return parameters
 
 
 def _inputs(stations: list[str]) -> dict[str, Input]:
-    found = {"Vdcref1": Input(1.0, "pu", "dc voltage set-point of station 1")}
+    inputs = {"Vdcref1": Input(1.0, "pu", "dc voltage set-point of station 1")}
     for i in stations[1:]:
         sign = 1.0 if int(i) % 2 == 0 else -1.0
-        found[f"Pref{i}"] = Input(0.4 * sign, "pu", f"active power set-point of station {i}")
+        inputs[f"Pref{i}"] = Input(0.4 * sign, "pu", f"active power set-point of station {i}")
     for i in stations:
-        found[f"Qref{i}"] = Input(0.0, "pu", f"reactive power set-point of station {i}")
-        found[f"E{i}"] = Input(1.0, "pu", f"grid voltage of station {i}", settable=False)
-        found[f"Iload{i}"] = Input(0.0, "pu", f"dc current drawn at node {i}", settable=False)
-    return found
+        inputs[f"Qref{i}"] = Input(0.0, "pu", f"reactive power set-point of station {i}")
+        inputs[f"E{i}"] = Input(1.0, "pu", f"grid voltage of station {i}", settable=False)
+        inputs[f"Iload{i}"] = Input(0.0, "pu", f"dc current drawn at node {i}", settable=False)
+    return inputs
 
 
 def _nodes(stations: list[str]) -> dict[str, State]:
     """Return the dc voltages of the stations' capacitors."""
-    found = {}
+    nodes = {}
     for i in stations:
         drawn = sp.Add(*(symbol(f"Idc{a}_{b}") * (1 if b == i else -1) for a, b in _lines(stations) if i in (a, b)))
         voltage = symbol(f"Vdc{i}")
         balance = symbol(f"Pdc{i}") / voltage - drawn - symbol(f"Iload{i}")
-        found[voltage.name] = State(balance / symbol(f"C{i}"), guess=1.0, unit="pu")
-    return found
+        nodes[voltage.name] = State(balance / symbol(f"C{i}"), guess=1.0, unit="pu")
+    return nodes
 
 
 def _components(stations: list[str]) -> dict[str, Component]:
     """Return the components of the grid: variables that go by one name in several of them are one."""
     first = {"*": "*", "Vdcref": "Vdcref1", "Vdc": "Vdc1", "Vdc_m": "Vdc1_m", "Irorder": "Irorder1"}
-    found = {
+    components = {
         "grid": _component("grid-impedance", {"*": "*"}, Zg="Zg", XR="XR"),
         "voltage1": _component("vsc-vdc-control", first, KP="KPVDC", KI="KIVDC"),
     }
     for i in stations:
-        found[f"converter{i}"] = _component("vsc-phasor", _numbered(i), R="R", X="X")
-        found[f"reactive{i}"] = _component("vsc-q-control", _numbered(i), KP=f"KPQ{i}", KI=f"KIQ{i}")
+        components[f"converter{i}"] = _component("vsc-phasor", _numbered(i), R="R", X="X")
+        components[f"reactive{i}"] = _component("vsc-q-control", _numbered(i), KP=f"KPQ{i}", KI=f"KIQ{i}")
     for i in stations[1:]:
-        found[f"power{i}"] = _component("vsc-p-control", _numbered(i), KP=f"KPP{i}", KI=f"KIP{i}")
+        components[f"power{i}"] = _component("vsc-p-control", _numbered(i), KP=f"KPP{i}", KI=f"KIP{i}")
     for a, b in _lines(stations):
         ends = {"V": f"Vdc{a}", "V_far": f"Vdc{b}", "I": f"Idc{a}_{b}"}
-        found[f"line{a}_{b}"] = _component("dc-line", ends, R=f"Rdc{a}_{b}")
-    return found
+        components[f"line{a}_{b}"] = _component("dc-line", ends, R=f"Rdc{a}_{b}")
+    return components
 
 
 def _component(source: str, names: Mapping[str, str], **parameters: str) -> Component:
