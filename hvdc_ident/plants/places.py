@@ -23,17 +23,17 @@ def block_signals(
     """
     diagram = _Diagram(model)
     live = diagram.reached_from(moving) & diagram.leading_to(outputs)
-    found = []
+    places = []
     for place in model.insertion_points:
         kind, name = insertion_point(model, place)
         if not any(fnmatchcase(place, p) for p in patterns):
             continue
         if kind == "output":
             if name in outputs:
-                found.append(place)
+                places.append(place)
         elif name in live and diagram.unit(name) and not diagram.is_other_name(name, patterns, live):
-            found.append(place)
-    return tuple(found)
+            places.append(place)
+    return tuple(places)
 
 
 class _Diagram:
@@ -85,8 +85,8 @@ class _Diagram:
         return known and [n for n in self._users()[source.name] if n in live] == [name]
 
     def _users(self) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {}
+        users: dict[str, list[str]] = {}
         for n, used in self._uses.items():
             for name in used:
-                found.setdefault(name, []).append(n)
-        return found
+                users.setdefault(name, []).append(n)
+        return users

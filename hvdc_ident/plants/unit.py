@@ -127,24 +127,24 @@ def _wired(
     models: Mapping[str, Model], connections: Mapping[str, str], played: bool
 ) -> tuple[dict[str, str], FrozenMap[Input]]:
     """Return what each input of the parts follows, and the inputs of the unit that are left. connections: those with the network."""
-    found, inputs = dict(connections), dict[str, Input]()
+    follows, inputs = dict(connections), dict[str, Input]()
     targets = [
-        (n, u, quantity) for n, m in models.items() for u, quantity in m.inputs.items() if f"{n}.{u}" not in found
+        (n, u, quantity) for n, m in models.items() for u, quantity in m.inputs.items() if f"{n}.{u}" not in follows
     ]
     for part, u, quantity in targets:
         sources = _sources(models, part, u)
         if len(sources) > 1:
             raise ModelError(f"'{part}.{u}' may follow several parts", expected="one", got=", ".join(sources))
         if sources:
-            found[f"{part}.{u}"] = f"{sources[0]}.{AHEAD.get(u, u)}"
+            follows[f"{part}.{u}"] = f"{sources[0]}.{AHEAD.get(u, u)}"
         elif played and u == "dwn":
-            found[f"{part}.{u}"] = "bus.dwn" if "dw" in models[part].outputs else METER
+            follows[f"{part}.{u}"] = "bus.dwn" if "dw" in models[part].outputs else METER
         else:
             signal = AHEAD.get(u, u)
-            found[f"{part}.{u}"] = UNCONNECTED.get(signal, signal)
+            follows[f"{part}.{u}"] = UNCONNECTED.get(signal, signal)
             if signal not in UNCONNECTED:
                 inputs.setdefault(signal, quantity)
-    return found, FrozenMap(inputs)
+    return follows, FrozenMap(inputs)
 
 
 def _sources(models: Mapping[str, Model], part: str, u: str) -> list[str]:
@@ -227,16 +227,16 @@ def _references(
 
     uses: of the unit with the references as inputs.
     """
-    found = {}
+    references = {}
     for level, output, unit_of_level, names in REFERENCES:
         acting = _followed(uses, output)
         reference = next((n for n in names if n in inputs and n in acting), None)
         if reference is not None:
-            found[reference] = (level, output, inputs.pop(reference))
+            references[reference] = (level, output, inputs.pop(reference))
             base = machine.values.get("Sn", shelf_model(machine.source).values.get("Sn", 100.0))
             value = LOADED * base if output == "P" else 0.0
             inputs[level] = Input(value, unit_of_level, f"{output} before the event", settable=False)
-    return found
+    return references
 
 
 @lru_cache(maxsize=16)
@@ -247,20 +247,20 @@ def _uses(card: str) -> FrozenMap[Set[str]]:
     """
     model = without_vanished(parse_card(card))
     at = {symbol(n): sp.Float(v) for n, v in model.values.items() if n in model.parameters}
-    found = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in model.states.items()}
-    found |= {n: [s.value] for n, s in model.signals.items()}
-    found |= {n: [a.equation] for n, a in model.algebraic.items()}
-    found |= {n: [o.value] for n, o in model.outputs.items() if n not in found}
-    return FrozenMap({n: {s.name for e in of for s in at_values(e, at).free_symbols} for n, of in found.items()})
+    expressions = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in model.states.items()}
+    expressions |= {n: [s.value] for n, s in model.signals.items()}
+    expressions |= {n: [a.equation] for n, a in model.algebraic.items()}
+    expressions |= {n: [o.value] for n, o in model.outputs.items() if n not in expressions}
+    return FrozenMap({n: {s.name for e in of for s in at_values(e, at).free_symbols} for n, of in expressions.items()})
 
 
 def _followed(uses: Mapping[str, Set[str]], name: str) -> set[str]:
     """Return a name and the names of all that it follows."""
-    found, new = set[str](), {name}
+    followed, new = set[str](), {name}
     while new:
-        found |= new
-        new = {s for n in new for s in uses.get(n, ())} - found
-    return found
+        followed |= new
+        new = {s for n in new for s in uses.get(n, ())} - followed
+    return followed
 
 
 def _network(machine: str, played: bool, step_up: bool) -> dict[str, str]:
@@ -285,13 +285,13 @@ def _network(machine: str, played: bool, step_up: bool) -> dict[str, str]:
 
 
 def _one_that_gives(models: Mapping[str, Model], output: str) -> str:
-    found = [n for n, m in models.items() if output in m.outputs]
-    if len(found) != 1:
-        got = ", ".join(found) or "none"
+    giving = [n for n, m in models.items() if output in m.outputs]
+    if len(giving) != 1:
+        got = ", ".join(giving) or "none"
         raise ModelError(
             "a unit has one part with a current into the network", expected="one machine or converter", got=got
         )
-    return found[0]
+    return giving[0]
 
 
 def _input_line(name: str, quantity: Input) -> str:

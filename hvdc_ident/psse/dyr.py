@@ -98,9 +98,9 @@ class DyrFile:
 
     def at(self, bus: int, machine: str | None = None) -> tuple[DyrRecord, ...]:
         """Return the records of a bus, of all its machines or of one id; ModelError, with those there are, where there is none."""
-        found = tuple(r for r in self.records if r.bus == bus and (machine is None or r.machine == machine.strip()))
-        if found:
-            return found
+        records = tuple(r for r in self.records if r.bus == bus and (machine is None or r.machine == machine.strip()))
+        if records:
+            return records
         ids = list(dict.fromkeys(r.machine for r in self.records if r.bus == bus))
         buses = list(dict.fromkeys(str(r.bus) for r in self.records))
         if ids:
@@ -173,7 +173,7 @@ def _parsed(path: str, content: bytes) -> DyrFile:
         raise ModelError(
             "this is power-flow data", where=path, expected=f"dynamic data (.dyr): {_FORM}", hint="read_raw reads it"
         )
-    lines = [begin] + [found.end() for found in _LINE_END.finditer(text)]
+    lines = [begin] + [match.end() for match in _LINE_END.finditer(text)]
     records: list[DyrRecord] = []
     for pieces, closed in _records(text, begin):
         first = bisect_right(lines, pieces[0].start)

@@ -84,10 +84,10 @@ def start_of(text: str) -> int:
 
 def tokens(text: str, start: int, end: int | None = None) -> Iterator[Word]:
     """Yield the tokens of the text from a place on; blanks are none."""
-    for found in _TOKEN.finditer(text, start, len(text) if end is None else end):
-        kind = found.lastgroup
+    for match in _TOKEN.finditer(text, start, len(text) if end is None else end):
+        kind = match.lastgroup
         if kind is not None:
-            yield Word(kind, found[0], *found.span())  # type: ignore[arg-type]  # the names of the groups are the kinds
+            yield Word(kind, match[0], *match.span())  # type: ignore[arg-type]  # the names of the groups are the kinds
 
 
 def items_of(pieces: list[Word], where: str) -> list[Item]:
@@ -131,10 +131,10 @@ def _value(word: str) -> float | str:
 
 def number_of(word: str) -> float | None:
     """Return the number that a word is, also with Fortran's exponents (1.0D-3, 1.0-3); None for any other word."""
-    found = _NUMBER.fullmatch(word)
-    if found is None:
+    match = _NUMBER.fullmatch(word)
+    if match is None:
         return None
-    number = float(f"{found[1]}e{found[2] or found[3] or 0}")
+    number = float(f"{match[1]}e{match[2] or match[3] or 0}")
     return number if math.isfinite(number) else None
 
 

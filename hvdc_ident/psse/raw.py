@@ -71,24 +71,24 @@ class RawFile:
 
     def bus(self, number: int) -> Bus:
         """Return a bus by its number; ModelError where there is none."""
-        found = next((b for b in self.buses if b.number == number), None)
-        if found is None:
+        bus = next((b for b in self.buses if b.number == number), None)
+        if bus is None:
             raise ModelError(
                 f"no bus {number}",
                 where=self.path,
                 expected=f"the bus {one_of([str(b.number) for b in self.buses], SHOWN)}",
             )
-        return found
+        return bus
 
     def generator(self, bus: int, machine: str | None = None) -> Generator:
         """Return the generator of a bus, by its id where there are several; ModelError, with those there are, where it is not one."""
         there = [g for g in self.generators if g.bus == bus]
-        found = [g for g in there if machine is None or g.id == machine.strip()]
-        if len(found) == 1:
-            return found[0]
+        generators = [g for g in there if machine is None or g.id == machine.strip()]
+        if len(generators) == 1:
+            return generators[0]
         which = f"'{machine}' at bus {bus}" if machine is not None else f"of bus {bus}"
         if there:
-            what = f"{len(found)} generators {which}" if found else f"no generator {which}"
+            what = f"{len(generators)} generators {which}" if generators else f"no generator {which}"
             raise ModelError(what, where=self.path, expected=f"the id {one_of([g.id for g in there], SHOWN)}")
         buses = dict.fromkeys(str(g.bus) for g in self.generators)
         raise ModelError(f"no generator {which}", where=self.path, expected=f"the bus {one_of(list(buses), SHOWN)}")
@@ -278,11 +278,11 @@ def _numbers(buses: Sequence[Bus]) -> Number:
         value = r.get(place)
         if isinstance(value, str):
             squeezed = _squeezed(value)
-            found = named.get(squeezed) or named.get(_without_zeros(squeezed), [])
-            if len(found) == 1:
-                return found[0]
+            numbers = named.get(squeezed) or named.get(_without_zeros(squeezed), [])
+            if len(numbers) == 1:
+                return numbers[0]
             raise ModelError(
-                f"{len(found) or 'no'} buses with the name '{value.strip()}'",
+                f"{len(numbers) or 'no'} buses with the name '{value.strip()}'",
                 where=r.where,
                 expected="one bus with this name (and base voltage in kV)",
             )

@@ -32,10 +32,10 @@ def card_of(name: str) -> Path:
 @cache
 def _sources() -> dict[str, str]:
     """Return the component of each model of .dyr files, by the model's name."""
-    found = {name.upper(): name for name in components()}
+    by_model = {name.upper(): name for name in components()}
     for name in components():
-        found |= dict.fromkeys(_about(name).get("also", ()), name)
-    return found
+        by_model |= dict.fromkeys(_about(name).get("also", ()), name)
+    return by_model
 
 
 def source_of(model: str) -> str | None:
