@@ -222,5 +222,5 @@ def function_of(head: Any) -> GrammarFunction | None:
 
 def elementary(head: Any) -> GrammarFunction | None:
     """Function with derivatives of its own whose applications are of a class of sympy; None where there is none."""
-    found = function_of(head)
-    return found if found is not None and found.slopes is not None else None
+    function = function_of(head)
+    return function if function is not None and function.slopes is not None else None

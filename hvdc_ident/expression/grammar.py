@@ -77,7 +77,7 @@ class Source:
 
 def tokens(source: Source) -> list[Token]:
     """Return the tokens of the text, closed by one of kind "end"."""
-    text, found, at = source.text, list[Token](), 0
+    text, parts, at = source.text, list[Token](), 0
     if len(text) > MAX_LENGTH:
         got = f"{len(text)}"
         raise ExpressionError(
@@ -88,14 +88,14 @@ def tokens(source: Source) -> list[Token]:
         if match is None:
             source.fail(_stray(text, at), at)
         if match.lastgroup != "space":
-            found.append(Token(str(match.lastgroup), match.group(), at))
+            parts.append(Token(str(match.lastgroup), match.group(), at))
         at = match.end()
         if match.lastgroup == "number" and at < len(text) and (text[at].isalnum() or text[at] in "_."):
             source.fail(f"'{text[at]}' cannot follow the number {match.group()[:30]}", at)
-        if len(found) > MAX_TOKENS:
+        if len(parts) > MAX_TOKENS:
             source.fail(f"the expression has over {MAX_TOKENS} parts", at)
-    found.append(Token("end", "the end", len(text)))
-    return found
+    parts.append(Token("end", "the end", len(text)))
+    return parts
 
 
 def _stray(text: str, at: int) -> str:
@@ -132,9 +132,9 @@ _CHOICES = (r"(?P<a>.+?)\bif\b(?P<c>.+?)\belse\b(?P<b>.+)", r"(?P<c>.+?)\?(?P<a>
 def _instead(word: str, text: str) -> str:
     """Return how a choice of another language is written: this one, where it is the whole text."""
     for pattern in _CHOICES if len(text) <= 200 else ():
-        found = re.fullmatch(pattern, text.strip())
-        if found and not re.search(r"\b(if|and|or|not)\b|[?&|!]", "".join(found.groups())):
-            return f"write where({found['c'].strip()}, {found['a'].strip()}, {found['b'].strip()})"
+        match = re.fullmatch(pattern, text.strip())
+        if match and not re.search(r"\b(if|and|or|not)\b|[?&|!]", "".join(match.groups())):
+            return f"write where({match['c'].strip()}, {match['a'].strip()}, {match['b'].strip()})"
     return _WORDS[_MARKS.get(word, word)]
 
 
@@ -146,13 +146,13 @@ class SyntaxTree:
     """
 
     def __init__(self, source: Source) -> None:
-        found = tokens(source)
-        if len(found) == 1:
+        parts = tokens(source)
+        if len(parts) == 1:
             raise ExpressionError("the expression is empty", where=source.where)
-        _Scan(source).run(found)
-        marks = [t.text if t.kind == "mark" else "_" for t in found[:-1]]
+        _Scan(source).run(parts)
+        marks = [t.text if t.kind == "mark" else "_" for t in parts[:-1]]
         starts = accumulate((len(m) + 1 for m in marks), initial=0)
-        self._begins = dict(zip(starts, found, strict=True))
+        self._begins = dict(zip(starts, parts, strict=True))
         self.root: ast.expr = ast.parse(" ".join(marks), mode="eval").body
 
     def token(self, node: ast.expr) -> Token:
@@ -185,10 +185,10 @@ class _Scan:
         self.compared = False
         self.before = ""
 
-    def run(self, found: list[Token]) -> None:
+    def run(self, parts: list[Token]) -> None:
         """Raise an ExpressionError at the first token that cannot stand where it does."""
         before, value_due = Token("start", "", 0), True
-        for token, following in pairwise((*found, found[-1])):
+        for token, following in pairwise((*parts, parts[-1])):
             self.before = before.text
             if token.text == "(" and before.kind == "name":
                 self._open(token, call=True, lists=before.text == "table")

@@ -76,11 +76,11 @@ def parse_card(text: str, where: str = "model card", inside: tuple[Path, ...] = 
 
 def _line(text: str, error: InputError) -> str:
     """Return ", line N" of the component or connection that an error is about; empty for another."""
-    found = re.match(r"\[?components\.([^\].]+)|\[connections\] '([^']+)'|connections\.(.+)", error.where)
-    if found is None:
+    match = re.match(r"\[?components\.([^\].]+)|\[connections\] '([^']+)'|connections\.(.+)", error.where)
+    if match is None:
         return ""
-    key = re.escape(found[1] or found[2] or found[3])
-    begin = rf"\s*\[components\.{key}[.\]]|\s*{key}\s*=" if found[1] else rf"\s*[\"']?{key}[\"']?\s*="
+    key = re.escape(match[1] or match[2] or match[3])
+    begin = rf"\s*\[components\.{key}[.\]]|\s*{key}\s*=" if match[1] else rf"\s*[\"']?{key}[\"']?\s*="
     lines = text.splitlines()
     return next((f", line {n}" for n, line in enumerate(lines, 1) if re.match(begin, line)), "")
 

@@ -298,12 +298,12 @@ def used_names(model: Model) -> frozenset[str]:
 
 def reached(begin: Iterable[str], onwards: Callable[[str], Iterable[str]]) -> Iterator[str]:
     """Yield the names that some lead to step by step, these included, each once. onwards: the names that one leads to at once."""
-    found: set[str] = set()
+    seen: set[str] = set()
     left = list(begin)
     while left:
         name = left.pop()
-        if name not in found:
-            found.add(name)
+        if name not in seen:
+            seen.add(name)
             yield name
             left.extend(onwards(name))
 

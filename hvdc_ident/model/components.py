@@ -140,10 +140,10 @@ def _names(component: str, part: Component) -> dict[str, str]:
                 return new.replace("*", n[len(head) : len(n) - len(tail)])
         return f"{component}.{n}"
 
-    found = {n: called(n) for n in known} | {n: f"{called(state)}_start" for n, state in starts.items()}
+    names = {n: called(n) for n in known} | {n: f"{called(state)}_start" for n, state in starts.items()}
     for n in variables:
-        check_name(found[n], f"the name of '{n}'")
-    return found
+        check_name(names[n], f"the name of '{n}'")
+    return names
 
 
 def _written(part: Component) -> dict[str, sp.Expr]:

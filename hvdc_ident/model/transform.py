@@ -201,13 +201,13 @@ def blended(model: Model) -> tuple[Model, str]:
 
 def insertion_point_of(points: Collection[str], name: str) -> str:
     """Return the insertion point among these that `rewritten` made the name at; the name itself where it is one of them."""
-    found = name
-    while found not in points:
-        base = max(found.rpartition("_before_")[0], found.rpartition("_after_")[0], key=len)
+    point = name
+    while point not in points:
+        base = max(point.rpartition("_before_")[0], point.rpartition("_after_")[0], key=len)
         if not base:
             return name
-        found = base
-    return found
+        point = base
+    return point
 
 
 def _inserted(signals: FrozenMap[Signal], name: str, before: str, value: Signal) -> FrozenMap[Signal]:

@@ -54,8 +54,8 @@ class Ending:
     def frames(self) -> Iterator[tuple[str, int, str]]:
         """Yield file, line and function of each frame, innermost first."""
         for line in self.traces.splitlines():
-            if found := FRAME.match(line):
-                yield found["file"], int(found["line"]), found["name"]
+            if match := FRAME.match(line):
+                yield match["file"], int(match["line"]), match["name"]
 
 
 class ChildEndedError(Exception):

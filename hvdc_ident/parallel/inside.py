@@ -313,13 +313,13 @@ def _kill_group(pid: int) -> None:
 
 def _peaks(pid: int) -> tuple[int, int]:
     """The most bytes of address space and of memory that a process has had; 0 where the system does not tell."""
-    found = {"VmPeak": 0, "VmHWM": 0}
+    peaks = {"VmPeak": 0, "VmHWM": 0}
     with contextlib.suppress(OSError), open(f"/proc/{pid}/status", encoding="ascii", errors="replace") as lines:
         for line in lines:
             name, _, rest = line.partition(":")
-            if name in found:
-                found[name] = int(rest.split()[0]) * 1024
-    return found["VmPeak"], found["VmHWM"]
+            if name in peaks:
+                peaks[name] = int(rest.split()[0]) * 1024
+    return peaks["VmPeak"], peaks["VmHWM"]
 
 
 def _parent_of(pid: int) -> int:

@@ -102,9 +102,9 @@ class _Items:
         if not self.left:
             return -1, None
         assert self._next is not None
-        found, self._next = self._next, None
+        item, self._next = self._next, None
         self._count -= 1
-        return found
+        return item
 
     def __length_hint__(self) -> int:
         return max(0, self._count)
