@@ -33,16 +33,16 @@ def moved(name: str) -> str | None:
 
 def current(verb: str, arguments: tuple[Any, ...], named: Mapping[str, Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """Return the arguments of a call under their names of now, in their order of now."""
-    found = dict(named)
+    given = dict(named)
     for old, new in ARGUMENTS.get(verb, {}).items():
-        if old in found:
+        if old in given:
             warn(f"{verb}({old}=...)", f"{verb}({new}=...)")
-            found[new] = found.pop(old)
+            given[new] = given.pop(old)
     if verb == "sweep" and len(arguments) > 1 and _are_points(arguments[1]):
         warn("sweep(model, parameters, data)", "sweep(model, data, parameters)")
         model, points, *data = arguments
-        return (model, *data), {"parameters": points, **found}
-    return arguments, found
+        return (model, *data), {"parameters": points, **given}
+    return arguments, given
 
 
 def _are_points(given: Any) -> bool:

@@ -410,8 +410,8 @@ def sensitivities(
     --------
     >>> import numpy as np, hvdc_ident as hi
     >>> t = np.linspace(0.0, 0.5, 51)
-    >>> found = hi.sensitivities("vsc-hvdc-link", t, "KIVDC", inputs={"Vdcref1": hi.step(1.0, 1.019, at=0.1)}, outputs="Irorder1")
-    >>> found.trajectories is not None
+    >>> result = hi.sensitivities("vsc-hvdc-link", t, "KIVDC", inputs={"Vdcref1": hi.step(1.0, 1.019, at=0.1)}, outputs="Irorder1")
+    >>> result.trajectories is not None
     True
     """
     import numpy as np
@@ -688,9 +688,9 @@ def fit(
             return fit_of(model, seed=seed, executor=pool, progress=told, **settings)
         study = _asked(study_of(model, data, parameters, fit=settings), "fit")
         fitting.need(study, "fit")
-        found = report or judged(study, seed=seed, executor=pool, progress=told)
+        identified = report or judged(study, seed=seed, executor=pool, progress=told)
         forced = names_of(force, "parameter") or ()
-        return fitting.estimated(study, found, force=forced, seed=seed, executor=pool, progress=told)
+        return fitting.estimated(study, identified, force=forced, seed=seed, executor=pool, progress=told)
 
 
 @_verb
@@ -757,8 +757,8 @@ def diagnose(
     ...     y = hi.simulate(plant, t, inputs=step)["y"] + 0.005 * noise.standard_normal(t.size)
     ...     return hi.Experiment(t, name, inputs=step, outputs={"y": y})
     >>> records = [record("up", 1.0), record("down", -0.5)]
-    >>> found = hi.diagnose(lag, records, {"T": (0.1, 10.0), "k": (0.1, 10.0)}, effects=["delay", "gain"])
-    >>> found.verdict, found.effects[0].effect, len(found.findings[0].places)  # at u or at y: these records cannot tell
+    >>> diagnosis = hi.diagnose(lag, records, {"T": (0.1, 10.0), "k": (0.1, 10.0)}, effects=["delay", "gain"])
+    >>> diagnosis.verdict, diagnosis.effects[0].effect, len(diagnosis.findings[0].places)  # at u or at y: these records cannot tell
     ('named', 'delay', 2)
     """
     from hvdc_ident.study.assemble import names_of, study_of
@@ -771,8 +771,8 @@ def diagnose(
     study = _asked(study_of(model, data, parameters, diagnose={**settings, **tried}), "diagnose")
     need(study, "diagnose")
     with _open(executor) as pool, _told(progress, "diagnose") as told:
-        found = report or judged(study, seed=seed, executor=pool, progress=told)
-        return diagnosed(study, found, seed=seed, executor=pool, progress=told)
+        identified = report or judged(study, seed=seed, executor=pool, progress=told)
+        return diagnosed(study, identified, seed=seed, executor=pool, progress=told)
 
 
 @_verb
@@ -866,15 +866,15 @@ def export(
     from hvdc_ident.study.assemble import is_study, model_of, subject_of, values_of
     from hvdc_ident.study.export import write
 
-    found: Any = source if isinstance(source, LinearModel) else subject_of(source)
+    subject: Any = source if isinstance(source, LinearModel) else subject_of(source)
     if values is not None and not isinstance(values, str):
-        plant = model_of(found)
-        found, values = plant.with_values(values_of(values, plant)), None
-    if not (is_study(found) or isinstance(found, Model | LinearModel)):
+        plant = model_of(subject)
+        subject, values = plant.with_values(values_of(values, plant)), None
+    if not (is_study(subject) or isinstance(subject, Model | LinearModel)):
         from hvdc_ident.linearize import linearize as linear_model
 
-        found = linear_model(found)
-    return write(found, path, linear, fmu, values, folder).path
+        subject = linear_model(subject)
+    return write(subject, path, linear, fmu, values, folder).path
 
 
 def _are_times(data: Any) -> bool:

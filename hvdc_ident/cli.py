@@ -117,9 +117,9 @@ def _new_unit(folder: Path, recordings: list[Path], model: str | None, unit: Pss
     return new_unit_study(folder, recordings, UnitAsked(**vars(unit)))
 
 
-def _tell_new(console: Console, found: NewStudy) -> None:
-    console.print_json(found.to_dict())
-    console.say(*replace(found, door="shell").lines)
+def _tell_new(console: Console, study: NewStudy) -> None:
+    console.print_json(study.to_dict())
+    console.say(*replace(study, door="shell").lines)
 
 
 def check(
@@ -150,9 +150,9 @@ def check(
         raise InputError("--find, --all and --compile are about an FMU", where=str(study), expected="a path to an .fmu")
     from hvdc_ident.study.summary import Summary
 
-    found = Summary.of(access.study(study), seed)
-    console.print_json(found.to_dict())
-    console.say(*(pasteable(line, study, out, access) for line in str(found).splitlines()))
+    summary = Summary.of(access.study(study), seed)
+    console.print_json(summary.to_dict())
+    console.say(*(pasteable(line, study, out, access) for line in str(summary).splitlines()))
 
 
 def _check_fmu(
@@ -177,15 +177,16 @@ def _check_fmu(
 
         path = compile_fmu(path)
         console.say(f"compiled: {path} is written; name it in the study's [model] source")
-    found = read_capabilities(path)
-    found = found if found.problem else tested_capabilities(load_model(path, limits=limits), found)  # type: ignore[arg-type]
-    shown = found.matching(find) if find else found
+    capabilities = read_capabilities(path)
+    if not capabilities.problem:
+        capabilities = tested_capabilities(load_model(path, limits=limits), capabilities)  # type: ignore[arg-type]
+    shown = capabilities.matching(find) if find else capabilities
     console.print_json(shown.to_dict())
     listed = shown.text(None) if every else shown.text()
     console.say(listed)
     if listed != shown.text(None):
         console.say("", "--all shows every variable, --find TEXT those with TEXT in them")
-    if found.problem:
+    if capabilities.problem:
         load_model(path)  # raises, with the way out
 
 
@@ -263,11 +264,11 @@ def compare(
         raise InputError(
             "--open has no page to open", where="the command line", hint="--out DIR, which writes the page"
         )
-    found = compare_runs(first, second)
-    console.print_json(found.to_dict())
-    console.say(*found.lines)
+    comparison = compare_runs(first, second)
+    console.print_json(comparison.to_dict())
+    console.say(*comparison.lines)
     if out is not None:
-        page = write_text(out / "compare.html", found.page)
+        page = write_text(out / "compare.html", comparison.page)
         console.say(f"page: {page}")
         if open_:
             open_page(page)
@@ -349,9 +350,9 @@ def convert(
     if to is None:
         if window is not None:
             raise InputError("--window cuts what --to writes", where="the command line", hint="--to FILE.csv beside it")
-        found = list_signals(data, search or "")
-        console.print_json({"schema": 1, "signals": [{"name": n, "unit": u} for n, u in found]})
-        console.say("\n".join(f"{n} [{u}]" if u else n for n, u in found) or "no such signal")
+        signals = list_signals(data, search or "")
+        console.print_json({"schema": 1, "signals": [{"name": n, "unit": u} for n, u in signals]})
+        console.say("\n".join(f"{n} [{u}]" if u else n for n, u in signals) or "no such signal")
         return
     written = to_csv(data, to, signal, window)
     gaps = {n: k for n in written.names if (k := written.gaps(n))}

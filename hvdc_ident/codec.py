@@ -39,8 +39,7 @@ class Coded:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as JSON holds it: full precision, None for a number that is not finite."""
-        found: dict[str, Any] = plain_fields(self)
-        return found
+        return plain_fields(self)
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
@@ -93,14 +92,14 @@ def _plain_dataclass(value: Any) -> Any:
 
 def plain_fields(value: Any) -> dict[str, Any]:
     """Return the fields of a dataclass, and its stored properties, under their keys."""
-    found: dict[str, Any] = {}
+    by_key: dict[str, Any] = {}
     for f in fields(value):
         own, key = getattr(value, f.name), _key(f)
         if f.metadata.get("inline"):
-            found |= plain(own)
+            by_key |= plain(own)
         elif key and not (f.metadata.get("optional") and _empty(own)):
-            found[key] = plain(own)
-    return found | {name: plain(getattr(value, name)) for name in getattr(value, "stored_properties", ())}
+            by_key[key] = plain(own)
+    return by_key | {name: plain(getattr(value, name)) for name in getattr(value, "stored_properties", ())}
 
 
 def read_fields(kind: type[T], data: Any) -> T:
@@ -251,11 +250,11 @@ def _expect(right: bool, value: Any, expected: str) -> Any:
 @cache
 def _annotations(kind: type) -> dict[str, Any]:
     """Return the annotations of the fields of a dataclass that are read, each in the names of the module that states it."""
-    found: dict[str, Any] = {}
+    by_field: dict[str, Any] = {}
     read = {f.name for f in fields(kind) if f.init and _key(f)}
     for owner in reversed(kind.__mro__):
         names = vars(sys.modules[owner.__module__])
         for name, told in vars(owner).get("__annotations__", {}).items():
             if name in read:
-                found[name] = eval(told, dict(names)) if isinstance(told, str) else told
-    return found
+                by_field[name] = eval(told, dict(names)) if isinstance(told, str) else told
+    return by_field

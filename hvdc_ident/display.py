@@ -89,10 +89,10 @@ class Shown:
     @property
     def lines(self) -> list[str]:
         """The screen as lines, which are as long as they are."""
-        found: list[str] = []
+        lines: list[str] = []
         for block in self._screen():
-            found += [*str(block).splitlines(), ""] if str(block) else []
-        return found[:-1]
+            lines += [*str(block).splitlines(), ""] if str(block) else []
+        return lines[:-1]
 
     def __repr__(self) -> str:
         first = next((text for text in map(str, self._screen()) if text), "")

@@ -97,8 +97,8 @@ def _tell_run(
     from hvdc_ident.summary import Results
 
     seed = done[0].data["seed"] if done else 0
-    found = {d.stage.name: d.data for d in done}
-    console.print_json({**heading_of(study, seed), "stages": found, "report": "report.html"})
+    by_stage = {d.stage.name: d.data for d in done}
+    console.print_json({**heading_of(study, seed), "stages": by_stage, "report": "report.html"})
     console.say(*map(typed, run_lines(done, Results(folder).summary if done else None, truth)))
     console.say(f"report: {folder / 'report.html'}")
     if opens:

@@ -149,7 +149,7 @@ def folded(text: str, width: int) -> str:
 def _folded(line: str, width: int) -> str:
     if len(line) <= width or re.search(r"\S {2,}\S.*\S {2,}\S", line):
         return line
-    kept = _COMMAND.sub(lambda found: found[0].replace(" ", "\0"), line)
+    kept = _COMMAND.sub(lambda match: match[0].replace(" ", "\0"), line)
     settings = {"break_long_words": False, "break_on_hyphens": False}
     return textwrap.fill(kept, width, subsequent_indent="  ", **settings).replace("\0", " ")  # type: ignore[arg-type]
 
@@ -174,7 +174,7 @@ def one_of(names: Sequence[str], most: int = 4) -> str:
 def with_study(text: str, study: str, *options: str) -> str:
     """Return the text with every "hvdc-ident COMMAND STUDY" in it made a command to paste, with this study and these options."""
     typed = shlex.join([study, *options])
-    return re.sub(r"(hvdc-ident [a-z]+) STUDY\b", lambda found: f"{found[1]} {typed}", text)
+    return re.sub(r"(hvdc-ident [a-z]+) STUDY\b", lambda match: f"{match[1]} {typed}", text)
 
 
 class ValueAtPlace(Protocol):

@@ -254,7 +254,7 @@ def validated(kind: type[Table], table: dict[str, Any], where: str, error: type[
 
 def _told(problem: Mapping[str, Any]) -> tuple[str, str, str, str]:
     """Return what is wrong, what was expected, what was found and what to try."""
-    kind, found, ctx = problem["type"], problem["input"], problem.get("ctx") or {}
+    kind, got, ctx = problem["type"], problem["input"], problem.get("ctx") or {}
     if kind == "unknown_key":
         near = nearest(ctx["key"], ctx["known"])
         meant = f"did you mean {' or '.join(repr(n) for n in near)}?" if near else ""
@@ -265,20 +265,20 @@ def _told(problem: Mapping[str, Any]) -> tuple[str, str, str, str]:
         text, _, hint = str(ctx["error"]).partition(". Try: ")
         return text, "", "", hint
     if kind == "wrong":
-        return ctx["what"], ctx["expected"], shown(found), ctx["hint"]
+        return ctx["what"], ctx["expected"], shown(got), ctx["hint"]
     what = "a value of the wrong kind" if kind.endswith("_type") else "a value that does not fit"
     expected, hint = EXPECTED.get(kind, kind.replace("_", " ")).format(**ctx), ""
     if kind == "literal_error":
         expected = expected.replace(" or ", ", ")
-    if kind == "float_type" and hasattr(found, "isoformat"):  # a date or time of day of TOML
+    if kind == "float_type" and hasattr(got, "isoformat"):  # a date or time of day of TOML
         hint = "a time in s, as the time in the data counts"
     if kind == "string_pattern_mismatch":
         is_file = "\\w" in ctx["pattern"]
         expected = "letters, digits, blanks and - + . _ only, for files are named after it"
         expected = expected if is_file else "a name without control characters"
-        if not is_file and re.search(r"[\t\n\r\f\b]", found):
+        if not is_file and re.search(r"[\t\n\r\f\b]", got):
             hint = "a path in single quotes or with /: in double quotes \\t is a tab and \\n a line break"
-    return what, expected, shown(found), hint
+    return what, expected, shown(got), hint
 
 
 def _is_branch(part: int | str) -> bool:
