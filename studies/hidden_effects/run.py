@@ -18,7 +18,7 @@ HERE = Path(__file__).resolve().parent
 if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
-from hidden.cases import PARTS, Design, designs, factorial, made  # noqa: E402
+from hidden.cases import ASKED, PARTS, Design, designs, factorial, made  # noqa: E402
 from hidden.judging import summary  # noqa: E402
 from hidden.plants import FIRST, PLANTS  # noqa: E402
 from hidden.reporting import report  # noqa: E402
@@ -27,8 +27,12 @@ SEED = 42
 """Of the reported cases. Thresholds were settled on others (--seed 1)."""
 
 
-def one(design: Design, seed: int, sindy: bool = False) -> dict[str, Any]:
-    """Return the line of one case: generated, diagnosed, compared."""
+def one(design: Design, seed: int, sindy: bool = False, budget: float | None = None) -> dict[str, Any]:
+    """Return the line of one case: generated, diagnosed, compared. budget: of the diagnosis, s; None: no limit."""
+    return _line(design, seed, sindy, budget) | {"budget": budget}
+
+
+def _line(design: Design, seed: int, sindy: bool, budget: float | None) -> dict[str, Any]:
     from hidden.diagnosing import diagnosed
 
     begin = time.perf_counter()
@@ -44,7 +48,7 @@ def one(design: Design, seed: int, sindy: bool = False) -> dict[str, Any]:
                 "unreachable": True,
             }
         making = time.perf_counter() - begin
-        return diagnosed(case, seed=design.number, sindy=sindy) | {"making": making}
+        return diagnosed(case, seed=design.number, sindy=sindy, budget=budget) | {"making": making}
     except Exception:  # a mistake in the program: a line of its own, and the others go on
         told: dict[str, Any] = {
             "case": design.name,
@@ -83,23 +87,30 @@ def pending(
     done: set[str],
     full: bool = False,
     least: float = 0.0,
-    plants: Sequence[str] = FIRST,
+    plants: Sequence[str] | None = None,
     messy: Sequence[bool] = (False,),
 ) -> Iterator[Design]:
     """Return the cases still to be done, the parts in turn, so that an early stop has cases of each.
 
     limit: of each part, of each kind of records, and of the first two plants and each of the others; least: size of a hidden
-    effect. messy: which records.
+    effect. plants: None: the first two, of the part `value` all. messy: which records.
     """
-    groups = [
-        group for group in (tuple(p for p in plants if p in FIRST), *((p,) for p in plants if p not in FIRST)) if group
-    ]
-    every = [factorial(seed)] if full else [designs(p, seed, g, m) for m in messy for g in groups for p in parts]
+    every = [factorial(seed)]
+    if not full:
+        every = [designs(p, seed, g, m) for m in messy for p, g in _groups(parts, plants)]
     tables = [[d for d in table if d.size >= least or d.part == "clean"][:limit] for table in every]
     shares = [(k / len(t), n, d) for n, t in enumerate(tables) for k, d in enumerate(t)]
     for _, _, design in sorted(shares, key=lambda s: s[:2]):
         if design.name not in done:
             yield design
+
+
+def _groups(parts: Sequence[str], plants: Sequence[str] | None) -> list[tuple[str, tuple[str, ...]]]:
+    """Return each part with the plants that share its designs: the first two, then each of the others with all parts in turn."""
+    chosen = {p: plants or (tuple(PLANTS) if p == "value" else FIRST) for p in parts}
+    groups = [FIRST, *((p,) for p in PLANTS if p not in FIRST)]
+    each = [(part, tuple(p for p in group if p in chosen[part])) for group in groups for part in parts]
+    return [(part, group) for part, group in each if group]
 
 
 def numbered(text: str) -> list[str]:
@@ -114,17 +125,16 @@ def numbered(text: str) -> list[str]:
 def main(arguments: list[str] | None = None) -> dict[str, Any]:
     """Return the summary; results are kept line by line, and a second call resumes the first."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=[p for p in PARTS if p != "triple"])
+    parser.add_argument("--parts", nargs="+", choices=list(PARTS), default=[p for p in PARTS if p not in ASKED])
     plants = ", ".join(f"{k} {n}" for k, n in enumerate(PLANTS, start=1))
-    parser.add_argument(
-        "--plants", type=numbered, default=list(FIRST), help=f"numbers of plants: {plants}; default 1,2"
-    )
+    parser.add_argument("--plants", type=numbered, help=f"numbers of plants: {plants}; default 1,2, of part value all")
     parser.add_argument(
         "--messy", choices=("no", "yes", "both"), nargs="?", const="yes", default="no", help="which records"
     )
     parser.add_argument("--limit", type=int, help="cases of each part at most")
     parser.add_argument("--least", type=float, default=0.0, help="leave out smaller effects, by their size in units")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--budget", type=float, metavar="SECONDS", help="of each diagnosis (default: no limit)")
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--out", type=Path, help="folder of the results (default: seed-SEED-results beside this file)")
     parser.add_argument("--judge-only", action="store_true", help="summarise what is there")
@@ -136,6 +146,12 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     path = out / "cases.jsonl"
     done = lines(path)
     if not asked.judge_only:
+        others = {x.get("budget") for x in done.values()} - {asked.budget}
+        if others:
+            parser.error(
+                f"--budget: {path} has cases with a budget of {_said(others)}, asked was {_said({asked.budget})}; "
+                "give that budget to go on there, or another folder with --out"
+            )
         messy = {"no": (False,), "yes": (True,), "both": (False, True)}[asked.messy]
         asked_for = asked.limit, set(done), asked.full, asked.least, asked.plants, messy
         todo = list(pending(asked.parts, asked.seed, *asked_for))
@@ -148,6 +164,10 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     return found
 
 
+def _said(budgets: set[float | None]) -> str:
+    return " and ".join("no limit" if b is None else f"{b:g} s" for b in budgets)
+
+
 def _work(todo: list[Design], asked: argparse.Namespace, path: Path, before: int) -> None:
     """Append each case's line to the file as soon as it is finished."""
     if path.exists() and path.read_bytes()[-1:] not in (b"\n", b""):
@@ -157,7 +177,7 @@ def _work(todo: list[Design], asked: argparse.Namespace, path: Path, before: int
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(asked.workers, mp_context=context) as pool, path.open("a", encoding="utf-8") as stream:
-        jobs = {pool.submit(one, d, asked.seed, asked.sindy): d for d in todo}
+        jobs = {pool.submit(one, d, asked.seed, asked.sindy, asked.budget): d for d in todo}
         for k, job in enumerate(as_completed(jobs), start=1):
             line = job.result()
             stream.write(json.dumps(line) + "\n")

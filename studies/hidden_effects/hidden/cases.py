@@ -20,6 +20,7 @@ from hidden.plant import INTERVAL
 from hidden.plants import FIRST, PLANTS
 from hidden.simulator import Hidden, Run, simulate
 from hidden.sizes import UNIT, Nominal, needs_source, nominal, sized, units
+from hidden.values import Value, misstated
 
 Array = NDArray[np.floating]
 SIZES = (1.0, 3.0, 10.0, 30.0)
@@ -32,10 +33,12 @@ LOUDNESS = (math.log(2e-3), math.log(2e-2))
 """Of the noise: its standard deviation in shares of an output's range, as logarithms."""
 FED_BACK = ("coupling", "droop")
 """Effects that a plant's own list of feedbacks places in every second case."""
-PARTS = {"single": 357, "pair": 60, "clean": 400, "outside": 50, "left-out": 60, "triple": 40}
+PARTS = {"single": 357, "pair": 60, "clean": 400, "outside": 50, "left-out": 60, "triple": 40, "value": 20}
 """How many cases each part has, of the first two plants together."""
-MORE = {"single": 160, "pair": 30, "clean": 200, "outside": 25, "left-out": 30, "triple": 20}
+MORE = {"single": 160, "pair": 30, "clean": 200, "outside": 25, "left-out": 30, "triple": 20, "value": 10}
 """How many each part has of every other plant."""
+ASKED = ("triple", "value")
+"""Parts that run only where they are asked for."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,8 @@ class Case:
     records, clean: (rows, 3, outputs), all outputs; clean: without noise. channels: the recorded ones. sigma: (outputs,) of
     the noise, with that of the quantisation of messy records. told: the stated standard deviation, or None. given: the
     parameters that a user would start from. units: the total size of the hidden effects, of messy records in units of the
-    mess as well. tries: number of insertion points drawn until an effect of this size was possible.
+    mess as well. tries: number of insertion points drawn until an effect of this size was possible. value: what the card states
+    wrong, if anything; its size and draws are those that count then.
     """
 
     design: Design
@@ -86,6 +90,7 @@ class Case:
     runs: tuple[Run, Run, Run]
     units: float
     tries: int
+    value: Value | None = None
 
     @property
     def times(self) -> Array:
@@ -125,7 +130,7 @@ def _designs(part: str, rng: np.random.Generator, count: int, plants: Sequence[s
     known = [n for n in CATALOGUE if n != "inductance" or any(PLANTS[p].resistance[0] for p in plants)]
     if all(PLANTS[p].servos for p in plants):
         known += OF_STATES
-    names = {"outside": list(OUTSIDE), "clean": [""]}.get(part, known)
+    names = {"outside": list(OUTSIDE), "clean": [""], "value": [""]}.get(part, known)
     each = -(-count // len(names))
     tables = {name: _balanced(rng, each, part, plants) for name in names}
     for number in range(count):
@@ -185,7 +190,7 @@ def _balanced(rng: np.random.Generator, count: int, part: str, plants: Sequence[
 
 
 def made(design: Design, seed: int) -> Case | None:
-    """Return the case; None if the effect cannot reach the size of the design at any of TRIES insertion points."""
+    """Return the case; None if none of TRIES insertion points, or wrong values, reaches the size of the design."""
     key = [seed, list(PARTS).index(design.part), design.number]
     rng = np.random.default_rng([*key, 7])
     base = nominal(design.plant, design.excitation, design.variant)
@@ -200,16 +205,25 @@ def made(design: Design, seed: int) -> Case | None:
         channels = tuple(k for k in channels if k != lost)
     kind = design.noise if design.noise in KINDS else "ar" if design.noise == "told-white" else "white"
     unit = 1.0
-    if design.messy and design.effects:
+    if design.messy and (design.effects or design.part == "value"):
         alone = mess.recorded(plant, base.runs, [], extent, [*key, 8])
         unit = math.hypot(1.0, float(units(base, alone[:, :2, None], sigma, kind, channels)[0]) / MESS)
-    drawn = _drawn(design, base, sigma, kind, channels, key, rng, unit)
-    if drawn is None:
-        return None
-    hidden, clean, size, tries = drawn
+    hidden: list[Hidden] = []
+    value, runs = None, base.runs
+    if design.part == "value":
+        wrong = misstated(base, design.size * unit, sigma, kind, channels, rng, TRIES)
+        if wrong is None:
+            return None
+        value, clean, size, tries = wrong
+        size, runs = size / unit, value.truly(runs)
+    else:
+        drawn = _drawn(design, base, sigma, kind, channels, key, rng, unit)
+        if drawn is None:
+            return None
+        hidden, clean, size, tries = drawn
     if design.messy:
         hidden = mess.on_coarse_steps(plant, hidden)
-        clean = mess.recorded(plant, base.runs, hidden, extent, [*key, 8])
+        clean = mess.recorded(plant, runs, hidden, extent, [*key, 8])
         if not np.isfinite(clean).all():
             return None
     event = round(EVENT / INTERVAL)
@@ -219,7 +233,7 @@ def made(design: Design, seed: int) -> Case | None:
         records = mess.quantised(records, levels)
     given = {n: plant.parameters[n] * float(np.exp(rng.uniform(-0.25, 0.25))) for n in plant.fitted}
     told = _told(design, sigma)
-    return Case(design, tuple(hidden), records, clean, channels, sigma, told, given, base.runs, size, tries)
+    return Case(design, tuple(hidden), records, clean, channels, sigma, told, given, runs, size, tries, value)
 
 
 def _drawn(

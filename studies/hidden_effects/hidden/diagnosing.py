@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from hidden.plants import PLANTS
 from hidden.sizes import UNIT, WIDTH, on_jumps
 from hvdc_ident import simulate
 from hvdc_ident.data import Experiment, InputSignal, Trajectory
-from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.effects import EffectUse, apply_effects, effects
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.fit import FitParameter, Problem, fit
@@ -64,10 +65,10 @@ def free_of(case: Case) -> tuple[FitParameter, ...]:
     return tuple(FitParameter(n, v, true[n] / WIDTH, true[n] * WIDTH) for n, v in case.given.items())
 
 
-def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
+def diagnosed(case: Case, seed: int = 0, sindy: bool = False, budget: float | None = None) -> dict[str, Any]:
     """Return one line: the design, the truth, the diagnosis, and the misfit of the held-out record.
 
-    sindy: run the baseline of that name too.
+    sindy: run the baseline of that name too. budget: of the diagnosis, s; None: no limit.
     """
     design = case.design
     line: dict[str, Any] = {
@@ -86,12 +87,14 @@ def diagnosed(case: Case, seed: int = 0, sindy: bool = False) -> dict[str, Any]:
         "tries": case.tries,
         "truth": case.truth,
     }
+    if case.value is not None:
+        line["value"] = asdict(case.value)
     model, experiments, free = model_of(design.plant), experiments_of(case), free_of(case)
     others = [n for n, e in effects().items() if e.tried_by_default and n not in design.effects]
     tried: Any = others if design.part == "left-out" else "all"
     begin, spent = time.perf_counter(), time.process_time()
     try:
-        found = diagnose(model, experiments, free, effects=tried, seed=seed)
+        found = diagnose(model, experiments, free, effects=tried, seed=seed, options=DiagnosisOptions(budget=budget))
     except HvdcIdentError as e:
         return line | {"failed": str(e), "seconds": time.perf_counter() - begin, "cpu": time.process_time() - spent}
     line |= {"seconds": time.perf_counter() - begin, "cpu": time.process_time() - spent} | _told(found)
@@ -185,9 +188,14 @@ def _sindy(
 
 
 def _oracle(model: Model, experiments: Sequence[Experiment], case: Case, free: Sequence[FitParameter]) -> float | None:
-    """Return the misfit of the model with the true effects, fitted from the truth; None outside the catalogue or without effects."""
+    """Return the misfit of the model with the true effects, or the true value, fitted from the truth.
+
+    None outside the catalogue, and where nothing is hidden and no value is wrong.
+    """
     known = effects()
-    if not case.hidden or any(h.effect not in known for h in case.hidden):
+    if case.value is not None:
+        model = model.with_values({case.value.name: case.value.true})
+    elif not case.hidden or any(h.effect not in known for h in case.hidden):
         return None
     true = PLANTS[case.design.plant].parameters
     unknown = [FitParameter(f.name, true[f.name], f.min, f.max) for f in free]

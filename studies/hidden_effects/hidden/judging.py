@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 
 from hidden.kinds import SLOW_STATE
-from hidden.outcomes import Line, effects_found, is_truth, members, named, outcome, same_effect
+from hidden.outcomes import (
+    Line,
+    effects_found,
+    is_truth,
+    members,
+    named,
+    outcome,
+    same_effect,
+    value_estimated,
+    value_outcome,
+)
 from hidden.probabilities import calibration, limit_above
 
 MAIN = {
@@ -20,13 +30,14 @@ MAIN = {
 }  # fmt: skip
 """The parameter that measures the effect; a limit of a state has one of two."""
 OUTCOMES = ("right", "covered", "place", "wrong", "ambiguous", "abstained", "failed")
-PARTS = ("single", "pair", "clean", "outside", "left-out", "triple")
+OF_VALUES = ("named", "covered", "beside", "wrong", "abstained", "failed")
+PARTS = ("single", "pair", "clean", "outside", "left-out", "triple", "value")
 
 
 def summary(lines: Sequence[Line]) -> dict[str, Any]:
     """Return everything that the study reports, as plain numbers.
 
-    Messy records count in `by_plant`, `calibration` and the numbers of cases only.
+    Messy records count in `by_plant`, `values` by plant, `calibration` and the numbers of cases only.
     """
     made = [x for x in lines if not x.get("unreachable")]
     tidy = [x for x in made if not x.get("messy")]
@@ -56,6 +67,7 @@ def summary(lines: Sequence[Line]) -> dict[str, Any]:
         "clean": _clean(by_part["clean"]),
         "outside": _strangers(by_part["outside"]),
         "left_out": _strangers(by_part["left-out"]),
+        "values": _values(made),
         "location": _location(large),
         "sizes": _sizes(single),
         "held_out": _held_out(large),
@@ -191,6 +203,36 @@ def _strangers(lines: Sequence[Line]) -> dict[str, Any]:
         "named_as": {
             e: dict(Counter(x["found"][0]["effect"] for x in named if x["effects"][0] == e))
             for e in sorted({x["effects"][0] for x in named})
+        },
+    }
+
+
+def _values(lines: Sequence[Line]) -> dict[str, Any]:
+    """Return the statistics of values that the card states wrong: of all tidy records, and by plant and cleanliness."""
+    own = [x for x in lines if x["part"] == "value"]
+    rooms = sorted({(x["plant"], bool(x.get("messy"))) for x in own})
+
+    def row(part: Sequence[Line]) -> dict[str, Any]:
+        found, n = Counter(value_outcome(x) for x in part), len(part)
+        right = [value_estimated(x) for x in part if value_outcome(x) == "named"]
+        return {
+            "cases": n,
+            **{name: found.get(name, 0) for name in OF_VALUES},
+            "named_or_covered": (found["named"] + found["covered"]) / n if n else None,
+            "wrong_names": found["wrong"] / n if n else None,
+            "wrong_names_limit": limit_above(found["wrong"], n) if n else None,
+            "estimated": sum(right) / len(right) if right else None,
+            "cpu": _quantiles([x["cpu"] for x in part if "cpu" in x]),
+            "verdicts": dict(Counter(x.get("verdict", "failed") for x in part)),
+        }
+
+    return {
+        "all": row([x for x in own if not x.get("messy")]),
+        "by_plant": {
+            f"{plant}, {'messy' if messy else 'tidy'}": row(
+                [x for x in own if x["plant"] == plant and bool(x.get("messy")) == messy]
+            )
+            for plant, messy in rooms
         },
     }
 

@@ -56,19 +56,16 @@ def on_coarse_steps(plant: Plant, hidden: Sequence[Hidden]) -> list[Hidden]:
 def recorded(plant: Plant, runs: Sequence[Run], hidden: Sequence[Hidden], extent: Array, key: Sequence[int]) -> Array:
     """Return (rows, runs, outputs) before noise and quantisation: what a real plant and its recorder would show.
 
-    hidden: on coarse steps. extent: (outputs,), the range of each output. key: of the generator.
+    runs: values of their own, if any, are of parameters that are not fitted. hidden: on coarse steps. extent: (outputs,), the range
+    of each output. key: of the generator.
     """
     rng = np.random.default_rng(key)
     signs = rng.choice([-1.0, 1.0], size=len(plant.parameters))
-    values = {
-        n: v * (1.0 + WRONG * s)
-        for (n, v), s in zip(plant.parameters.items(), signs, strict=True)
-        if n not in plant.fitted
-    }
+    off = {n: 1.0 + WRONG * s for n, s in zip(plant.parameters, signs, strict=True) if n not in plant.fitted}
     quarter = plant.interval / 4
     fine = simulate(
         plant,
-        [Run(r.inputs, values) for r in runs],
+        [Run(r.inputs, {n: r.values.get(n, plant.parameters[n]) * share for n, share in off.items()}) for r in runs],
         hidden,
         rows=4 * (ROWS - 1 + AROUND) + 1,
         interval=quarter,

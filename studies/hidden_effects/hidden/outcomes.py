@@ -1,9 +1,11 @@
-"""The outcome of one case: named and true effects and insertion points."""
+"""The outcome of one case: named and true effects and insertion points, or a named and a true value."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
+
+from hidden.plants import PLANTS
 
 Line = Mapping[str, Any]
 SAME_NAME = ({"coupling", "droop"}, {"lag", "inductance"})
@@ -23,6 +25,8 @@ ONLY_RECORDED: Mapping[str, Sequence[str]] = {"machine": ("Qe",), "converter": (
 """Signals that nothing reads but the output of the same name: every effect at one is the same at the other."""
 ONE_SOURCE: Mapping[str, Sequence[set[str]]] = {"machine": ({"w", "dw"},), "hydro": ({"w", "dw"},)}
 """Signals that differ by a constant, which the steady state takes up: what one brings in, so does the other."""
+CLOSE = 0.05
+"""Share of the true value by which an estimate may be off, whatever its interval."""
 ADDED = ("offset", "disturbance", "coupling", "droop", "conductance", "loss")
 
 
@@ -102,3 +106,42 @@ def named(line: Line) -> bool:
 
     all_found = all(any(meets(g, t) for g in groups) for t in truths)
     return all_found and all(any(meets(g, t) for t in truths) for g in groups) and len(groups) == len(truths)
+
+
+def value_outcome(line: Line) -> str:
+    """Return the outcome of one case in which the card states a value wrong.
+
+    named: it is named, and nothing beside it. beside: it is named, and an effect or another value too. covered: it is among what
+    is told as likely. wrong: something is named, and it is not among it. abstained: nothing of these. failed: no diagnosis.
+    A fitted parameter that is told to be off its start is no other value: it is off in every case.
+    """
+    if "failed" in line:
+        return "failed"
+    name = line["value"]["name"]
+    if line["verdict"] not in ("named", "ambiguous"):
+        return "abstained"
+    findings = _values_found(line)
+    told = {n for f in findings for n in f["parameters"]} - set(PLANTS[line["plant"]].fitted)
+    if line["verdict"] == "named" and name in told:
+        return "named" if told == {name} and not effects_found(line) else "beside"
+    sets = [r["at"] for group in line["ambiguity"] for r in group if r["effect"] == "parameter"]
+    if name in told or any(name in at for at in (*sets, *(p["at"] for f in findings for p in f["places"]))):
+        return "covered"
+    return "wrong" if line["verdict"] == "named" else "abstained"
+
+
+def value_estimated(line: Line) -> bool:
+    """Return True if the value that is named is right: the truth is in its 95 % interval, or it is off by CLOSE at most."""
+    name, true = line["value"]["name"], float(line["value"]["true"])
+    told = next(f["parameters"][name] for f in _values_found(line) if name in f["parameters"])
+    if abs(told["value"] - true) <= CLOSE * abs(true):
+        return True
+    if told["ci95"] is None:
+        return False
+    low, high = told["ci95"]
+    return (low is None or bool(low <= true)) and (high is None or bool(true <= high))
+
+
+def _values_found(line: Line) -> list[Line]:
+    """Return the findings that are values that are off."""
+    return [f for f in line.get("findings", []) if f["effect"] == "parameter"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hidden.judging import OUTCOMES
+from hidden.judging import OF_VALUES, OUTCOMES
 
 
 def report(found: Mapping[str, Any]) -> str:
@@ -37,6 +37,7 @@ def report(found: Mapping[str, Any]) -> str:
         ),
         f"Outside the catalogue: {_plain(found['outside'])}",
         f"Left out of the search: {_plain(found['left_out'])}",
+        *_values(found["values"]),
         f"Localisation: {_plain(found['location'])}",
         _table(
             "Sizes, of what was named rightly", sizes, ("cases", "median_error", "median_absolute_error", "coverage")
@@ -72,6 +73,25 @@ def _by_plant(found: Mapping[str, Any]) -> list[str]:
         _table("Clean cases, by plant and records", of("clean"), ("cases", "named", "limit", "evidence_without_name")),
         _table("Outside, by plant and records", of("outside"), ("cases", "confident_wrong_names", "limit")),
         _table("Seconds a diagnosis, by plant and records", of("seconds"), ("5 %", "median", "95 %", "largest")),
+    ]
+
+
+def _values(found: Mapping[str, Any]) -> list[str]:
+    """Return the table of values that the card states wrong; none without such cases."""
+    if not found["by_plant"]:
+        return []
+    rows = {"all tidy": found["all"], **found["by_plant"]}
+    shown = {
+        name: row | {f"cpu, {q}": v for q, v in (row["cpu"] or {}).items() if q in ("median", "largest")}
+        for name, row in rows.items()
+    }
+    shares = ("named_or_covered", "wrong_names", "wrong_names_limit", "estimated")
+    return [
+        _table(
+            "Values stated wrong, by plant and records",
+            shown,
+            ("cases", *OF_VALUES, *shares, "cpu, median", "cpu, largest", "verdicts"),
+        )
     ]
 
 

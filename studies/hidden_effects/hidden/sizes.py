@@ -28,6 +28,8 @@ ROUNDS, SETTLED = 8, 1e-2
 """Of a refit: runs at most, and the relative fall of the sum of squares at which it has ended."""
 WIDTH = 5.0
 """The bounds of a fitted parameter: its true value divided and multiplied by this."""
+FARTHEST = 4.0
+"""Ranges of an output in the plant without effects: what goes farther counts as diverged."""
 PACED = {"T": 1, "Ts": 1, "compute": 1, "T1": 1, "T2": 1, "wn": -1, "rate": -1, "up": -1, "down": -1, "frequency": -1}
 """Parameters of effects that are times, with 1, or rates, with -1."""
 LATE = 1e-7
@@ -211,6 +213,11 @@ def about(base: Nominal, at: str, source: str) -> About:
     )  # fmt: skip
 
 
+def ranges(base: Nominal) -> Array:
+    """Return (outputs,), the range of each output in the fitted experiments, or a bit more than 0 of one that does not move."""
+    return np.asarray(np.ptp(base.outputs[:, :2], axis=(0, 1)) + 1e-3 * np.abs(base.outputs).max(axis=(0, 1, 2)))
+
+
 def on_jumps(runs: Sequence[Run], interval: float = INTERVAL) -> NDArray[np.bool_]:
     """Return (rows, runs), True for rows on a jump of an input: a recording does not state which side such a row shows."""
     rows = [[round(t / interval) for signal in run.inputs.values() for t in signal.jumps] for run in runs]
@@ -324,7 +331,7 @@ def sized(
 ) -> Hidden | None:
     """Return the effect at the required size, in units; None if no size reaches it or a run diverges before.
 
-    A size with a response of over four times the outputs' range counts as diverged.
+    A size whose response is larger than FARTHEST of the outputs' ranges counts as diverged.
     """
     plant = base.plant
     low, high = SPANS.get(effect, (1e-3, 1.0))
@@ -336,9 +343,8 @@ def sized(
     runs = [r for r in base.runs[:2] for _ in range(GRID)]
     answer = simulate(plant, runs, [Hidden(effect, at, tiled, source)])
     answer = answer.reshape(answer.shape[0], 2, GRID, -1)
-    extent = np.ptp(base.outputs[:, :2], axis=(0, 1)) + 1e-3 * np.abs(base.outputs).max(axis=(0, 1, 2))
-    far = np.abs(answer - base.outputs[:, :2, None]).max(axis=(0, 1)) / extent
-    fine = np.isfinite(answer).all(axis=(0, 1, 3)) & (far < 4.0).all(axis=1)
+    far = np.abs(answer - base.outputs[:, :2, None]).max(axis=(0, 1)) / ranges(base)
+    fine = np.isfinite(answer).all(axis=(0, 1, 3)) & (far < FARTHEST).all(axis=1)
     count = GRID if fine.all() else int(np.argmin(fine))
     if count == 0:
         return None
