@@ -28,7 +28,7 @@ SEED = 42
 
 
 def one(design: Design, seed: int, sindy: bool = False, budget: float | None = None) -> dict[str, Any]:
-    """Return the line of one case: generated, diagnosed, compared. budget: of the diagnosis, s; None: no limit."""
+    """Return the line of one case: generated, diagnosed, compared. budget: CPU time of the diagnosis, s; None: no limit."""
     return _line(design, seed, sindy, budget) | {"budget": budget}
 
 
@@ -92,8 +92,8 @@ def pending(
 ) -> Iterator[Design]:
     """Return the cases still to be done, the parts in turn, so that an early stop has cases of each.
 
-    limit: of each part, of each kind of records, and of the first two plants and each of the others; least: size of a hidden
-    effect. plants: None: the first two, of the part `value` all. messy: which records.
+    limit: of each part, of each kind of records, and of the first two plants (in the part `value`: of each) and each of the others;
+    least: size of a hidden effect. plants: None: the first two, of the part `value` all. messy: which records.
     """
     every = [factorial(seed)]
     if not full:
@@ -106,11 +106,14 @@ def pending(
 
 
 def _groups(parts: Sequence[str], plants: Sequence[str] | None) -> list[tuple[str, tuple[str, ...]]]:
-    """Return each part with the plants that share its designs: the first two, then each of the others with all parts in turn."""
+    """Return each part with plants that are limited together: the first two, then each of the others with all parts in turn."""
     chosen = {p: plants or (tuple(PLANTS) if p == "value" else FIRST) for p in parts}
-    groups = [FIRST, *((p,) for p in PLANTS if p not in FIRST)]
-    each = [(part, tuple(p for p in group if p in chosen[part])) for group in groups for part in parts]
-    return [(part, group) for part, group in each if group]
+    found: list[tuple[str, tuple[str, ...]]] = []
+    for group in (FIRST, *((p,) for p in PLANTS if p not in FIRST)):
+        for part in parts:
+            own = tuple(p for p in group if p in chosen[part])
+            found += [(part, (p,)) for p in own] if part == "value" else [(part, own)] if own else []
+    return found
 
 
 def numbered(text: str) -> list[str]:
@@ -134,7 +137,9 @@ def main(arguments: list[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--limit", type=int, help="cases of each part at most")
     parser.add_argument("--least", type=float, default=0.0, help="leave out smaller effects, by their size in units")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--budget", type=float, metavar="SECONDS", help="of each diagnosis (default: no limit)")
+    parser.add_argument(
+        "--budget", type=float, metavar="SECONDS", help="CPU time of each diagnosis (default: no limit)"
+    )
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--out", type=Path, help="folder of the results (default: seed-SEED-results beside this file)")
     parser.add_argument("--judge-only", action="store_true", help="summarise what is there")
