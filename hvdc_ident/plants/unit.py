@@ -250,6 +250,8 @@ def _uses(card: str) -> FrozenMap[Set[str]]:
     expressions = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in model.states.items()}
     expressions |= {n: [s.value] for n, s in model.signals.items()}
     expressions |= {n: [a.equation] for n, a in model.algebraic.items()}
+    expressions |= {n: [d.of] for n, d in model.delays.items()}
+    expressions |= {n: [s.value] for n, s in model.sampled.items()}
     expressions |= {n: [o.value] for n, o in model.outputs.items() if n not in expressions}
     return FrozenMap({n: {s.name for e in of for s in at_values(e, at).free_symbols} for n, of in expressions.items()})
 

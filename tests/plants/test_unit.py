@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import hvdc_ident as hi
+from hvdc_ident.data import InputSignal
 from hvdc_ident.model import parse_card
 from hvdc_ident.plants import UnitPart, unit_card
 
@@ -63,3 +64,27 @@ def test_the_reference_that_the_flags_let_act_is_found(elec, plant, reference) -
     assert reference in model.states
     found = hi.find_operating_point(model.with_values({"P0": 80.0, "Q0": 15.0})).outputs
     assert (found["P"], found["Q"]) == pytest.approx((80.0, 15.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("governor", ["tgov1", "ieeeg1", "ieesgo", "gast", "ggov1", "hygov"])
+def test_the_reference_of_every_governor_is_found(governor) -> None:
+    """GGOV1 has a transport delay between its reference and the power."""
+    parts = {"gen": UnitPart("genrou"), "avr": UnitPart("sexs"), "gov": UnitPart(governor)}
+    model = parse_card(unit_card(parts, network="playback", f0=60.0))
+    point = hi.find_operating_point(model.with_values({"P0": 75.0, "Q0": 10.0}))
+    assert (point.outputs["P"], point.outputs["Q"]) == pytest.approx((75.0, 10.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(("governor", "scale"), [("tgov1", 1.0), ("ggov1", 0.04)])
+def test_a_load_controller_leads_the_power_back(governor, scale) -> None:
+    """The frequency stays 0.1 Hz low: the governor's answer is withdrawn, but for 1/droop of the frequency where Fb is that."""
+    left = {}
+    for Fb in (0.0, 25.0):
+        parts = {"gen": UnitPart("genrou"), "avr": UnitPart("sexs"), "gov": UnitPart(governor)}
+        parts["lcfb1"] = UnitPart("lcfb1", {"Ki": 0.1, "Kp": 0.2, "Fb": Fb, "scale": scale})
+        model = parse_card(unit_card(parts, network="playback", f0=50.0)).with_values({"P0": 60.0, "Q0": 0.0})
+        fall = InputSignal.corners([(1.0, 50.0), (2.0, 49.9)])
+        P = hi.simulate(model, np.arange(0.0, 200.0, 0.5), inputs={"f": fall})["P"]
+        assert P[0] == pytest.approx(60.0, abs=1e-6) and P.max() > 62.0
+        left[Fb] = P[-1] - P[0]
+    assert left == pytest.approx({0.0: 0.0, 25.0: 100.0 * 25.0 * 0.1 / 50.0}, abs=0.05)
