@@ -94,6 +94,9 @@ def _model(card: dict[str, Any], inside: tuple[Path, ...]) -> Model:
     require_known("parameter", [n for n in file.record if n != "-"], file.parameters, "record")
     require_known("parameter", file.power_flow, file.parameters, "power_flow")
     require_known("parameter of the record", file.asked, file.record, "asked")
+    if file.exchange is not None:
+        for key in ("free", "means", "takes"):
+            require_known("parameter", getattr(file.exchange, key), file.parameters, f"exchange, {key}")
     sections = file.model_dump(include=set(SECTIONS), exclude_unset=True)
     if not file.components and not file.connections:
         return Model(name=file.name, description=file.description, **sections)

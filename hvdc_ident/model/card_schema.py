@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator
+from pydantic import BeforeValidator, Field
 
 from hvdc_ident.toml_tables import Name, TomlTable, key, optional, wrong
 
@@ -35,6 +35,11 @@ def _entry(value: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, str | int | float):
         raise wrong("an expression, as text or number, or a table: {value = ...}")
     return {"value": value}
+
+
+def _several(value: Any) -> Any:
+    """One expression as the list that it stands for."""
+    return value if isinstance(value, list) else [value]
 
 
 def _pattern(value: Any) -> Any:
@@ -169,6 +174,28 @@ class ConnectionEntry(TomlTable):
         '"bus.I" = {value = "gen.I", start = 1.0}', "that of the input")
 
 
+Several = Annotated[list[Expression], BeforeValidator(_several, json_schema_input_type=str | float | list[str | float])]
+
+
+class ExchangeEntry(TomlTable):
+    """[exchange]: how a card of the shelf stands in for another one of its class: what its parameters mean, as quantities that cards of
+    any class share by name, and what a fit frees."""
+
+    klass: str = optional("Class of the card: the cards of one class stand in for each other. Empty: its parameters alone have a meaning.",
+        'class = "governor"', default="", alias="class")
+    free: dict[str, Annotated[list[Number], Field(min_length=2, max_length=2)]] = optional(
+        "Parameters that a fit frees where the card stands in, with their usual range. A time constant's begins above 0, where its block "
+        "would be gone.", "free = {K = [5.0, 50.0]}", "that of the parameter", default={})
+    ranges: str = optional("Where the ranges are from.", 'ranges = "IEEE PES-TR1, 2013"', default="")
+    means: dict[str, str] = optional("By parameter: the quantity that it is.", 'means = {T3 = "servo"}', default={})
+    says: dict[str, Expression] = optional(
+        "By quantity: what it is, as an expression of the parameters. One that is no finite number, as 1/K where K is 0, is not said.",
+        'says = {droop = "1/K"}', default={})
+    takes: dict[str, Several] = optional(
+        "By parameter: what it is, as an expression of quantities and of parameters before it; of several the first whose quantities are "
+        "said.", 'takes = {K = "1/droop"}', default={})
+
+
 Signals = dict[str, Annotated[SignalEntry, BeforeValidator(_entry, json_schema_input_type=str | float | SignalEntry)]]
 Outputs = dict[str, Annotated[OutputEntry, BeforeValidator(_entry, json_schema_input_type=str | float | OutputEntry)]]
 Connections = dict[str, Annotated[ConnectionEntry, BeforeValidator(_entry, json_schema_input_type=str | float | ConnectionEntry)]]
@@ -191,6 +218,8 @@ class CardFile(TomlTable):
     asked: list[str] = optional(
         "Parameters of the record that a study of a unit asks about, the first that is not 0 and that no flag switches off: inertia, "
         "gain, droop.", 'asked = ["KPR", "KIR"]', default=[])
+    exchange: ExchangeEntry | None = optional("How the card stands in for another one of its class, and what its parameters mean.",
+        "[exchange]", default=None)
     parameters: dict[str, ParameterEntry] = optional("Constants that may be estimated, by name.", "[parameters]", default={})
     inputs: dict[str, InputEntry] = optional("Signals that enter the model from outside, by name.", "[inputs]", default={})
     states: dict[str, StateEntry] = optional("Differential equations, by state.", "[states]", default={})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import sympy as sp
@@ -74,7 +75,7 @@ def assembled(
             )
         try:
             names = _names(part_name, part)
-            flat = _sections(part, names)
+            flat = _sections(part, FrozenMap(names))
         except InputError as e:
             raise e.at(place) from None
         for section, items in flat.items():
@@ -105,6 +106,7 @@ def assembled(
         if isinstance(value, sp.Symbol) and value != TIME and value.name not in owners:
             raise unknown_name("variable", value.name, owners, where=place)
     made_of: dict[str, Any] = {k: FrozenMap(v) for k, v in sections.items()}
+    made_of["components"] = FrozenMap({n: c.model.name for n, c in components.items()})
     whole = without_vanished(Model(name=name, description=description, **made_of))
     for units in agree:
         _check_unit(whole, *units)
@@ -151,8 +153,12 @@ def _written(part: Component) -> dict[str, sp.Expr]:
     return {n: v for n, v in part.values.items() if isinstance(v, sp.Expr)}
 
 
-def _sections(part: Component, names: Mapping[str, str]) -> dict[str, list[tuple[str, Any]]]:
-    """Return the sections of a component, each the objects with their names in the whole."""
+@lru_cache(maxsize=128)
+def _sections(part: Component, names: FrozenMap[str]) -> FrozenMap[tuple[tuple[str, Any], ...]]:
+    """Return the sections of a component, each the objects with their names in the whole.
+
+    Of units that differ in one component the others are the same, and most of the work.
+    """
     written = _written(part)
     numbers = {n: v for n, v in part.values.items() if n not in written}
     model = part.model.with_values(numbers) if numbers else part.model
@@ -172,7 +178,7 @@ def _sections(part: Component, names: Mapping[str, str]) -> dict[str, list[tuple
     ]
     outputs = {n: Signal(o.value, o.unit, o.description) for n, o in model.outputs.items() if n not in model.names}
     free = {n: p for n, p in model.parameterisations.items() if not set(p.replaces) & set(written)}
-    return {
+    sections = {
         "parameters": under(model.parameters.without(*written)),
         "states": under(model.states),
         "signals": of_expressions + under(model.signals) + under(outputs),
@@ -181,6 +187,7 @@ def _sections(part: Component, names: Mapping[str, str]) -> dict[str, list[tuple
         "sampled": under(model.sampled),
         "parameterisations": [(names[n], _under(names, p, new)) for n, p in free.items()],
     }
+    return FrozenMap({n: tuple(items) for n, items in sections.items()})
 
 
 def _renamed(item: Any, new: Mapping[sp.Symbol, sp.Symbol]) -> Any:

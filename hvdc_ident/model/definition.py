@@ -125,6 +125,7 @@ class Model(Shown):
     expression for a State, Signal, Algebraic or Output.
 
     origin: what it was made from by `with_values` and `hvdc_ident.effects.apply_effects`; no part of its definition.
+    components: by component of its card the name of the model that it is, as gen: genrou; no part of its definition either.
 
     Raises ModelError where names clash, are unknown, or signals run in a circle.
     """
@@ -141,6 +142,7 @@ class Model(Shown):
     parameterisations: FrozenMap[Parameterisation] = field(default_factory=FrozenMap)
     description: str = ""
     origin: ModelOrigin | None = field(default=None, compare=False, repr=False)
+    components: FrozenMap[str] = field(default_factory=FrozenMap, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         from hvdc_ident.model.check import check, coerced

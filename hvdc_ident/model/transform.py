@@ -160,7 +160,8 @@ def without_vanished(model: Model) -> Model:
 
 def _is_zero(model: Model, time: sp.Expr) -> bool:
     """Return True where a time constant is 0 at the parameters' values."""
-    return float(time.xreplace({symbol(n): sp.Float(v) for n, v in model.values.items()})) == 0.0
+    at = {s: sp.Float(model.parameters[s.name].value) for s in time.free_symbols}
+    return float(time.xreplace(at)) == 0.0
 
 
 def with_derivative_signal(model: Model, state: str) -> tuple[Model, str]:

@@ -1,6 +1,7 @@
 """Plants of standard components: units at an infinite bus or at a recorded voltage, wired by the names of their signals."""
 
 from hvdc_ident.model import shelf_model
+from hvdc_ident.plants.exchange import CardChange, exchanges
 from hvdc_ident.plants.places import block_signals
 from hvdc_ident.plants.records import RecordedUnit, machine_records, recorded_unit, with_unit_values
 from hvdc_ident.plants.unit import (
@@ -24,9 +25,11 @@ __all__ = [
     "SET_POINTS",
     "STEP_UP",
     "UNCONNECTED",
+    "CardChange",
     "RecordedUnit",
     "UnitPart",
     "block_signals",
+    "exchanges",
     "idle_parts",
     "machine_records",
     "part_name",

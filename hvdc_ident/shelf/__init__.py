@@ -62,6 +62,12 @@ def asked_of(name: str) -> tuple[str, ...]:
 
 
 @cache
+def exchange_of(name: str) -> FrozenMap[Any]:
+    """Return the table of a component's card that says what its parameters mean, and for which others it stands in."""
+    return FrozenMap(_about(name).get("exchange", {}))
+
+
+@cache
 def outputs_of(name: str) -> frozenset[str]:
     """Return the names of a component's outputs, without its equations being read."""
     return frozenset(_about(name)["outputs"])
