@@ -10,14 +10,15 @@ import sympy as sp
 
 from hvdc_ident.expression import at_values, symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model, parse_card, shelf_model
+from hvdc_ident.model import Model, parse_card, reached, shelf_model
+from hvdc_ident.model.transform import without_vanished
 from hvdc_ident.parameters import Parameter
 from hvdc_ident.plants.meaning import Said, meaning_of, of_class, said_by, taken
-from hvdc_ident.plants.unit import AHEAD, UNCONNECTED, UnitPart, idle_parts, part_name, unit_card
+from hvdc_ident.plants.unit import AHEAD, UNCONNECTED, UnitPart, idle_parts, part_name, unit_card, uses
 from hvdc_ident.shelf import components, outputs_of
 
 ADDED = ("stabiliser", "load controller", "plant control")
-"""Classes of controls that a unit may lack: it runs without them. One has an exciter or a governor, or its output is constant."""
+"""Classes of controls that are added where a unit has none."""
 NETWORK = ("bus", "freq")
 """Components of a unit that is played back which are not its own parts."""
 
@@ -81,7 +82,7 @@ class _Unit:
         levels = {n: i.value for n, i in model.inputs.items() if n in root.inputs}
         signals = frozenset((*root.inputs, *(n for n, s in root.states.items() if s.is_reference)))
         unit = cls(_parts(root, sources), levels, signals, root.name, root.values["bus.f0"])
-        if _root(unit.model(unit.parts)).structure != root.structure:
+        if unit.model(unit.parts).structure != without_vanished(root).structure:
             return None
         return replace(unit, parts=_parts(model, sources))
 
@@ -93,10 +94,10 @@ class _Unit:
         """Yield the units in which one part is of another type."""
         for name, part in self.parts.items():
             own, others = _said(name, part), {n: p for n, p in self.parts.items() if n != name}
-            followed = outputs_of(part.source) & _followed(others)
+            asked = outputs_of(part.source) & _asked(others)
             for card in of_class(meaning_of(part.source).klass):
                 values = taken(card, self._said() | own)
-                if card != part.source and followed <= outputs_of(card) and _unmoved(others, own, name, card, values):
+                if card != part.source and asked <= outputs_of(card) and _unmoved(others, own, name, card, values):
                     yield from self._changed(others, name, part.source, card, values)
 
     def extended(self) -> Iterator[CardChange]:
@@ -104,21 +105,28 @@ class _Unit:
         has = {meaning_of(p.source).klass for p in self.parts.values()}
         for card in (c for klass in ADDED if klass not in has for c in of_class(klass)):
             gives, name = outputs_of(card), part_name(card)
-            if name not in self.parts and gives <= _followed(self.parts) and not gives & _given(self.parts):
+            if name not in self.parts and gives <= _asked(self.parts) and not gives & _given(self.parts):
                 yield from self._changed(self.parts, name, None, card, taken(card, self._said()))
 
     def _changed(
         self, others: Mapping[str, UnitPart], name: str, stated: str | None, card: str, values: Mapping[str, Said]
     ) -> Iterator[CardChange]:
         """Yield the unit with a new part beside the others, unless an input of it has no source or nothing follows another part now."""
-        free = _free(card, values)
-        part = UnitPart(card, {n: s.value for n, s in values.items()} | {n: p.value for n, p in free.items()})
+        carried = {n: s.value for n, s in values.items()}
+        free = _free(card, carried)
+        part = UnitPart(card, carried | {n: p.value for n, p in free.items()})
         order = self.parts if stated else (*self.parts, name)
         parts = {n: others.get(n, part) for n in order}
         if self._has_sources(others, card) and set(idle_parts(parts)) <= set(idle_parts(self.parts)):
-            frees = FrozenMap({f"{name}.{n}": p for n, p in free.items()})
-            carried = FrozenMap({f"{name}.{n}": s for n, s in values.items()})
-            yield CardChange(name, meaning_of(card).klass, stated, card, self.model(parts), frees, carried)
+            yield CardChange(
+                name,
+                meaning_of(card).klass,
+                stated,
+                card,
+                self.model(parts),
+                free=FrozenMap({f"{name}.{n}": p for n, p in free.items()}),
+                carried=FrozenMap({f"{name}.{n}": s for n, s in values.items()}),
+            )
 
     def _has_sources(self, others: Mapping[str, UnitPart], card: str) -> bool:
         """Return whether each input of a component follows a part, or is a set-point, or what the unit has without it."""
@@ -154,7 +162,7 @@ def _said(name: str, part: UnitPart) -> dict[str, Said]:
     return said_by(part.source, shelf_model(part.source).values | dict(part.values), name)
 
 
-def _followed(parts: Mapping[str, UnitPart]) -> set[str]:
+def _asked(parts: Mapping[str, UnitPart]) -> set[str]:
     """Return the signals that inputs of the parts follow."""
     return {AHEAD.get(u, u) for p in parts.values() for u in shelf_model(p.source).inputs}
 
@@ -180,16 +188,19 @@ def _unmoved(
     return all(math.isclose(own[q].value, now[q].value) for q in asked & own.keys() & now.keys())
 
 
-def _free(card: str, values: Mapping[str, Said]) -> dict[str, Parameter]:
+def _free(card: str, carried: Mapping[str, float]) -> dict[str, Parameter]:
     """Return what a fit frees of a component, at its values: one that lies outside its range widens it.
 
-    A value of 0 below the range takes a block out, which no fit can bring back: there the search begins at the range's low end.
+    A value of 0 below the range takes a block out, which no fit can bring back: there the search begins at the range's low end. What
+    the flags switch off is left out.
     """
-    found = {}
+    free, model = dict[str, Parameter](), shelf_model(card)
     for name, (low, high) in meaning_of(card).free.items():
-        typical = shelf_model(card).parameters[name]
-        value = values[name].value if name in values else typical.value
+        typical = model.parameters[name]
+        value = carried.get(name, typical.value)
         value = low if value == 0.0 < low else value
-        bounds = {"min": min(low, value), "max": max(high, value)}
-        found[name] = Parameter(value, typical.unit, **bounds, description=typical.description)
-    return found
+        free[name] = replace(typical, value=value, min=min(low, value), max=max(high, value))
+    made = model.with_values({**carried, **{n: p.value for n, p in free.items()}})
+    used = uses(made, free)
+    acting = set(reached(made.outputs, lambda name: used.get(name, ())))
+    return {n: p for n, p in free.items() if n in acting}

@@ -62,13 +62,13 @@ def of_class(klass: str) -> tuple[str, ...]:
 def said_by(source: str, values: Mapping[str, float], part: str) -> dict[str, Said]:
     """Return the quantities that a component says at values of its parameters. part: its name in the unit."""
     at = {symbol(n): sp.Float(v) for n, v in values.items()}
-    found = {}
+    said = {}
     for quantity, expression in meaning_of(source).says.items():
         value = _number(expression, at)
         if value is not None:
             names = sorted(s.name for s in expression.free_symbols)
-            found[quantity] = Said(value, tuple(f"{part}.{n}" for n in names))
-    return found
+            said[quantity] = Said(value, tuple(f"{part}.{n}" for n in names))
+    return said
 
 
 def taken(source: str, said: Mapping[str, Said]) -> dict[str, Said]:
@@ -76,7 +76,7 @@ def taken(source: str, said: Mapping[str, Said]) -> dict[str, Said]:
 
     A value that the parameter's bounds exclude, as a droop of 0, is left out: the card's own value stays.
     """
-    model, found = shelf_model(source), dict[str, Said]()
+    model, parameters = shelf_model(source), dict[str, Said]()
     own = {symbol(n): sp.Float(v) for n, v in model.values.items()}
     quantities = {symbol(q): sp.Float(s.value) for q, s in said.items()}
     for name, expressions in meaning_of(source).takes.items():
@@ -85,10 +85,10 @@ def taken(source: str, said: Mapping[str, Said]) -> dict[str, Said]:
             value = _number(e, own | quantities) if e.free_symbols <= own.keys() | quantities.keys() else None
             if value is not None and limits.min <= value <= limits.max:
                 used = sorted({n for s in e.free_symbols if s in quantities for n in said[s.name].of})
-                found[name] = Said(value, tuple(used))
+                parameters[name] = Said(value, tuple(used))
                 own[symbol(name)] = sp.Float(value)
                 break
-    return found
+    return parameters
 
 
 def _parsed(expression: str | float) -> sp.Expr:
@@ -97,6 +97,5 @@ def _parsed(expression: str | float) -> sp.Expr:
 
 def _number(expression: sp.Expr, at: Mapping[sp.Symbol, sp.Expr]) -> float | None:
     """Return the value of an expression; None where it is no finite number."""
-    found = at_values(expression, at)
-    value = float(found) if found.is_real else math.nan
-    return value if math.isfinite(value) else None
+    value = at_values(expression, at)
+    return float(value) if value.is_real and math.isfinite(float(value)) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Literal
@@ -12,7 +12,7 @@ import sympy as sp
 from hvdc_ident.errors import ModelError, unknown_name
 from hvdc_ident.expression import at_values, symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import Model, parse_card, shelf_model
+from hvdc_ident.model import Model, parse_card, reached, shelf_model
 from hvdc_ident.model.card import toml_key, toml_string
 from hvdc_ident.model.transform import without_vanished
 from hvdc_ident.parameters import Input
@@ -221,15 +221,15 @@ def part_name(source: str) -> str:
 
 
 def _references(
-    inputs: dict[str, Input], machine: UnitPart, uses: Mapping[str, Set[str]]
+    inputs: dict[str, Input], machine: UnitPart, used: Mapping[str, Set[str]]
 ) -> dict[str, tuple[str, str, Input]]:
     """Return by reference its level's name, its output and what it was; the levels take the places of the references among the inputs.
 
-    uses: of the unit with the references as inputs.
+    used: by name what it uses, of the unit with the references as inputs.
     """
     references = {}
     for level, output, unit_of_level, names in REFERENCES:
-        acting = _followed(uses, output)
+        acting = set(reached([output], lambda name: used.get(name, ())))
         reference = next((n for n in names if n in inputs and n in acting), None)
         if reference is not None:
             references[reference] = (level, output, inputs.pop(reference))
@@ -241,12 +241,19 @@ def _references(
 
 @lru_cache(maxsize=16)
 def _uses(card: str) -> FrozenMap[Set[str]]:
+    """Return `uses` of a unit.
+
+    Its card is written twice, before and after the levels of its inputs are known, which do not matter here.
+    """
+    return uses(without_vanished(parse_card(card)))
+
+
+def uses(model: Model, free: Collection[str] = ()) -> FrozenMap[Set[str]]:
     """Return by variable the names that its expressions have at the values of the parameters: flags decide which branch counts.
 
-    A unit's card is written twice, before and after the levels of its inputs are known, which do not matter here.
+    free: parameters that are not at their values.
     """
-    model = without_vanished(parse_card(card))
-    at = {symbol(n): sp.Float(v) for n, v in model.values.items() if n in model.parameters}
+    at = {symbol(n): sp.Float(p.value) for n, p in model.parameters.items() if n not in free}
     expressions = {n: [s.derivative, s.rest or sp.S.Zero] for n, s in model.states.items()}
     expressions |= {n: [s.value] for n, s in model.signals.items()}
     expressions |= {n: [a.equation] for n, a in model.algebraic.items()}
@@ -254,15 +261,6 @@ def _uses(card: str) -> FrozenMap[Set[str]]:
     expressions |= {n: [s.value] for n, s in model.sampled.items()}
     expressions |= {n: [o.value] for n, o in model.outputs.items() if n not in expressions}
     return FrozenMap({n: {s.name for e in of for s in at_values(e, at).free_symbols} for n, of in expressions.items()})
-
-
-def _followed(uses: Mapping[str, Set[str]], name: str) -> set[str]:
-    """Return a name and the names of all that it follows."""
-    followed, new = set[str](), {name}
-    while new:
-        followed |= new
-        new = {s for n in new for s in uses.get(n, ())} - followed
-    return followed
 
 
 def _network(machine: str, played: bool, step_up: bool) -> dict[str, str]:

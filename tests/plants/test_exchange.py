@@ -55,16 +55,16 @@ def check_runs(model: Model, c: CardChange) -> None:
     for n, s in c.carried.items():
         assert c.model.values[n] == s.value or (s.value == 0.0 and c.free[n].min == c.free[n].value), n
         assert set(s.of) <= set(model.parameters)
-    found = hi.find_operating_point(c.model.with_values(LEVELS))
-    assert (found.outputs["P"], found.outputs["Q"]) == pytest.approx((80.0, 10.0), abs=1e-6), (c.stated, c.card)
+    point = hi.find_operating_point(c.model.with_values(LEVELS))
+    assert (point.outputs["P"], point.outputs["Q"]) == pytest.approx((80.0, 10.0), abs=1e-6), (c.stated, c.card)
 
 
-@pytest.mark.parametrize("name", ["sexs", "hygov", "ac8b", "reecb1-q"])
+@pytest.mark.parametrize("name", ["ieeest", "reecb1-q"])
 def test_every_change_of_a_unit_starts_at_its_levels(name) -> None:
     model = case(name)
-    found = exchanges(model)
-    assert found
-    for c in found:
+    units = exchanges(model)
+    assert units
+    for c in units:
         check_runs(model, c)
 
 
@@ -78,11 +78,11 @@ def test_every_change_of_every_unit_starts_at_its_levels(name) -> None:
 
 def test_every_card_of_a_class_stands_in_for_another() -> None:
     model = unit(gen=GENROU, avr="sexs", gov="tgov1", pss="ieeest")
-    found = {(c.component, c.stated, c.card) for c in exchanges(model)}
+    cards = {(c.component, c.stated, c.card) for c in exchanges(model)}
     expected = {("avr", "sexs", c) for c in of_class("exciter") if c != "sexs"}
     expected |= {("gov", "tgov1", c) for c in of_class("governor") if c != "tgov1"}
     expected |= {("pss", "ieeest", c) for c in of_class("stabiliser") if c != "ieeest"} | {("lcfb1", None, "lcfb1")}
-    assert found == expected and len(found) == 21
+    assert cards == expected and len(cards) == 21
     assert part_name("lcfb1") == "lcfb1"
 
 
@@ -132,7 +132,7 @@ def test_there_and_back_is_the_stated_unit() -> None:
     dip = {"V": InputSignal.corners([(1.0, 1.0), (1.2, 0.96)]), "f": InputSignal.corners([(1.0, 50.0), (3.0, 49.9)])}
     times = np.arange(0.0, 10.0, 0.05)
     expected = hi.simulate(model, times, inputs=dip)
-    for there, back in (("ieeeg1", "tgov1"), ("ieesgo", "tgov1"), ("exst1", "sexs"), ("esst1a", "sexs")):
+    for there, back in (("ieeeg1", "tgov1"), ("exst1", "sexs")):
         again = changes(changes(model)[there].model)[back].model
         assert again.values == pytest.approx(model.values, rel=1e-12)
         run = hi.simulate(again, times, inputs=dip)
@@ -183,6 +183,25 @@ def test_what_a_study_sets_is_carried_and_what_it_frees_stays() -> None:
 def test_a_value_beyond_the_usual_range_widens_it() -> None:
     c = changes(unit(gen=GENROU, avr=UnitPart("sexs", {"K": 2000.0}), gov="tgov1"))["exst1"]
     assert (c.free["avr.KA"].value, c.free["avr.KA"].min, c.free["avr.KA"].max) == (2000.0, 20.0, 2000.0)
+
+
+@pytest.mark.parametrize(
+    ("flags", "acting"),
+    [
+        ({"QFLAG": 0.0}, {"Kqv", "Tpord"}),
+        ({"QFLAG": 1.0, "VFLAG": 0.0}, {"Kqv", "Kvp", "Kvi", "Tpord"}),
+        ({"QFLAG": 1.0, "VFLAG": 1.0}, {"Kqv", "Kqp", "Kqi", "Kvp", "Kvi", "Tpord"}),
+    ],
+)
+def test_what_a_flag_switches_off_is_not_freed(flags, acting) -> None:
+    c = changes(unit(gen="regca1", elec=UnitPart("reeca1", flags)))["reecb1"]
+    assert set(c.free) == {f"elec.{n}" for n in acting}
+
+
+def test_a_unit_with_a_step_up_transformer_is_one() -> None:
+    model = unit(gen=GENROU, avr="sexs", gov="tgov1", step_up=UnitPart("transformer", {"X": 0.12}))
+    assert len(exchanges(model)) == 22
+    check_runs(model, changes(model)["exst1"])
 
 
 def test_controls_that_a_unit_lacks() -> None:

@@ -18,11 +18,11 @@ def test_lcfb1_has_the_transfer_functions_of_its_diagram() -> None:
     """A lag of the power and a proportional and integral control; the frequency has no lag."""
     model = shelf_model("lcfb1").with_values({"Fb": 15.0, "Kp": 0.4, "scale": 0.05})
     linear = hi.linearize(model, outputs=["Pref"])
-    found = {n: linear.response(OMEGA)[:, 0, k] for k, n in enumerate(linear.input_names)}
+    responses = {n: linear.response(OMEGA)[:, 0, k] for k, n in enumerate(linear.input_names)}
     s, control = 1j * OMEGA, 0.4 + 0.02 / (1j * OMEGA)
-    np.testing.assert_allclose(found["Pref0"], 1.0, rtol=1e-9)
-    np.testing.assert_allclose(found["Pe"], -0.05 * control / (1 + s), rtol=1e-8)
-    np.testing.assert_allclose(found["dw"], -0.05 * control * 15.0, rtol=1e-8)
+    np.testing.assert_allclose(responses["Pref0"], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(responses["Pe"], -0.05 * control / (1 + s), rtol=1e-8)
+    np.testing.assert_allclose(responses["dw"], -0.05 * control * 15.0, rtol=1e-8)
 
 
 CASES = {
@@ -45,8 +45,8 @@ def test_lcfb1_follows_its_block_diagram(values) -> None:
         return float(np.interp(t, *zip(*corners, strict=True)))
 
     def error(measured: float, t: float) -> float:
-        found = p["Pbf"] * (0.8 - measured) - p["Fbf"] * p["Fb"] * 0.02 * moved(t)
-        return float(np.clip(np.sign(found) * max(abs(found) - p["db"], 0.0), -p["emax"], p["emax"]))
+        raw = p["Pbf"] * (0.8 - measured) - p["Fbf"] * p["Fb"] * 0.02 * moved(t)
+        return float(np.clip(np.sign(raw) * max(abs(raw) - p["db"], 0.0), -p["emax"], p["emax"]))
 
     def rate(t: float, x: np.ndarray) -> np.ndarray:
         power = 0.8 + moved(t)

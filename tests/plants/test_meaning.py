@@ -36,10 +36,10 @@ def test_the_table_of_a_card_is_about_its_parameters(card: str) -> None:
 def test_a_card_takes_what_it_says(card: str) -> None:
     """At its own values, and at others, where the quantities count: shares of steam are of their sum."""
     own = shelf_model(card).values
-    found = taken(card, said_by(card, own, "x"))
+    parameters = taken(card, said_by(card, own, "x"))
     rest = {"Fflag"} if card == "repca1" else set()  # with which it is added
-    assert {n: s.value for n, s in found.items() if n not in rest} == pytest.approx(
-        {n: own[n] for n in found if n not in rest}
+    assert {n: s.value for n, s in parameters.items() if n not in rest} == pytest.approx(
+        {n: own[n] for n in parameters if n not in rest}
     )
     rng, free = np.random.default_rng(1), meaning_of(card).free
     moved = own | {n: low + (high - low) * rng.random() for n, (low, high) in free.items()}
