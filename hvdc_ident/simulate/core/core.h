@@ -111,6 +111,7 @@ enum {
 #define INDICES(INDEX)                                                                                                         \
     INDEX(pivots) INDEX(small_pivots) /* row exchanges of the factors */                                                       \
     INDEX(at)                         /* each input's present piece */                                                         \
+    INDEX(mover)                      /* of each switch the unknown that moved it as far as it was beyond its mode */          \
     INDEX(heads)                      /* heads of this record for the slide on each switch, then without one */
 
 #define COUNTS(INT)                                                                                                            \

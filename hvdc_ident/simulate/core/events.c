@@ -10,24 +10,37 @@ static double over(const run *r, integer k)
     return (2.0 * r->m[k] - 1.0) * r->sv[k];
 }
 
-/* The value of a switch at y that may be an error: at most a hundredth of the tolerance of the largest value there was, and not more
-   than the states' tolerances make of it; not less than rounding does.
-
-   The first alone would take p^9 for 0 long before p is: the tolerance is one of the states, not of a function of them. */
-static double unsure(run *r, double *y, integer k)
+/* By how much a switch moves, from its value in r->sv at y, where unknown i moves by its tolerance. */
+static double moved_by(run *r, double *y, integer k, integer i)
 {
-    double moved = 0.0;
+    double kept = y[i];
+    y[i] += r->rtol * fabs(kept) + r->atol;
     evaluate(r, r->do_sw, y, r->beside);
-    double there = r->beside[k];
+    y[i] = kept;
+    return fabs(r->beside[k] - r->sv[k]);
+}
+
+/* True where a switch whose values at y are in r->sv is by more beyond its mode than may be an error: at most a hundredth of the
+   tolerance of the largest value there was, and not more than the states' tolerances make of it; not less than rounding does.
+
+   The first alone would take p^9 for 0 long before p is: the tolerance is one of the states, not of a function of them. One unknown
+   that moves the switch as far is enough to tell that it is not: that which did the last time is asked first. */
+static bool surely_beyond(run *r, double *y, integer k, double far)
+{
+    double usual = 0.01 * r->rtol * r->top[k], moved = 0.0;
+    bool one_tells = far <= usual;
+    if (one_tells && moved_by(r, y, k, r->mover[k]) >= far)
+        return false;
     for (integer i = 0; i < r->n; i++) {
-        double kept = y[i];
-        y[i] += r->rtol * fabs(kept) + r->atol;
-        evaluate(r, r->do_sw, y, r->beside);
-        moved += fabs(r->beside[k] - there);
-        y[i] = kept;
+        double by = moved_by(r, y, k, i);
+        if (one_tells && by >= far) {
+            r->mover[k] = i;
+            return false;
+        }
+        moved += by;
     }
-    double rounding = 8.0 * 0x1p-52 / r->rtol * moved, usual = 0.01 * r->rtol * r->top[k];
-    return fmax(moved < usual ? moved : usual, rounding); /* `usual` too where moved is no number */
+    double rounding = 8.0 * 0x1p-52 / r->rtol * moved;
+    return far > fmax(moved < usual ? moved : usual, rounding); /* `usual` too where moved is no number */
 }
 
 /* The switch that is furthest beyond its mode at y, or NONE; leaves the switches' values in r->sv. */
@@ -43,7 +56,7 @@ static integer violation(run *r, double *y)
     integer which = NONE;
     for (integer k = 0; k < r->ns; k++) {
         double far = over(r, k);
-        if (far > worst && (far > r->slack[k] || far > unsure(r, y, k))) {
+        if (far > worst && (far > r->slack[k] || surely_beyond(r, y, k, far))) {
             worst = far;
             which = k;
         }
