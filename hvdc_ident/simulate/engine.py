@@ -71,21 +71,38 @@ class _Equations:
 
     def __init__(self, structure: ModelEquations) -> None:
         self.structure = structure
-        self._code = structure.compile()
-        self._late: Code | None = None
-        self.address = np.array([self._code.address.get(n, 0) for n in NAMES], dtype=np.int64)
+        self.address = np.zeros(len(NAMES), dtype=np.int64)
+        self._codes: list[Code] = []
+        self._keep(structure.compile())
+        self._deferred = set(structure.deferred)
+        self._late = False
         self._second = [np.zeros(0, dtype=np.int64)] * 2
 
-    def head(self, rosenbrock: bool) -> Integers:
+    def _keep(self, code: Code) -> None:
+        """Keep the code as long as this object, and know where its functions are."""
+        self._codes.append(code)
+        for name, start in code.address.items():
+            self.address[NAMES.index(name)] = start
+
+    def need(self, *names: str) -> None:
+        """Compile what is not there yet of these functions."""
+        missing = [n for n in names if n in self._deferred]
+        if missing:
+            self._keep(self.structure.compile_deferred(missing))
+            self._deferred.difference_update(missing)
+
+    def head(self, rosenbrock: bool, slides: bool) -> Integers:
         """Return the part of a run's record that describes these equations, (head fields,) integers: sizes, and addresses that live
         as long as this object.
 
-        The code that only the Rosenbrock method needs is compiled when it is first asked for.
+        The code that only the Rosenbrock method, or only a slide, needs is compiled when it is first asked for.
         """
-        if rosenbrock and self._late is None:
-            self._late = self.structure.compile_late()
-            for name, start in self._late.address.items():
-                self.address[NAMES.index(name)] = start
+        if slides:
+            self.need("swd")
+        if rosenbrock and not self._late:
+            self.need("jac", "ft")
+            self._keep(self.structure.compile_late())
+            self._late = True
             second = self.structure.second
             self._second = [np.array([entry[k] for entry in second], dtype=np.int64) for k in (0, 1)]
         width, address = self.structure.sizes.width, dict(zip(NAMES, self.address.tolist(), strict=True))
@@ -118,7 +135,7 @@ class Engine:
         self._equilibria = Equilibria(self.structure, self._address)
         self._explicit: bool | None = None
         self._lock = Lock()
-        self._records: dict[bool, tuple[Integers, Integers, int]] = {}
+        self._records: dict[tuple[bool, bool], tuple[Integers, Integers, int]] = {}
 
     # --- the start ---
 
@@ -163,70 +180,44 @@ class Engine:
         rows = constants[first : first + s.nd * s.width].reshape(s.nd, s.width)
         return constants[: s.nd], rows[:, : s.np]
 
-    # --- the run ---
+    # --- the runs ---
 
-    def run(
+    def prepared(
         self,
-        p: Array,
         inputs: Sequence[Any],
         time: Array,
         tolerance: Tolerance,
         method: Method = "auto",
         scale: Array | None = None,
-        first: float | None = None,
         model: Model | None = None,
-    ) -> tuple[Array, Statistics]:
-        """Outputs at the times, (n, outputs (1 + width)): values, then rows; and what it cost.
+    ) -> EngineRuns:
+        """Return the runs with these inputs, one InputSignal each, and outputs at these times; the parameters' values are open.
 
-        inputs: one InputSignal an input. first: where the run starts, s (default: the first time). model: as in `start`.
-        No step is longer than a delay: `short_delays.run` is for models with delays that may be short.
+        scale: size of each sensitivity parameter. model: as in `start`. No step is longer than a delay: `short_delays` is for models
+        with delays that may be short.
         """
-        s = self.structure.sizes
-        begin, end = float(time[0] if first is None else first), float(time[-1])
-        p = np.array(p, dtype=float)  # one that may be written, for it has an address then
-        u, (n_breaks, *tables), _kept = _tables(tuple(inputs), begin, end)
-        y, w = self.start(p, u, begin, search=tolerance.search, model=model)
-        constants = self.constants(p)
-        out = np.empty((time.size, max(s.no * (1 + s.width), 1)))
+        begin, end = float(time[0]), float(time[-1])
+        u, (n_breaks, *tables), kept = _tables(tuple(inputs), begin, end)
         t_out = np.array(time, dtype=float)
-        scales = np.ones(max(s.np, 1)) if scale is None else np.array(scale, dtype=float)
-        own = [address(a) for a in (p, constants, scales, t_out, out)]
-        given = [*own, *tables, n_breaks, time.size, tolerance.max_steps, tolerance.slides]
-        instants = [begin, end, tolerance.rtol, tolerance.atol]
-        explicit = self._is_explicit(method, p, y, w, end - begin)
-        while True:
-            # The heads, as the tables above, live as long as the record that has their addresses.
-            record, _heads, work = self._record(not explicit)
-            record[GIVEN] = given
-            reals = record.view(float)
-            reals[GIVEN_INSTANTS] = instants
-            status = integrate(record, work, y, w)
-            if status == "stiff" and method in ("auto", "nonstiff"):
-                explicit = False
-                if method == "auto":
-                    self._explicit = False
-                continue
-            if status == "sliding":  # now with the code of that slide
-                self._compile_slide(int(record[PLACE["last_switch"]]))
-                continue
-            break
-        counts = record[COUNTED].tolist()
-        statistics = Statistics(status, "explicit" if explicit else "rosenbrock", *counts)
-        if status != "converged":
-            raise SimulationError(
-                f"the simulation of model '{self.structure.model.name}' stopped: {status}",
-                where=f"t = {reals[PLACE['t']]:.6g} s",
-                got=f"{statistics.accepted} steps accepted, {statistics.rejected} rejected, {statistics.events} switches",
-                hint=HINTS[status],
-            )
-        return out, statistics
+        scales = np.ones(max(self.structure.sizes.np, 1)) if scale is None else np.array(scale, dtype=float)
+        return EngineRuns(
+            self, model or self.structure.model, tolerance, method, (begin, end), u,
+            (address(scales), address(t_out)),
+            (*tables, n_breaks, time.size, tolerance.max_steps, tolerance.slides),
+            (kept, t_out, scales),
+        )  # fmt: skip
 
     @property
     def slides(self) -> tuple[int, ...]:
         """The switches along whose surfaces runs have slid so far."""
         return tuple(sorted(self._slides))
 
-    def _compile_slide(self, switch: int) -> None:
+    def note_stiff(self, method: Method) -> None:
+        """Let later runs begin with the Rosenbrock method, where the method is chosen by a run."""
+        if method == "auto":
+            self._explicit = False
+
+    def compile_slide(self, switch: int) -> None:
         """Make the equations of the slide on a switch known to later runs."""
         m = self.structure
         with self._lock:
@@ -235,26 +226,27 @@ class Engine:
                 self._slides[switch] = _Equations(equations)
                 self._records.clear()
 
-    def _record(self, rosenbrock: bool) -> tuple[Integers, Integers, Array]:
+    def record(self, rosenbrock: bool, slides: bool) -> tuple[Integers, Integers, Array]:
         """A new run's record, the heads of the equations it may use, and its workspace."""
+        kind = rosenbrock, slides
         with self._lock:  # two threads that compile would free the code that one of them runs
-            if rosenbrock not in self._records:
-                self._records[rosenbrock] = self._template(rosenbrock)
-            template, heads, doubles = self._records[rosenbrock]
+            if kind not in self._records:
+                self._records[kind] = self._template(*kind)
+            template, heads, doubles = self._records[kind]
         return template.copy(), heads, np.zeros(doubles)
 
-    def _template(self, rosenbrock: bool) -> tuple[Integers, Integers, int]:
+    def _template(self, rosenbrock: bool, slides: bool) -> tuple[Integers, Integers, int]:
         """The record before a run, its heads, and how many doubles of workspace a run takes."""
         heads = np.zeros((self.structure.sizes.ns + 1, len(HEAD_FIELDS)), dtype=np.int64)
         for row, equations in {**self._slides, -1: self._equations}.items():
-            heads[row] = equations.head(rosenbrock)
+            heads[row] = equations.head(rosenbrock, slides)
         record = np.zeros(len(RUN_FIELDS), dtype=np.int64)
         record[: len(HEAD_FIELDS)] = heads.max(axis=0)  # room for the largest
         doubles = room(record)
         record[PLACE["heads"]] = address(heads)
         return record, heads, doubles
 
-    def _is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
+    def is_explicit(self, method: Method, p: Array, y: Array, w: Array, span: float) -> bool:
         """True where the explicit pair is the better choice: no unknowns, and no eigenvalue so fast that it would rule the step."""
         s = self.structure.sizes
         if method == "nonstiff":
@@ -282,7 +274,7 @@ class Engine:
     def fastest(self, p: Array, inputs: Sequence[Any], time: Array, tolerance: Tolerance, model: Model) -> float:
         """Return the largest modulus of an eigenvalue at the start, rad/s; infinite where one cannot be told.
 
-        Arguments as in `run`.
+        inputs, time, tolerance: as in `prepared`.
         """
         s = self.structure.sizes
         u, *_ = _tables(tuple(inputs), float(time[0]), float(time[-1]))
@@ -302,6 +294,8 @@ class Engine:
         s = self.structure.sizes
         n = s.nx + s.nz
         m = np.zeros(max(s.ns, 1))
+        with self._lock:
+            self._equations.need("jac")
         evaluate(self._address[NAMES.index("modes")], y, w, p, m, m)
         for other in (None, *range(s.ns)):
             mode, jac = m.copy(), np.zeros((n, n))
@@ -309,6 +303,62 @@ class Engine:
                 mode[other] = 1.0 - mode[other]
             evaluate(self._address[NAMES.index("jac")], y, w, p, mode, jac.reshape(-1))
             yield jac
+
+
+@dataclass(frozen=True, eq=False)
+class EngineRuns:
+    """Runs of an engine that differ by the values of parameters alone.
+
+    span: their start and end, s. u: inputs at the start. There follow addresses of the parameters' sizes and the outputs' times, and the
+    rest of what the caller states of a run, in the order of its record; kept: what these addresses are of.
+    """
+
+    engine: Engine
+    model: Model
+    tolerance: Tolerance
+    method: Method
+    span: tuple[float, float]
+    u: Array
+    scale_and_times: tuple[int, int]
+    tables: tuple[int, ...]
+    kept: tuple[Any, ...]
+
+    def run(self, p: Array) -> tuple[Array, Statistics]:
+        """Outputs at the times, (n, outputs (1 + width)): values, then rows; and what it cost."""
+        engine, tolerance, (begin, end) = self.engine, self.tolerance, self.span
+        s = engine.structure.sizes
+        p = np.array(p, dtype=float)  # one that may be written, for it has an address then
+        y, w = engine.start(p, self.u, begin, search=tolerance.search, model=self.model)
+        constants = engine.constants(p)
+        out = np.empty((self.tables[-3], max(s.no * (1 + s.width), 1)))
+        given = [address(p), address(constants), *self.scale_and_times, address(out), *self.tables]
+        instants = [begin, end, tolerance.rtol, tolerance.atol]
+        explicit = engine.is_explicit(self.method, p, y, w, end - begin)
+        while True:
+            # The heads, as the tables above, live as long as the record that has their addresses.
+            record, _heads, work = engine.record(not explicit, tolerance.slides)
+            record[GIVEN] = given
+            reals = record.view(float)
+            reals[GIVEN_INSTANTS] = instants
+            status = integrate(record, work, y, w)
+            if status == "stiff" and self.method in ("auto", "nonstiff"):
+                explicit = False
+                engine.note_stiff(self.method)
+                continue
+            if status == "sliding":  # now with the code of that slide
+                engine.compile_slide(int(record[PLACE["last_switch"]]))
+                continue
+            break
+        counts = record[COUNTED].tolist()
+        statistics = Statistics(status, "explicit" if explicit else "rosenbrock", *counts)
+        if status != "converged":
+            raise SimulationError(
+                f"the simulation of model '{engine.structure.model.name}' stopped: {status}",
+                where=f"t = {reals[PLACE['t']]:.6g} s",
+                got=f"{statistics.accepted} steps accepted, {statistics.rejected} rejected, {statistics.events} switches",
+                hint=HINTS[status],
+            )
+        return out, statistics
 
 
 @lru_cache(maxsize=64)

@@ -243,48 +243,73 @@ class ModelEquations:
 
     @cached_property
     def functions(self) -> list[Function]:
-        """The functions of `NAMES` that every run needs, those without content left out."""
-        s, g = self.sizes, self.graph
-        n, width = s.nx + s.nz, s.width
+        """The functions of `NAMES` but for those of the Rosenbrock method alone, those without content left out."""
+        return self._made([*self._of_every_run(), *(make() for make in self._of_some_runs.values())])
 
-        def rows(nodes: Iterable[int], at: int) -> list[tuple[int, Row]]:
-            return [(at + k * width, self._row(v)) for k, v in enumerate(nodes)] if width else []
+    @cached_property
+    def deferred(self) -> tuple[str, ...]:
+        """Names of functions that are compiled when a run asks for them: those that not all do, where few runs are to come."""
+        return tuple(self._of_some_runs) if self.brief and self.switch is None else ()
 
-        def both(name: str, nodes: list[int], hot: bool = False) -> Function:
-            return Function(name, list(enumerate(nodes)), rows(nodes, len(nodes)), hot=hot)
-
-        def plain(name: str, nodes: list[int], live: bool = False, hot: bool = False) -> Function:
-            return Function(name, list(enumerate(nodes)), live=live, hot=hot)
-
-        jacobian = [(i * n + j, d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()]
-        by_time = [self.rate(v, False) for v in self.rhs]
+    def _of_every_run(self) -> list[Function]:
+        s, width = self.sizes, self.sizes.width
         result = [
-            plain("f", self.rhs, hot=not width),
-            Function("jac", jacobian, hot=True),
-            both("ft", by_time),
-            plain("sw", list(g.switches), hot=True),
-            plain("swd", [self.rate(v, True) for v in g.switches]),
-            plain("out", self.observed, hot=not width),
-            plain("src", self.sources),
-            plain("srcd", [self.rate(v, True) for v in self.sources]),
+            self._plain("f", self.rhs, hot=not width),
+            self._plain("sw", list(self.graph.switches), hot=True),
+            self._plain("out", self.observed, hot=not width),
+            self._plain("src", self.sources),
+            self._plain("srcd", [self.rate(v, True) for v in self.sources]),
         ]
+        result += [make() for name, make in self._of_unknowns.items() if s.nz]
         if self.switch is None:
-            result += [self._modes(), both("const", self.timing), *self._rest()]
+            result += [self._modes(), self._both("const", self.timing), *self._rest()]
         else:
             surface = list(enumerate(self.surface))
-            result.append(Function("surface", surface, rows(self.surface[:1], len(surface))))
+            result.append(Function("surface", surface, self._rows(self.surface[:1], len(surface))))
         if not width:
-            result.append(Function("rows", list(enumerate(self.observed)), hot=True, stride=(padded(n), s.no)))
+            stride = (padded(s.nx + s.nz), s.no)
+            result.append(Function("rows", list(enumerate(self.observed)), hot=True, stride=stride))
         if width:
             result += [
-                both("fs", self.rhs, hot=True),
-                both("sws", list(g.switches)),
-                both("outs", self.observed, hot=True),
-                both("srcs", self.sources),
+                self._both("fs", self.rhs, hot=True),
+                self._both("sws", list(self.graph.switches)),
+                self._both("outs", self.observed, hot=True),
+                self._both("srcs", self.sources),
+                self._switch_rates(),
             ]
-        return self._without_new_conditions(result)
+        return result
 
-    def _without_new_conditions(self, functions: list[Function]) -> list[Function]:
+    @property
+    def _of_some_runs(self) -> dict[str, Callable[[], Function]]:
+        """By name what makes a function that not every run needs: the Rosenbrock method the Jacobian, a slide the switches' rates."""
+        found = {} if self.sizes.nz else self._of_unknowns
+        return found if self.sizes.width else found | {"swd": self._switch_rates}
+
+    @property
+    def _of_unknowns(self) -> dict[str, Callable[[], Function]]:
+        """By name what makes a function that the unknowns are solved with, and a step of the Rosenbrock method."""
+        return {"jac": self._jacobian, "ft": lambda: self._both("ft", [self.rate(v, False) for v in self.rhs])}
+
+    def _jacobian(self) -> Function:
+        n = len(self.rhs)
+        entries = [(i * n + j, d) for i, v in enumerate(self.rhs) for j, d in self.partial(v, "y").items()]
+        return Function("jac", entries, hot=True)
+
+    def _switch_rates(self) -> Function:
+        return self._plain("swd", [self.rate(v, True) for v in self.graph.switches])
+
+    def _plain(self, name: str, nodes: list[int], hot: bool = False) -> Function:
+        return Function(name, list(enumerate(nodes)), hot=hot)
+
+    def _both(self, name: str, nodes: list[int], hot: bool = False) -> Function:
+        """Nodes, and their rows."""
+        return Function(name, list(enumerate(nodes)), self._rows(nodes, len(nodes)), hot=hot)
+
+    def _rows(self, nodes: Iterable[int], at: int) -> list[tuple[int, Row]]:
+        width = self.sizes.width
+        return [(at + k * width, self._row(v)) for k, v in enumerate(nodes)] if width else []
+
+    def _made(self, functions: list[Function]) -> list[Function]:
         """Return the functions, whose derivatives hold the model's own conditions only."""
         if len(self.graph.switches) != self.sizes.ns:
             raise AssertionError("a derivative made a new condition")
@@ -339,7 +364,13 @@ class ModelEquations:
         No derivative by another parameter than those of the sensitivities is had from the graph afterwards.
         """
         self.graph.hold(self.nodes[n] for n in self.model.parameters if n not in self.sensitivities)
-        return Code(self.graph, self.functions, max(self.sizes.width, 1), brief=self.brief)
+        functions = self._made(self._of_every_run()) if self.deferred else self.functions
+        return Code(self.graph, functions, max(self.sizes.width, 1), brief=self.brief)
+
+    def compile_deferred(self, names: Sequence[str]) -> Code:
+        """The machine code of functions that were left out at first."""
+        functions = self._made([self._of_some_runs[n]() for n in names])
+        return Code(self.graph, functions, max(self.sizes.width, 1), brief=self.brief)
 
     def compile_rest(self) -> Code:
         """The machine code of the steady state alone."""
@@ -356,7 +387,7 @@ class ModelEquations:
             second = [(i, j) for i, j, _ in self.second]
             written["solve"] = lambda symbol: solve_text(e, symbol, width, second)
         rows = [(k * width, self._row(d)) for k, (_, _, d) in enumerate(self.second)]
-        functions = self._without_new_conditions([Function("hess", (), rows, hot=True)] if width else [])
+        functions = self._made([Function("hess", (), rows, hot=True)] if width else [])
         return Code(self.graph, functions, max(width, 1), written, brief=self.brief)
 
 

@@ -9,19 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hvdc_ident.data import Experiment, InputSignal, Trajectory
+from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
 from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, TimingError, require_known
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.model import AnyModel, Model, State, fresh, is_white_box, rewritten
+from hvdc_ident.model import AnyModel, Model, ModelOrigin, State, fresh, is_white_box, rewritten
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.simulate.engine import Method, Tolerance
-from hvdc_ident.simulate.short_delays import run
+from hvdc_ident.simulate.short_delays import DelayedRuns
 from hvdc_ident.simulate.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -64,19 +64,16 @@ def _with_offsets_and_starts(model: Model, names: tuple[str, ...]) -> tuple[Mode
     names: inputs, to which a constant is added all along, the steady start included (0 unless given); states, which
     begin at a value instead of at rest. A state that the model calls free has its parameter already.
     """
-    by_name = {}
+    by_name = {n: f"{n}_start" for n in names if n in model.states}
+    begun = {n: model.states[n] for n in by_name if model.states[n].start != "free"}
+    if begun:
+        starts = {
+            by_name[n]: Parameter(x.guess or 0.0, x.unit, description=f"{n} at the start") for n, x in begun.items()
+        }
+        free = {n: replace(x, start="free") for n, x in begun.items()}
+        model = replace(model, states=model.states | free, parameters=model.parameters | starts)
     for name in names:
-        if name in model.states:
-            by_name[name] = f"{name}_start"
-            state = model.states[name]
-            if state.start != "free":
-                start = Parameter(state.guess or 0.0, state.unit, description=f"{name} at the start")
-                free = replace(state, start="free")
-                model = replace(
-                    model,
-                    states=model.states | {name: free},
-                    parameters=model.parameters | {by_name[name]: start},
-                )
+        if name in by_name:
             continue
         by_name[name] = offset = fresh(model, f"{name}_offset")
         constant = Parameter(0.0, model.inputs[name].unit, description=f"constant added to {name}")
@@ -163,32 +160,106 @@ def simulate(
         ending = {"partial": True} if partial else {}
         own: Simulation = model.simulate(experiment, values, sensitivities, outputs=chosen, tolerance=tol, **ending)
         return own
-    plant = with_recording(model, experiment)
-    given = {**experiment.values, **(values or {})}
-    where = f"experiment '{experiment.name}'"
-    known = dict.fromkeys((*plant.parameters, *plant.inputs))
-    require_known("parameter or input", (*given, *experiment.inputs), known, where)
+    seen = None if outputs is None else tuple(outputs)
+    return _prepared(model, model.origin, experiment, tuple(sensitivities), seen, tol, method).run(values or {})
+
+
+@dataclass(frozen=True, eq=False)
+class _Prepared:
+    """Runs of an experiment on a model that differ by values alone: what does not hang on these is worked out once.
+
+    plant: the model with what the experiment changes of it. known: names that values may have. p: the parameters' values but for those
+    of a run, which stand at `places`. levels: values of the inputs that no signal drives. parameters: those of the sensitivities.
+    """
+
+    model: Model
+    experiment: Experiment
+    plant: Model
+    known: tuple[str, ...]
+    places: Mapping[str, int]
+    p: Array
+    levels: Mapping[str, float]
+    sensitivities: tuple[str, ...]
+    parameters: tuple[str, ...]
+    outputs: tuple[str, ...]
+    tolerance: Tolerance
+    method: Method
+
+    def run(self, values: Mapping[str, float]) -> Simulation:
+        """Return the run with these values of parameters and constant inputs."""
+        places, p, where = self.places, self.p.copy(), f"experiment '{self.experiment.name}'"
+        beside = False
+        for name, value in values.items():
+            place = places.get(name)
+            if place is not None:
+                p[place] = value
+            else:
+                beside = True
+        runs = self._runs(values) if beside else self._own
+        if not np.isfinite(p).all():
+            bad = next(n for n, v in zip(self.plant.parameters, p, strict=True) if not math.isfinite(v))
+            raise ModelError(
+                f"the value of parameter '{bad}' is not finite",
+                where=f"model '{self.model.name}'",
+                hint="an effect at an infinite neutral value is left out: do not set it",
+            )
+        try:
+            answer = runs.run(p)
+        except (SimulationError, SteadyStateError) as e:
+            raise e.at(where) from None
+        trajectory = Trajectory(self.experiment.time, answer.values, self.outputs, self._units)
+        return Simulation(trajectory, self.sensitivities, answer.slopes, answer.statistics)
+
+    @cached_property
+    def _own(self) -> DelayedRuns:
+        """The runs with inputs as the experiment has them."""
+        return self._runs({})
+
+    def _runs(self, values: Mapping[str, float]) -> DelayedRuns:
+        """Return the runs with constant inputs at these values."""
+        require_known("parameter or input", values, self.known, f"experiment '{self.experiment.name}'")
+        levels = {n: float(values.get(n, v)) for n, v in self.levels.items()}
+        signals = tuple(self.experiment.inputs.get(n) or _constant(levels[n]) for n in self.plant.inputs)
+        return DelayedRuns(
+            self.plant, self.parameters, self.outputs, signals, self.experiment.time, self.tolerance, self.method
+        )
+
+    @cached_property
+    def _units(self) -> tuple[str, ...]:
+        known = self.plant.outputs
+        return tuple(known[n].unit if n in known else "" for n in self.outputs)
+
+
+# A screen goes back and forth between the experiments of a study; a model's origin, which tells its steady state, is no part of its
+# equality.
+@lru_cache(maxsize=32)
+def _prepared(
+    model: Model,
+    origin: ModelOrigin | None,
+    experiment: Experiment,
+    sensitivities: tuple[str, ...],
+    outputs: tuple[str, ...] | None,
+    tolerance: Tolerance,
+    method: Method,
+) -> _Prepared:
+    plant, where = with_recording(model, experiment), f"experiment '{experiment.name}'"
+    known = (*plant.parameters, *plant.inputs)
+    require_known("parameter or input", (*experiment.values, *experiment.inputs), known, where)
     require_known("input", experiment.offsets, plant.inputs, where)
     require_known("state", experiment.starts, plant.states, where)
     shifts = {**experiment.offsets, **experiment.starts}
     names = tuple(n for n in (*plant.inputs, *plant.states) if n in shifts or n in sensitivities)
     plant, parameter = _with_offsets_and_starts(plant, names) if names else (plant, FrozenMap())
-    given |= {parameter[n]: v for n, v in shifts.items()}
-    p = [float(given.get(n, q.value)) for n, q in plant.parameters.items()]
-    if not all(map(math.isfinite, p)):
-        bad = [n for n, v in zip(plant.parameters, p, strict=True) if not math.isfinite(v)]
-        raise ModelError(
-            f"the value of parameter '{bad[0]}' is not finite",
-            where=f"model '{model.name}'",
-            hint="an effect at an infinite neutral value is left out: do not set it",
-        )
-    signals = [experiment.inputs.get(n) or _constant(float(given.get(n, i.value))) for n, i in plant.inputs.items()]
-    wanted = tuple(parameter.get(n, n) for n in sensitivities)
-    seen = tuple(plant.outputs if outputs is None else outputs)
-    try:
-        answer = run(plant, wanted, seen, np.array(p), signals, experiment.time, tol, method)
-    except (SimulationError, SteadyStateError) as e:
-        raise e.at(where) from None
-    units = tuple(plant.outputs[n].unit if n in plant.outputs else "" for n in seen)
-    trajectory = Trajectory(experiment.time, answer.values, seen, units)
-    return Simulation(trajectory, tuple(sensitivities), answer.slopes, answer.statistics)
+    stated = {parameter[n]: v for n, v in shifts.items()}
+    given = {**experiment.values, **stated}
+    p = np.array([float(given.get(n, q.value)) for n, q in plant.parameters.items()])
+    return _Prepared(
+        model, experiment, plant, known,
+        {n: k for k, n in enumerate(plant.parameters) if n in known and n not in stated},
+        p,
+        {n: float(given.get(n, i.value)) for n, i in plant.inputs.items() if n not in experiment.inputs},
+        sensitivities,
+        tuple(parameter.get(n, n) for n in sensitivities),
+        tuple(plant.outputs) if outputs is None else outputs,
+        tolerance, method,
+    )  # fmt: skip

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from hvdc_ident.data import Array
 from hvdc_ident.expression import symbol
 from hvdc_ident.model import Model, fresh, without_delays
 from hvdc_ident.parameters import Parameter
-from hvdc_ident.simulate.engine import Engine, Method, Tolerance, engine_of
+from hvdc_ident.simulate.engine import EngineRuns, Method, Tolerance, engine_of
 from hvdc_ident.simulate.simulation import Statistics
 
 COARSEST = 2_500
@@ -46,58 +46,70 @@ class DelayedRun:
     statistics: Statistics
 
 
-def run(
-    model: Model,
-    sensitivities: Sequence[str],
-    outputs: Sequence[str] | None,
-    p: Array,
-    inputs: Sequence[Any],
-    time: Array,
-    tolerance: Tolerance,
-    method: Method = "auto",
-) -> DelayedRun:
-    """Return a run of the model, in which every delay may be 0 or short.
+@dataclass(frozen=True, eq=False)
+class DelayedRuns:
+    """Runs of a model, in which every delay may be 0 or short, that differ by the values of parameters alone.
 
-    p: (parameters,) values in the model's order. inputs: one InputSignal an input. Raises TimingError for a negative delay, and as
-    `Engine.run` does.
+    inputs: one InputSignal an input.
     """
-    engine = engine_of(model, sensitivities, outputs, brief=tolerance.brief)
 
-    def answer(of: Model, parameters: Sequence[str], values: Array) -> DelayedRun:
-        code = engine if of is model else engine_of(of, parameters, outputs, brief=tolerance.brief)
-        scale = np.array([of.parameters[n].size for n in parameters]) if parameters else None
-        out, statistics = code.run(values, inputs, time, tolerance, method, scale, model=of)
-        return _answer(code, out, statistics)
+    model: Model
+    sensitivities: tuple[str, ...]
+    outputs: tuple[str, ...] | None
+    inputs: tuple[Any, ...]
+    time: Array
+    tolerance: Tolerance
+    method: Method = "auto"
 
-    span = float(time[-1] - time[0])
-    times, by_parameters = engine.delay_times(p) if model.delays else (np.zeros(0), np.zeros((0, 0)))
-    shortest = 0.0
-    if (times < span / COARSEST).any():
-        plain = _without(model, tuple(model.delays))
-        fastest = engine_of(plain, sensitivities, outputs, brief=tolerance.brief).fastest(
-            p, inputs, time, tolerance, plain
-        )
-        shortest = span / _steps(span * fastest, inputs, tolerance)
-    lengths = zip(model.delays, times.tolist(), by_parameters, strict=True)
-    short = {name: (length, rows) for name, length, rows in lengths if length == 0.0 or length < shortest}
-    if not short:
-        return answer(model, sensitivities, p)
-    so_far = answer(_without(model, tuple(short)), sensitivities, p)
-    base, cost = so_far, [so_far.statistics]
-    for name, (length, rows) in short.items():
-        if shortest == 0.0 or not (length or rows.any()):
-            continue
-        longer, parameter = _with_time(model, name, tuple(n for n in short if n != name))
-        end = answer(longer, (*sensitivities, parameter), np.append(p, shortest))
-        so_far = _between(so_far, base, end, length / shortest, shortest, rows)
-        cost.append(end.statistics)
-    return replace(so_far, statistics=_sum(cost))
+    def run(self, p: Array) -> DelayedRun:
+        """Return the run at values (parameters,) in the model's order.
 
+        Raises TimingError for a negative delay, and as `EngineRuns.run` does.
+        """
+        return self._with_delays(p) if self.model.delays else self._answer(self._own, p)
 
-def _answer(code: Engine, out: Array, statistics: Statistics) -> DelayedRun:
-    s = code.structure.sizes
-    slopes = out[:, s.no :].reshape(len(out), s.no, s.width)[:, :, : s.np] if s.width else np.zeros((len(out), s.no, 0))
-    return DelayedRun(out[:, : s.no], slopes, statistics)
+    @cached_property
+    def _own(self) -> EngineRuns:
+        """The runs with all delays as they are."""
+        return self._prepared(self.model, self.sensitivities)
+
+    def _prepared(self, model: Model, sensitivities: Sequence[str]) -> EngineRuns:
+        engine = engine_of(model, sensitivities, self.outputs, brief=self.tolerance.brief)
+        scale = np.array([model.parameters[n].size for n in sensitivities]) if sensitivities else None
+        return engine.prepared(self.inputs, self.time, self.tolerance, self.method, scale, model)
+
+    @staticmethod
+    def _answer(runs: EngineRuns, p: Array) -> DelayedRun:
+        s = runs.engine.structure.sizes
+        out, statistics = runs.run(p)
+        none = np.zeros((len(out), s.no, 0))
+        slopes = out[:, s.no :].reshape(len(out), s.no, s.width)[:, :, : s.np] if s.width else none
+        return DelayedRun(out[:, : s.no], slopes, statistics)
+
+    def _with_delays(self, p: Array) -> DelayedRun:
+        model, tolerance, inputs = self.model, self.tolerance, self.inputs
+        span = float(self.time[-1] - self.time[0])
+        times, by_parameters = self._own.engine.delay_times(p)
+        shortest = 0.0
+        if (times < span / COARSEST).any():
+            plain = _without(model, tuple(model.delays))
+            engine = engine_of(plain, self.sensitivities, self.outputs, brief=tolerance.brief)
+            fastest = engine.fastest(p, inputs, self.time, tolerance, plain)
+            shortest = span / _steps(span * fastest, inputs, tolerance)
+        lengths = zip(model.delays, times.tolist(), by_parameters, strict=True)
+        short = {name: (length, rows) for name, length, rows in lengths if length == 0.0 or length < shortest}
+        if not short:
+            return self._answer(self._own, p)
+        so_far = self._answer(self._prepared(_without(model, tuple(short)), self.sensitivities), p)
+        base, cost = so_far, [so_far.statistics]
+        for name, (length, rows) in short.items():
+            if shortest == 0.0 or not (length or rows.any()):
+                continue
+            longer, parameter = _with_time(model, name, tuple(n for n in short if n != name))
+            end = self._answer(self._prepared(longer, (*self.sensitivities, parameter)), np.append(p, shortest))
+            so_far = _between(so_far, base, end, length / shortest, shortest, rows)
+            cost.append(end.statistics)
+        return replace(so_far, statistics=_sum(cost))
 
 
 def _steps(turns: float, inputs: Sequence[Any], tolerance: Tolerance) -> int:
