@@ -14,7 +14,6 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
 from hvdc_ident.data import Array, Experiment
@@ -42,6 +41,8 @@ NOT_TRIED = "not tried: the budget ended"
 """Failure of a candidate that was not simulated, or not refitted."""
 BATCH_SIZE = 150
 """Candidates in one piece of work: some tenths of a second."""
+TOGETHER = 64
+"""Candidates whose runs are compared in one go: a matrix product of so many columns takes little more than of one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,9 +98,12 @@ class Screen:
         slopes = np.column_stack([sketch(column) for column in at.jacobian.T])
         there = Linearised(sketch(at.residual), slopes, at.low, at.high)
         best: dict[int, float] = {}
-        for (k, n), added in self.answers.items():
-            reach = _reach(candidates[k], n) if in_proportion(candidates[k], n) else UP_TO_ONE
-            best[k] = min(there.stepped(added.astype(float), reach)[1], best.get(k, np.inf))
+        answers = list(self.answers.items())
+        for part in (answers[n : n + TOGETHER] for n in range(0, len(answers), TOGETHER)):
+            reach = [_reach(candidates[k], n) if in_proportion(candidates[k], n) else UP_TO_ONE for (k, n), _ in part]
+            _, chi2, _ = there.stepped(np.column_stack([added.astype(float) for _, added in part]), reach)
+            for ((k, _), _), left in zip(part, chi2.tolist(), strict=True):
+                best[k] = min(left, best.get(k, np.inf))
         return sorted(best, key=lambda k: best[k])
 
     def usable(self, column: tuple[int, int]) -> bool:
@@ -132,27 +136,38 @@ class Linearised:
         unit = self.jacobian / scale
         return unit, scale, unit.T @ unit, unit.T @ self.residual
 
-    def stepped(self, added: Array, reach: tuple[float, float], *, held: bool = False) -> tuple[Array, float, float]:
-        """Return the bounded step that lowers chi2 most to first order, chi2 after it, and the factor on the size.
+    def stepped(
+        self, added: Array, reach: Sequence[tuple[float, float]], *, held: bool = False
+    ) -> tuple[Array, Array, Array]:
+        """Return for k effects the bounded step that lowers chi2 most to first order, (k, p), chi2 after it, and the factor on the
+        size, both (k,).
 
-        added: (N,) what an effect adds to the residual in the size that was run. reach: bounds of the factor. held: whether it is 1.
+        added: (N, k) what each adds to the residual in the size that was run. reach: bounds of each factor. held: whether it is 1.
         """
         unit, scale, square, asked = self._normal
-        low, high = self.low * scale, self.high * scale
-        chi2, own, factor = float(self.residual @ self.residual), float(added @ self.residual), 1.0
+        count, p = added.shape[1], scale.size
+        low, high = np.tile(self.low * scale, (count, 1)), np.tile(self.high * scale, (count, 1))
+        chi2, own = float(self.residual @ self.residual), self.residual @ added
+        wanted, beside = np.tile(asked, (count, 1)), (unit.T @ added).T
         if held:
-            chi2 += 2.0 * own + float(added @ added)
-            asked = asked + unit.T @ added
-            step = _bounded(square, asked, low, high)
+            squares, chi2 = (
+                np.broadcast_to(square, (count, p, p)),
+                chi2 + 2.0 * own + np.einsum("nk,nk->k", added, added),
+            )
+            wanted = wanted + beside
         else:
-            size = float(np.linalg.norm(added)) or 1.0
-            beside = (unit.T @ added / size)[:, None]
-            square = np.block([[square, beside], [beside.T, np.ones((1, 1))]])
-            asked = np.append(asked, own / size)
-            step = _bounded(square, asked, np.append(low, reach[0] * size), np.append(high, reach[1] * size))
-            factor = float(step[-1]) / size
-        chi2 += float(2.0 * asked @ step + step @ square @ step)
-        return step[: scale.size] / scale, max(chi2, 0.0), factor
+            size = np.linalg.norm(added, axis=0)
+            size = np.where(size > 0.0, size, 1.0)
+            squares = np.ones((count, p + 1, p + 1))
+            squares[:, :p, :p] = square
+            squares[:, p, :p] = squares[:, :p, p] = beside / size[:, None]
+            wanted = np.column_stack([wanted, own / size])
+            ends = np.array(reach).reshape(count, 2) * size[:, None]
+            low, high = np.column_stack([low, ends[:, 0]]), np.column_stack([high, ends[:, 1]])
+        step = _bounded(squares, wanted, low, high)
+        after = chi2 + np.einsum("ki,ki->k", 2.0 * wanted + np.einsum("kij,kj->ki", squares, step), step)
+        factor = np.ones(count) if held else step[:, p] / size
+        return step[:, :p] / scale, np.maximum(after, 0.0), factor
 
 
 SKETCHED = 1024
@@ -220,6 +235,11 @@ class ScreenSetup:
     def at_rest(self) -> tuple[Experiment, ...]:
         """The experiments, those fitted begun at the steady state of the model without effects."""
         return tuple(_at_rest(self.nominal.problem, e, self.point) for e in self.nominal.problem.experiments)
+
+    @cached_property
+    def nominal_chi2(self) -> float:
+        """Sum of squared residuals of the model without effects at its optimum."""
+        return float(self.nominal.residual @ self.nominal.residual)
 
     @property
     def haste(self) -> Tolerance:
@@ -338,44 +358,54 @@ def _batches(
 
 def _screened_batch(batch: _Batch) -> _BatchResult:
     """The columns of a batch, simulated."""
-    setup, nominal, runner = batch.setup, batch.setup.nominal, _Runner(batch)
-    was = setup.without.residual
-    chi2 = float(nominal.residual @ nominal.residual)
-    found, sketch = _BatchResult([], {}, {}, np.zeros(setup.noise.shape[1]), {}, {}), Sketch(was.size)
-    answers: dict[tuple[int, int], Array] = {}
-    units: list[Array] = []
-    several = any(len(batch.candidates[k].at) > 1 for k, _ in batch.columns)
+    setup, runner = batch.setup, _Runner(batch)
+    found = _BatchResult([], {}, {}, np.zeros(setup.noise.shape[1]), {}, {})
+    answers: dict[tuple[int, int], Array] | None = {} if any(len(c.at) > 1 for c in batch.candidates.values()) else None
+    run: dict[tuple[int, int], Array] = {}
     for column in batch.columns:
         if len(batch.candidates[column[0]].at) > 1 and batch.movable:
             continue
         try:
-            r = runner(column)
+            run[column] = runner(column)
         except FAILURES as error:
             found.failures[column[0]] = str(error) or type(error).__name__
-            continue
-        step, fell, factor = setup.without.stepped(r - was, runner.reach(column), held=setup.held)
-        found.scores.append(Score(*column, chi2 - fell, setup.point + step, factor, setup.point))
-        left = nominal.projected((was - r)[:, None])[:, 0]
-        found.size[column], found.left[column] = float(np.sum((was - r) ** 2)), float(left @ left)
-        found.answers[column] = sketch.kept(r - was)
-        if several:
-            answers[column] = was - r
-        if found.size[column] >= EXCITED_CHI2 and found.left[column] > LEAST_SHARE_LEFT * found.size[column]:
-            units.append((left / np.sqrt(found.left[column])).astype(np.float32))
-        if len(units) == 64:
-            _raise_largest(found.largest, units, setup.noise)
-    _raise_largest(found.largest, units, setup.noise)
-    if several and batch.movable:
-        _at_several(batch, answers, found, chi2)
+        if len(run) == TOGETHER:
+            _compare(runner, run, found, answers)
+            run = {}
+    _compare(runner, run, found, answers)
+    if answers is not None and batch.movable:
+        _at_several(batch, answers, found, setup.nominal_chi2)
     return found
 
 
-def _raise_largest(largest: Array, units: list[Array], noise: NDArray[np.float32]) -> None:
-    """Raise the largest scores in records of noise to those of some answers, (N,) of length 1 each, which are then forgotten."""
-    if units:
-        scores = np.max(np.abs(np.array(units) @ noise), axis=0).astype(float) ** 2
-        np.maximum(largest, scores, out=largest)
-        units.clear()
+def _compare(
+    runner: _Runner,
+    run: Mapping[tuple[int, int], Array],
+    found: _BatchResult,
+    answers: dict[tuple[int, int], Array] | None,
+) -> None:
+    """Add what some columns do to what was found. run: by column its misfits; answers: to keep what each takes off the residual in."""
+    if not run:
+        return
+    setup = runner.batch.setup
+    nominal, was, columns = setup.nominal, setup.without.residual, list(run)
+    added = nominal.problem.residuals(np.column_stack(list(run.values()))) - was[:, None]
+    steps, fell, factors = setup.without.stepped(added, [runner.reach(c) for c in columns], held=setup.held)
+    left = nominal.projected(-added)
+    size, kept = np.einsum("nk,nk->k", added, added), np.einsum("nk,nk->k", left, left)
+    sketch = Sketch(was.size)
+    for n, column in enumerate(columns):
+        fall, theta = setup.nominal_chi2 - float(fell[n]), setup.point + steps[n]
+        found.scores.append(Score(*column, fall, theta, float(factors[n]), setup.point))
+        found.size[column], found.left[column] = float(size[n]), float(kept[n])
+        found.answers[column] = sketch.kept(added[:, n])
+        if answers is not None:
+            answers[column] = -added[:, n]
+    told = (size >= EXCITED_CHI2) & (kept > LEAST_SHARE_LEFT * size)
+    units = (left[:, told] / np.sqrt(kept[told])).astype(np.float32)
+    if units.size:
+        scores = np.max(np.abs(units.T @ setup.noise), axis=0).astype(float) ** 2
+        np.maximum(found.largest, scores, out=found.largest)
 
 
 def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: _BatchResult, chi2: float) -> None:
@@ -400,11 +430,11 @@ def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: 
             near, column = min(nearby, key=lambda s: abs(np.log(s[0] / size)) if s[0] > 0 else np.inf)
             parts.append(answers[column] * (size / near if near else 1.0))
         answer = np.sum(parts, axis=0, dtype=float)
-        step, fell, factor = setup.without.stepped(-answer, UP_TO_ONE)
+        steps, fell, factors = setup.without.stepped(-answer[:, None], [UP_TO_ONE])
         left = nominal.projected(answer[:, None])[:, 0]
         found.size[k, n], found.left[k, n] = float(answer @ answer), float(left @ left)
         found.answers[k, n] = Sketch(answer.size).kept(-answer)
-        found.scores.append(Score(k, n, chi2 - fell, setup.point + step, factor))
+        found.scores.append(Score(k, n, chi2 - float(fell[0]), setup.point + steps[0], float(factors[0])))
 
 
 def _distance(candidate: CandidateEffect, probe: int) -> float:
@@ -443,12 +473,12 @@ class _Runner:
         return {x: replace(p, experiments=self.batch.setup.at_rest) for x, p in self._problems.items()}
 
     def __call__(self, column: tuple[int, int]) -> Array:
-        """Return (N,) the whitened residual with a candidate in the size of a probe."""
+        """Return (M,) the misfits with a candidate in the size of a probe (`Problem.misfits`)."""
         setup, candidate = self.batch.setup, self.batch.candidates[column[0]]
         own, theta, probe = setup.nominal.problem, setup.point, candidate.probes[column[1]]
         if not self.batch.movable or not is_white_box(setup.model):
             larger = apply_effects(setup.model, [candidate.use(probe)])
-            return _residual(replace(own, simulator=ModelSimulator(larger, setup.patience)), theta, {})
+            return replace(own, simulator=ModelSimulator(larger, setup.patience)).misfits(theta, {})
         loop = on_loop(setup.model, candidate.at[0])
         moved = self.batch.movable[loop]
         known = own.values(theta) if candidate.named else {}
@@ -457,23 +487,27 @@ class _Runner:
         if effects()[
             candidate.effect
         ].self_exciting:  # what it does at the first row is no state that the plant rests in
-            return _residual(self._from_rest[loop], theta, values)
+            return self._from_rest[loop].misfits(theta, values)
         try:
-            return _residual(self._problems[loop], theta, values)
+            return self._problems[loop].misfits(theta, values)
         except FAILURES:  # it leaves no steady state, as levels in a loop do not, or none near
-            return _residual(self._from_rest[loop], theta, values)
+            return self._from_rest[loop].misfits(theta, values)
 
 
-def _residual(problem: Problem, theta: Array, values: Mapping[str, float]) -> Array:
-    return np.concatenate([b.residual for b in problem.blocks(theta, also=values, derivatives=False)])
-
-
-def _bounded(square: Array, asked: Array, least: Array, most: Array) -> Array:
-    """Return the x between bounds at which x' square x + 2 asked' x is least; square: of columns of length 1."""
+def _bounded(squares: Array, asked: Array, low: Array, high: Array) -> Array:
+    """Return (k, n) the x between bounds at which x' square x + 2 asked' x is least; squares: (k, n, n) of columns of length 1."""
     # What is made of the other columns is rounding alone.
-    half = np.linalg.cholesky(square + 1e-10 * np.eye(asked.size)).T
-    target = -solve_triangular(half, asked, trans="T")
-    step = solve_triangular(half, target)
-    if ((step < least) | (step > most)).any():
-        step = np.clip(lsq_linear(half, target, (least, most), method="bvls").x, least, most)
-    return np.asarray(step)
+    halves = np.linalg.cholesky(squares + 1e-10 * np.eye(asked.shape[1]))
+    targets = -np.linalg.solve(halves, asked[:, :, None])
+    steps = np.linalg.solve(halves.transpose(0, 2, 1), targets)[:, :, 0]
+    for k in np.flatnonzero(((steps < low) | (steps > high)).any(axis=1)):
+        half, target = halves[k].T, targets[k, :, 0]
+        clipped = np.clip(steps[k], low[k], high[k])
+        # Nearly always the best has what was out of bounds on them, and the rest within: then this is it.
+        on = clipped != steps[k]
+        clipped[~on] = np.linalg.lstsq(half[:, ~on], target - half[:, on] @ clipped[on])[0]
+        slope = half.T @ (half @ clipped - target)
+        outwards = np.where(clipped == low[k], slope >= 0.0, slope <= 0.0)
+        best = outwards[on].all() and ((low[k] <= clipped) & (clipped <= high[k])).all()
+        steps[k] = clipped if best else lsq_linear(half, target, (low[k], high[k]), method="bvls").x
+    return steps

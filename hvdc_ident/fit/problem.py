@@ -24,6 +24,7 @@ from hvdc_ident.fit.passed_noise import PassedNoise, passed_noise
 from hvdc_ident.fit.residual import (
     Band,
     ComparedRecord,
+    Comparison,
     ResidualBlock,
     Treatment,
     compared_records,
@@ -32,7 +33,7 @@ from hvdc_ident.fit.residual import (
     with_best_start,
     with_steady_start,
 )
-from hvdc_ident.fit.simulator import Simulator, approximate, unknown_of, unknowns
+from hvdc_ident.fit.simulator import Simulator, approximate, observe, unknown_of, unknowns
 from hvdc_ident.fit.whitening import AR
 from hvdc_ident.immutable import FrozenMap
 
@@ -211,24 +212,62 @@ class Problem:
         *,
         derivatives: bool = True,
         in_time: bool = False,
-        also: Mapping[str, float] | None = None,
     ) -> tuple[ResidualBlock, ...]:
         """Return the residuals of each output in each experiment; jacobians have a column for every unknown, without derivatives none.
 
         Neither the loss nor the priors are in them. in_time: samples in time
-        even where the fit is of spectra. also: values of further parameters of the simulator, for these runs. Raises
-        SimulationError where a run fails: theta is then inadmissible.
+        even where the fit is of spectra. Raises SimulationError where a run fails: theta is then inadmissible.
         """
         treatment = replace(self.treatment, band=None) if in_time else self.treatment
         width = len(self.names)
         blocks: list[ResidualBlock] = []
         for e in self.fitted_experiments:
             columns = self._columns[e.name]
-            answered = self._experiment(e, theta, derivatives, treatment, also)
+            answered = self._experiment(e, theta, derivatives, treatment)
             # Where every unknown is one of this experiment's they are in their order.
             whole = not derivatives or len(columns) == width
             blocks += answered if whole else [b.among(columns, width) for b in answered]
         return tuple(blocks)
+
+    def misfits(self, theta: Array, also: Mapping[str, float]) -> Array:
+        """Return (M,) what `residuals` makes the residuals of: the misfits of a run of each experiment, in standard deviations.
+
+        also: values of further parameters of the simulator. With unknown initial states, which are found for each run by itself, these
+        are the residuals. Raises SimulationError where a run fails.
+        """
+        if self.free_initial_states:
+            return np.concatenate(
+                [
+                    b.residual
+                    for e in self.fitted_experiments
+                    for b in self._experiment(e, theta, False, self.treatment, also)
+                ]
+            )
+        values = {**self.values(theta), **also}
+        found = []
+        for c in self._comparisons:
+            nuisance = self.nuisances(c.experiment, theta)
+            run = observe(self.simulator, c.experiment, values, (), nuisance, derivatives=False)
+            found.append(c.misfits(run.values))
+        return np.concatenate(found)
+
+    def residuals(self, misfits: Array) -> Array:
+        """Return (N, k) the residuals of all blocks in k runs, from their misfits (M, k): treated together in a fraction of the time."""
+        if self.free_initial_states:
+            return misfits
+        ends = np.cumsum([sum(r.rows.size for r in c.records) for c in self._comparisons])
+        parts = np.split(misfits, ends[:-1])
+        return np.vstack([c.residuals(part) for c, part in zip(self._comparisons, parts, strict=True)])
+
+    @cached_property
+    def _comparisons(self) -> tuple[Comparison, ...]:
+        """What the runs of each fitted experiment are compared with."""
+        found = []
+        for e in self.fitted_experiments:
+            treatment = self._treatment_of(e, self.treatment)
+            records = self._compared(e, treatment) or compared_records(e, treatment.guard)
+            found.append(Comparison(e, records, self.sigma[e.name], treatment))
+        return tuple(found)
 
     @cached_property
     def _columns(self) -> dict[str, list[int]]:
@@ -257,6 +296,12 @@ class Problem:
             e = with_best_start(e, blocks, states)
         return e, np.vstack([b.jacobian[:, : len(states)] for b in blocks])
 
+    @staticmethod
+    def _treatment_of(e: Experiment, treatment: Treatment) -> Treatment:
+        """Return the treatment of an experiment's misfits."""
+        # Measured responses are compared as they are: whitening, guards and bands are of samples in time.
+        return Treatment() if e.domain == "frequency" else treatment
+
     def _experiment(
         self,
         e: Experiment,
@@ -266,8 +311,7 @@ class Problem:
         also: Mapping[str, float] | None = None,
     ) -> tuple[ResidualBlock, ...]:
         """Return the residuals of one experiment; jacobians have a column for every unknown that it answers."""
-        if e.domain == "frequency":  # is compared as it is: whitening, guards and bands are of samples in time
-            treatment = Treatment()
+        treatment = self._treatment_of(e, treatment)
         eliminated = (
             unknown_initial_states(self.simulator, e) if self.free_initial_states and e.domain == "time" else ()
         )

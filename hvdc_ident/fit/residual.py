@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -212,6 +212,81 @@ def compared_records(experiment: Experiment, guard: float = 0.0) -> tuple[Compar
     return tuple(records)
 
 
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What runs of an experiment are compared with, in two steps: the first of each run by itself, the second of many together.
+
+    records: one for each measured output. sigma: standard deviation by output, in its unit. Of a spectrum residuals are fewer than rows.
+    """
+
+    experiment: Experiment
+    records: tuple[ComparedRecord, ...]
+    sigma: Mapping[str, float]
+    treatment: Treatment
+
+    def misfits(self, outputs: Mapping[str, Array]) -> Array:
+        """Return (M,) measured - simulated in standard deviations, all compared rows of an output after those of another; of a
+        rounded record in its unit.
+
+        outputs: (n,) by output, at the experiment's rows. Raises SimulationError where one grows beyond all bounds.
+        """
+        there = np.concatenate([outputs[r.output] if r.whole else outputs[r.output][r.rows] for r in self.records])
+        misfits = (self._measured - there) / self._deviations
+        if not np.abs(misfits).max(initial=0.0) < SQUARABLE:
+            for r, part in zip(self.records, self._parts(misfits), strict=True):
+                _require_squarable(part, r.output, self.experiment.name)
+        return np.asarray(misfits)
+
+    def residuals(self, misfits: Array) -> Array:
+        """Return (N, k) the residuals of k runs, as those of `residual_blocks`, from their misfits (M, k)."""
+        name, found = self.experiment.name, []
+        for r, part in zip(self.records, self._parts(misfits), strict=True):
+            quantised = self._quantised(r)
+            if quantised is not None:
+                found.append(quantised.residual(part)[0])
+            else:
+                found.append(self.treatment.applied(part, r.time, r.output, f"experiment '{name}'"))
+        rows = np.vstack(found)
+        if name not in self.treatment.passed:
+            return rows
+        none = np.empty(0)
+        blocks = [
+            ResidualBlock(name, r.output, r.rows, none, self.sigma[r.output], none, none, profile=r.profile)
+            for r in self.records
+        ]
+        return whitened_together(rows, blocks, [r.time for r in self.records], self.treatment)
+
+    def _quantised(self, record: ComparedRecord) -> QuantisedNoise | None:
+        return self.treatment.quantised(record.output, self.experiment.name) if record.profile is None else None
+
+    def _parts(self, misfits: Array) -> list[Array]:
+        """The rows of each record."""
+        return np.split(misfits, np.cumsum([r.rows.size for r in self.records])[:-1])
+
+    @cached_property
+    def _measured(self) -> Array:
+        return np.concatenate([r.values for r in self.records])
+
+    @cached_property
+    def _deviations(self) -> Array:
+        """(M,) what each misfit is divided by."""
+        found = []
+        for r in self.records:
+            own = np.ones(r.rows.size) if r.profile is None else r.profile
+            found.append(own if self._quantised(r) is not None else self.sigma[r.output] * own)
+        return np.concatenate(found)
+
+
+def _require_squarable(scaled: Array, output: str, experiment: str) -> None:
+    """Raise SimulationError where an output or its sensitivity, in standard deviations, grows beyond all bounds."""
+    if not np.abs(scaled).max(initial=0.0) < SQUARABLE:
+        raise SimulationError(
+            f"output '{output}' or its sensitivity grows beyond all bounds",
+            where=f"experiment '{experiment}'",
+            expected=f"below {SQUARABLE:g} standard deviations",
+        )
+
+
 @dataclass(frozen=True)
 class Treatment:
     """The steps that turn misfits into residuals.
@@ -286,12 +361,7 @@ def residual_blocks(
             jacobian, spare = slopes * slope[:, None], quantised.spare
         else:
             scaled = per_deviation(np.column_stack([misfit, slopes]), weight, record.profile)
-            if not np.abs(scaled).max(initial=0.0) < SQUARABLE:
-                raise SimulationError(
-                    f"output '{output}' or its sensitivity grows beyond all bounds",
-                    where=f"experiment '{experiment.name}'",
-                    expected=f"below {SQUARABLE:g} standard deviations",
-                )
+            _require_squarable(scaled, output, experiment.name)
             treated = treatment.applied(scaled, record.time, output, f"experiment '{experiment.name}'")
             residual, jacobian, slope, spare = np.ascontiguousarray(treated[:, 0]), treated[:, 1:], None, 0.0
         block = ResidualBlock(

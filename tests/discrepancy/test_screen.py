@@ -25,11 +25,19 @@ from tests.discrepancy.cases import experiments, model
 from tests.discrepancy.refits import plain
 
 
+def stepped(
+    at: Linearised, added: Array, reach: tuple[float, float], *, held: bool = False
+) -> tuple[Array, float, float]:
+    """Return the step with one effect (`Linearised.stepped`), beside another one that is none of it."""
+    steps, left, factors = at.stepped(np.column_stack([added, at.residual]), [reach, UP_TO_ONE], held=held)
+    return steps[0], float(left[0]), float(factors[0])
+
+
 def test_what_runs_away_is_none_of_it() -> None:
     """An unstable candidate's answer is 1e30 times the residual: none of it explains anything."""
     residual, jacobian, low, high = problems(3)
     away = 1e30 * np.exp(np.linspace(0.0, 5.0, 40))
-    step, left, factor = Linearised(residual, jacobian, low, high).stepped(away, UP_TO_ONE)
+    step, left, factor = stepped(Linearised(residual, jacobian, low, high), away, UP_TO_ONE)
     without = lsq_linear(jacobian, -residual, (low, high), tol=1e-14)
     assert left <= 2.0 * without.cost * (1.0 + 1e-9) and abs(factor) * 1e30 < 10.0 * np.abs(residual).max()
     assert left > 0.5 * without.cost and np.all(step >= low) and np.all(step <= high)
@@ -61,7 +69,7 @@ def problems(seed: int) -> tuple[Array, Array, Array, Array]:
 def test_a_step_without_bounds_is_that_of_least_squares(seed: int) -> None:
     residual, jacobian, low, high = problems(seed)
     slope = np.random.default_rng(1000 + seed).standard_normal(40)
-    step, left, factor = Linearised(residual, jacobian, 1e9 * low - 1e9, 1e9 * high + 1e9).stepped(slope, ANY_FACTOR)
+    step, left, factor = stepped(Linearised(residual, jacobian, 1e9 * low - 1e9, 1e9 * high + 1e9), slope, ANY_FACTOR)
     columns = np.column_stack([jacobian, slope])
     best = np.linalg.lstsq(columns, -residual)[0]
     assert np.append(step, factor) == pytest.approx(best, rel=1e-6)
@@ -75,7 +83,7 @@ def test_a_step_within_bounds_is_the_best_there_is(reach: tuple[float, float]) -
     for seed in range(60):
         residual, jacobian, low, high = problems(seed)
         slope = np.random.default_rng(1000 + seed).standard_normal(40)
-        step, left, factor = Linearised(residual, jacobian, low, high).stepped(slope, reach, held=reach[0] == 1.0)
+        step, left, factor = stepped(Linearised(residual, jacobian, low, high), slope, reach, held=reach[0] == 1.0)
         columns = np.column_stack([jacobian, slope])
         best = lsq_linear(columns, -residual, (np.append(low, reach[0]), np.append(high, reach[1])), tol=1e-14)
         assert np.all(step >= low * (1.0 + 1e-12)) and np.all(step <= high * (1.0 + 1e-12))
