@@ -178,13 +178,16 @@ def _optimisers(e: dict[str, Any]) -> str:
 
 
 def _units(e: dict[str, Any]) -> str:
-    units = e["units"].values()
+    units = e["effects"].values()
     found = sum(u.get("effect") in ("named", "covered") for u in units)
     near = sum(u.get("parameter") in ("found", "near") for u in units)
     seconds = [u["cpu_seconds"] for u in units]
+    others = [u.get(outcome) for n, outcome in (("cards", "card"), ("values", "named")) for u in e[n].values()]
+    told = sum(o in ("named", "covered") for o in others)
     return (
         f"of {len(units)} units, the effect is named or among the likely ones for {found}, the wrong parameter within its interval "
-        f"or 5 % for {near}; {number(np.median(seconds), 2)} s of CPU each (median)"
+        f"or 5 % for {near}; {number(np.median(seconds), 2)} s of CPU each (median); of {len(others)} with another card or a wrong value "
+        f"that is not asked about, that is named or among the likely ones for {told}"
     )
 
 

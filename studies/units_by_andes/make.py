@@ -20,7 +20,7 @@ HERE = Path(__file__).resolve().parent
 if str(HERE) not in sys.path:
     sys.path.insert(0, str(HERE))
 
-from units import PLANTS, Plant  # noqa: E402
+from units import PLANTS, Plant, dyr  # noqa: E402
 
 SEED = 7
 STEPS_A_ROW = 5
@@ -34,7 +34,10 @@ NOISE = 0.005
 noise of a phasor has no direction."""
 CLOCK, OFFSET, MISSING = 0.4, 0.006, 0.02
 """Of messy records: rows by which the powers are late, share of the base by which the reactive power is off, share of missing rows."""
-ORDERS = {"ESST1A": "UEL VOS TR VIMAX VIMIN TB TC TB1 TC1 VAMAX VAMIN KA TA ILR KLR VRMAX VRMIN KF TF KC"}
+ORDERS = {
+    "AC8B": "TR KPR KIR KDR TDR VPIDMAX VPIDMIN VRMAX VRMIN VFEMAX VEMIN TA KA TE KC KD KE E1 SE1 E2 SE2",
+    "ESST1A": "UEL VOS TR VIMAX VIMIN TB TC TB1 TC1 VAMAX VAMIN KA TA ILR KLR VRMAX VRMIN KF TF KC",
+}
 """Order in which andes reads the values of a record, where it is not PSS/E's."""
 OF_SYSTEM, SYSTEM = (("IEEEG1", "UO"), ("IEEEG1", "UC")), 100.0
 """Values that andes takes in pu of the system's base, where PSS/E has them in pu of the machine's, and that base, MVA."""
@@ -68,13 +71,6 @@ Q
 
 ANDES_NAMES = {"TW": "Tw", "Dturb": "Dt"}
 """Names of HYGOV's values in andes where they differ: HYGOVDB is not read from a .dyr file."""
-
-
-def dyr(records: dict[str, dict[str, float]], order: dict[str, str] | None = None) -> str:
-    """Return the text of a .dyr file. order: of the values, by model, where it is not PSS/E's."""
-    orders = {m: o.split() for m, o in (order or {}).items()}
-    rows = ((m, [v[n] for n in orders.get(m, v)]) for m, v in records.items())
-    return "".join(f"1 '{m}' 1 {' '.join(f'{v:g}' for v in values)} /\n" for m, values in rows)
 
 
 def simulated(plant: Plant, folder: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:

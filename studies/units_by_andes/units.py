@@ -1,4 +1,4 @@
-"""The ten units: what the plant is, what the vendor's .dyr says instead, and what the diagnosis should tell."""
+"""The units: what the plant is, what the vendor's .dyr says instead, and what the diagnosis should tell."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import hvdc_ident
 
@@ -14,8 +15,13 @@ SHELF = Path(hvdc_ident.__file__).parent / "shelf"
 GENROU = (7.0, 0.03, 0.75, 0.05, 3.0, 0.0, 2.1, 2.0, 0.2, 0.5, 0.18, 0.15, 0.05, 0.3)
 HYDRO = (6.0, 0.04, 0.5, 0.06, 4.0, 0.0, 1.1, 0.7, 0.3, 0.45, 0.2, 0.12, 0.1, 0.4)
 SEXS = (0.1, 10.0, 100.0, 0.1, 0.0, 5.0)
+AC8B = (
+    0.02, 20.0, 5.0, 4.0, 0.1, 99.0, -99.0, 1.0, 0.02, 99.0, -99.0, 0.3, 0.5, 1.0, 1.2, 99.0, -99.0, 3.0, 0.1, 4.5, 0.5,
+)  # fmt: skip
+EXAC1 = (0.0, 1.0, 0.2, 150.0, 0.05, 99.0, -99.0, 0.8, 0.05, 1.0, 0.2, 0.38, 1.0, 3.0, 0.1, 4.5, 0.5)
 TGOV1 = (0.05, 0.5, 1.2, 0.0, 2.0, 6.0, 0.0)
 IEEEG1 = (0, 0, 20.0, 0.0, 0.0, 0.1, 99.0, -99.0, 1.2, 0.0, 0.3, 0.3, 0.0, 8.0, 0.4, 0.0, 0.5, 0.3, 0.0, 0.0, 0.0, 0.0)
+GAST = (0.05, 0.4, 0.1, 3.0, 0.82, 2.0, 1.2, -0.05, 0.0)
 HYGOV = (0.05, 0.4, 2.5, 0.05, 0.5, 9.0, 1.2, 0.0, 1.3, 1.2, 0.2, 0.08)
 IEEET1 = (0.0, 50.0, 0.05, 9.0, -9.0, 1.0, 0.5, 0.08, 1.0, 0.0, 3.0, 0.05, 4.0, 0.3)
 EXST1 = (0.02, 9.0, -9.0, 1.0, 10.0, 200.0, 0.02, 99.0, -99.0, 0.0, 0.0, 1.0)
@@ -42,6 +48,9 @@ ESST1A = (
     5.0,
 )
 IEEEST = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.2, 0.05, 0.25, 0.04, 5.0, 5.0, 5.0, 0.2, -0.2, 0.0, 0.0)
+ST2CUT = (
+    1.0, 0.0, 3.0, 0.0, 8.0, -0.6, 0.02, 0.02, 5.0, 5.0, 0.2, 0.05, 0.2, 0.05, 0.0, 0.0, 0.2, -0.2, 0.0, 0.0,
+)  # fmt: skip
 REGCA1 = (0, 0.02, 10.0, 0.9, 0.4, 1.22, 1.2, 0.8, 0.4, -1.3, 0.02, 0.7, 99.0, -99.0, 0.7)
 REECA1 = (
     0, 0, 0, 1, 0, 1, 0.5, 1.3, 0.0, -0.9, 0.9, 0.0, 1.05, -1.05, 1.0, 0.0, 0.0, 0.0, 0.05, 0.8, -0.8, 1.3, -1.3, 0.0, 0.1,
@@ -75,17 +84,34 @@ class Hidden:
 
 
 @dataclass(frozen=True)
+class Card:
+    """The card that the plant has and the vendor's .dyr lacks. model: its record's; component: the part of the unit that it is;
+    stated: the records that the vendor's .dyr has in its place, none where it has no such part; also: other cards that do the same, with
+    the values with which they do."""
+
+    model: str
+    component: str
+    stated: Mapping[str, tuple[float, ...]]
+    also: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def right(self, card: str, component: str) -> bool:
+        """Return True if a card, upper or lower case, at a part of the unit is this one."""
+        return component == self.component and card.upper() in (self.model, *self.also)
+
+
+@dataclass(frozen=True)
 class Plant:
-    """One unit. records: of its .dyr; true: values of the plant that differ from them, by MODEL.NAME; vendor: values of the vendor's
-    .dyr that differ from the plant's; wrong: the parameter, of these, that the diagnosis should estimate, by its name in the unit;
-    instead: models of andes that take the places of records, with the values that those lack.
+    """One unit. records: of its .dyr; hidden: what the vendor's .dyr lacks, None where a value alone is wrong; true: values of the plant
+    that differ from the records, by MODEL.NAME; vendor: values of the vendor's .dyr that differ from the plant's; wrong: the parameter, of
+    these, that the diagnosis should estimate, by its name in the unit, "" where a card is wrong; instead: models of andes that take the
+    places of records, with the values that those lack.
 
     f0: Hz; Sn: MVA of the machine; P: MW; frequency, voltage: corners (s, Hz) and (s, pu) of the deviations of the grid;
     channel: what the recorder has, the angle or the frequency; rate: rows a second; end: s. mess: what is untidy in the record.
     """
 
     records: Mapping[str, tuple[float, ...]]
-    hidden: Hidden
+    hidden: Hidden | Card | None
     wrong: str
     true: Mapping[str, float]
     vendor: Mapping[str, float]
@@ -100,14 +126,29 @@ class Plant:
     end: float = 18.0
     mess: tuple[str, ...] = ()
 
-    def values(self, vendor: bool) -> dict[str, dict[str, float]]:
-        """Return the values of the plant's records, or of the vendor's, by model and name, in the record's order."""
-        found = {model: dict(zip(names(model), values, strict=True)) for model, values in self.records.items()}
+    def values(self, vendor: bool, also: str = "") -> dict[str, dict[str, float]]:
+        """Return the values of the plant's records, or of the vendor's, by model and name, in the record's order.
+
+        also: the card that does the same, in the place of the plant's.
+        """
+        records = self.records
+        if isinstance(self.hidden, Card) and (vendor or also):
+            records = self._with({also: self.hidden.also[also]} if also else self.hidden.stated)
+        found = {model: dict(zip(names(model), values, strict=True)) for model, values in records.items()}
         for name, value in {**self.true, **(self.vendor if vendor else {})}.items():
             model, _, parameter = name.partition(".")
+            if model in self.records and model not in records:
+                continue  # a value of the card that the vendor's .dyr lacks
             if parameter not in found[model]:
                 raise KeyError(f"{model} has no {parameter}")
             found[model][parameter] = value
+        return found
+
+    def _with(self, others: Mapping[str, tuple[float, ...]]) -> dict[str, tuple[float, ...]]:
+        """Return the records with others in the place of the card that the vendor's .dyr lacks."""
+        found: dict[str, tuple[float, ...]] = {}
+        for model, values in self.records.items():
+            found |= others if isinstance(self.hidden, Card) and model == self.hidden.model else {model: values}
         return found
 
     def truth(self) -> float:
@@ -123,6 +164,13 @@ class Plant:
         return next(v for n, v in changes.items() if n.partition(".")[2] == parameter)
 
 
+def dyr(records: Mapping[str, Mapping[str, float]], order: Mapping[str, str] | None = None) -> str:
+    """Return the text of a .dyr file. order: of the values, by model, where it is not PSS/E's."""
+    orders = {m: o.split() for m, o in (order or {}).items()}
+    rows = ((m, [v[n] for n in orders.get(m, v)]) for m, v in records.items())
+    return "".join(f"1 '{m}' 1 {' '.join(f'{v:g}' for v in values)} /\n" for m, values in rows)
+
+
 def names(model: str) -> list[str]:
     """Return the names of the values of a record; a value that is not read has the name of its position."""
     record = tomllib.loads((SHELF / f"{model.lower()}.toml").read_text(encoding="utf-8"))["record"]
@@ -135,7 +183,7 @@ DEADBAND = ("deadband",)
 LAG = ("lag", "second-order", "delay", "window-mean", "inner-loop", "filter", "lead-lag")
 UPPER = ("limit", "saturation", "non-windup-limit")
 
-PLANTS = {
+EFFECTS = {
     "steam_dead_band": Plant(
         {"GENROU": GENROU, "SEXS": SEXS, "TGOV1": TGOV1},
         Hidden("dead band of the governor, ±36 mHz", DEADBAND, ("gov.dw", "gen.dw")),
@@ -265,3 +313,139 @@ PLANTS = {
         mess=("offset",),
     ),
 }
+"""Units whose .dyr has one wrong parameter and lacks one effect."""
+
+STEAM = {"GENROU": GENROU, "SEXS": SEXS, "TGOV1": TGOV1}
+HYDRO_FREQUENCY = ((2.0, 0.0), (5.0, -0.25), (12.0, -0.25), (14.0, 0.1), (20.0, 0.1), (22.0, 0.0))
+
+
+def _changed(model: str, values: tuple[float, ...], **changes: float) -> tuple[float, ...]:
+    """Return the values of a record with some of them changed."""
+    return tuple({**dict(zip(names(model), values, strict=True)), **changes}.values())
+
+
+IEESGO = (0.1, 1.0, 0.1, 0.3, 10.0, 0.5, 20.0, 0.8, 0.625, 1.2, 0.0)
+IEEEX1 = (0.0, 100.0, 0.2, 0.0, 0.0, 9.0, -9.0, 1.0, 1.0, 0.05, 1.0, 0.0, 3.0, 0.05, 4.0, 0.3)
+ESAC1A = (
+    0.0, 1.0, 0.2, 150.0, 0.05, 99.0, -99.0, 0.8, 0.05, 1.0, 0.2, 0.38, 1.0, 3.0, 0.1, 4.5, 0.5, 99.0, -99.0,
+)  # fmt: skip
+ONE_INPUT = (
+    1.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0, 0.0, 5.0, 5.0, 0.2, 0.05, 0.25, 0.04, 0.0, 0.0, 0.2, -0.2, 0.0, 0.0,
+)  # fmt: skip
+PSS2B = (
+    1, 0, 3, 0, 0, 0, 5.0, 0.0, 0.0, 5.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.2, 0.05, 0.25, 0.04, 0.0, 0.0, 99.0, -99.0,
+    99.0, -99.0, 0.2, -0.2,
+)  # fmt: skip
+"""Values with which cards do what another one does in the plant."""
+
+
+def _carded(records: Mapping[str, tuple[float, ...]], card: Card, **more: Any) -> Plant:
+    """Return a unit with a card that the vendor's .dyr lacks."""
+    return Plant(records, card, "", more.pop("true", {}), {}, more.pop("frequency", FALL), DIP, **more)
+
+
+CARDS = {
+    "steam_stages": _carded(
+        {"GENROU": GENROU, "SEXS": SEXS, "IEEEG1": IEEEG1},
+        Card("IEEEG1", "gov", {"TGOV1": (0.05, 0.3, 1.2, 0.0, 2.4, 8.0, 0.0)}, {"IEESGO": IEESGO}),
+        true={
+            "IEEEG1.T1": 0.1,
+            "IEEEG1.T2": 1.0,
+            "IEEEG1.K1": 0.2,
+            "IEEEG1.K3": 0.3,
+            "IEEEG1.T5": 10.0,
+            "IEEEG1.K5": 0.5,
+        },
+    ),
+    "hydro_as_steam": _carded(
+        {"GENROU": HYDRO, "EXST1": EXST1, "HYGOV": HYGOV},
+        Card("HYGOV", "gov", {"TGOV1": TGOV1}),
+        frequency=HYDRO_FREQUENCY,
+        Sn=100.0,
+        P=80.0,
+        f0=50.0,
+        end=26.0,
+    ),
+    "gas_as_steam": _carded(
+        {"GENROU": GENROU, "SEXS": SEXS, "GAST": GAST},
+        Card("GAST", "gov", {"TGOV1": (0.05, 0.4, 1.2, 0.0, 2.0, 6.0, 0.0)}),
+    ),
+    "static_exciter_simplified": _carded(
+        {"GENROU": GENROU, "EXST1": EXST1, "TGOV1": TGOV1},
+        Card(
+            "EXST1",
+            "avr",
+            {"SEXS": (0.1, 10.0, 200.0, 0.05, -5.0, 8.0)},
+            {"ESST1A": _changed("ESST1A", ESST1A, TR=0.05, VIMAX=0.015, VIMIN=-0.015, TC=1.0, TB=10.0, TA=0.02)},
+        ),
+        true={"EXST1.TR": 0.05, "EXST1.VIMAX": 0.015, "EXST1.VIMIN": -0.015},
+    ),
+    "dc_exciter_simplified": _carded(
+        {"GENROU": GENROU, "IEEET1": IEEET1, "TGOV1": TGOV1},
+        Card("IEEET1", "avr", {"SEXS": SEXS}, {"IEEEX1": IEEEX1, "ESDC2A": IEEEX1}),
+        true={"IEEET1.KA": 100.0, "IEEET1.TA": 0.2, "IEEET1.TE": 1.0, "IEEET1.KF": 0.05},
+    ),
+    "ac_exciter_as_static": _carded(
+        {"GENROU": GENROU, "EXAC1": EXAC1, "TGOV1": TGOV1},
+        Card("EXAC1", "avr", {"EXST1": EXST1}, {"ESAC1A": ESAC1A}),
+    ),
+    "stabiliser_missing": _carded(
+        {"GENROU": GENROU, "EXST1": EXST1, "IEEEST": IEEEST, "TGOV1": TGOV1},
+        Card("IEEEST", "pss", {}, {"ST2CUT": ONE_INPUT, "PSS2B": PSS2B}),
+        true={"IEEEST.KS": 8.0},
+    ),
+    "stabiliser_of_one_input": _carded(
+        {"GENROU": GENROU, "EXST1": EXST1, "ST2CUT": ST2CUT, "TGOV1": TGOV1},
+        Card(
+            "ST2CUT",
+            "pss",
+            {"IEEEST": IEEEST},
+            {"PSS2B": _changed("PSS2B", PSS2B, T6=0.02, T7=0.02, KS2=0.075, T3=0.2, T4=0.05)},
+        ),
+    ),
+    "wind_as_solar": _carded(
+        {"REGCA1": REGCA1, "REECA1": REECA1, "REPCA1": REPCA1},
+        Card("REECA1", "elec", {"REECB1": _changed("REECB1", REECB1, Vdip=0.985)}),
+        true={"REECA1.QFLAG": 0.0, "REECA1.Kqv": 2.0, "REECA1.Vdip": 0.985, "REECA1.Iqfrz": 0.1, "REECA1.Thld": 1.0},
+        Sn=100.0,
+        P=80.0,
+    ),
+    "plant_controller_missing": _carded(
+        {"REGCA1": REGCA1, "REECB1": REECB1, "REPCA1": REPCA1},
+        Card("REPCA1", "plant", {}),
+        true={"REPCA1.Fflag": 1.0},
+        Sn=100.0,
+        P=80.0,
+    ),
+}
+"""Units whose .dyr has another card than the plant, with values that are usual for it, or lacks one."""
+
+VALUES = {
+    "reheater": Plant(STEAM, None, "gov.T3", {"TGOV1.T3": 14.0}, {"TGOV1.T3": 8.0}, FALL, DIP),
+    "regulator_integral": Plant(
+        {"GENROU": GENROU, "AC8B": AC8B, "TGOV1": TGOV1},
+        None,
+        "avr.KIR",
+        {"AC8B.KIR": 7.5},
+        {"AC8B.KIR": 5.0},
+        FALL,
+        DIP,
+    ),
+    "field_time_constant": Plant(STEAM, None, "gen.Tpdo", {"GENROU.Tpdo": 8.0}, {"GENROU.Tpdo": 5.0}, FALL, DIP),
+    "droop_of_another_base": Plant(
+        {"REGCA1": REGCA1, "REECB1": REECB1, "REPCA1": REPCA1},
+        None,
+        "plant.Kc",
+        {"REPCA1.Kc": 0.05},
+        {"REPCA1.Kc": 0.125},
+        FALL,
+        DIP,
+        Sn=100.0,
+        P=80.0,
+    ),
+}
+"""Units whose .dyr has a wrong value of a parameter that the study does not ask about."""
+
+SETS: Mapping[str, Mapping[str, Plant]] = {"effects": EFFECTS, "cards": CARDS, "values": VALUES}
+PLANTS = {name: plant for units in SETS.values() for name, plant in units.items()}
+"""All of them."""
