@@ -28,14 +28,14 @@ class _CapturedError(Exception):
 
 def asked_of_screen(case: str) -> tuple[Any, Any, list[tuple[int, int]]]:
     """Return the setup, the candidates and the columns of a case's first screen."""
-    from hvdc_ident.discrepancy import diagnose, rounds
+    from hvdc_ident.discrepancy import diagnose, expansion
 
-    whole = rounds.screened
+    whole = expansion.screened
 
     def captured(setup: Any, candidates: Any, *, columns: Any, **_: Any) -> Any:
         raise _CapturedError(setup, candidates, list(columns))
 
-    rounds.screened = captured
+    expansion.screened = captured
     try:
         if case == "link":
             import diagnose as link
@@ -57,7 +57,7 @@ def asked_of_screen(case: str) -> tuple[Any, Any, list[tuple[int, int]]]:
         setup, candidates, columns = found.args
         return setup, candidates, columns
     finally:
-        rounds.screened = whole
+        expansion.screened = whole
     raise AssertionError(f"{case}: nothing was screened")
 
 

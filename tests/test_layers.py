@@ -20,9 +20,8 @@ fmu linearize sensitivity linear fit identifiability discrepancy summary report 
 # Rooms with rooms inside, and the order of those.
 INSIDE = {
     "discrepancy": """
-options result candidates movable nominal prediction hypothesis screen location residual_checks implied evidence pushes rounds explain
-stand_ins moves known_errors remainder forms size_search search candidate_table classes findings verdict
-unknown_noise diagnosis
+options result candidates movable nominal prediction hypothesis screen location residual_checks misfit score pushes expansion
+sentences stand_ins clocks stated remainder outside sizes effect_moves search classes findings conclusion unknown_noise diagnosis
 """,
     "linearize": """
 limits system delays sampling characteristic stability descriptor equilibrium plot derivatives point branches linear_model zeros

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,23 +12,25 @@ from typing import TypeVar
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import (
+from hvdc_ident.discrepancy.expansion import Expansion
+from hvdc_ident.discrepancy.hypothesis import Refit
+from hvdc_ident.discrepancy.movable import in_proportion
+from hvdc_ident.discrepancy.options import CERTAIN, TOLERANCE, DiagnosisOptions
+from hvdc_ident.discrepancy.outside import expression
+from hvdc_ident.discrepancy.result import VALUE, Hypothesis, Rival
+from hvdc_ident.discrepancy.score import (
+    TIED,
     CandidateFit,
-    Ruler,
+    apart,
     at_edge,
     best_gain,
     deficits,
-    evidence_between,
+    implied,
+    nearest,
+    off_given,
     same_answers,
 )
-from hvdc_ident.discrepancy.forms import expression
-from hvdc_ident.discrepancy.hypothesis import Refit
-from hvdc_ident.discrepancy.implied import TIED, apart, implied, nearest, off_given
-from hvdc_ident.discrepancy.movable import in_proportion
-from hvdc_ident.discrepancy.options import CERTAIN, TOLERANCE, DiagnosisOptions
-from hvdc_ident.discrepancy.result import Hypothesis, Rival
-from hvdc_ident.discrepancy.rounds import Round
-from hvdc_ident.discrepancy.search import SearchOutcome
+from hvdc_ident.discrepancy.search import P_EFFECT, Kept, SearchOutcome, Term
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 
@@ -37,33 +40,37 @@ UNNOTICED_SHARE = 0.15
 """Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
 
 
-def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True) -> tuple[Rival, ...]:
-    """The winner and every candidate within delta BIC of it, the best first, and those that are the same equation or do the same.
+def rivals(kept: Kept, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True) -> tuple[Rival, ...]:
+    """The term that was kept and everything that explains the records as well in its stead, the best first.
 
     What does the same within the tolerance, with no parameter more, is listed however far behind it is: no model is right to
-    the last unit of evidence.
-    tries: whether an effect is one of those that are looked for.
+    the last unit of evidence. So are effects that are the same equation. tries: whether an effect is one of those that are looked for.
     """
-    assert found.winner is not None and found.ruler is not None
-    behind_by = deficits(found.trials)
+    found = kept.expansion
+    assert found.ruler is not None
+    others = [t for _, t in kept.others]
+    own = found.winner or next(t for term, t in kept.others if term == kept.term)
+    behind_by = deficits([*found.trials, *others])
     # One that explains as much is no nothing, even where gains make good any size of it; one at its edge is another's work.
-    sound = [t is found.winner or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
+    sound = [t is own or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
     # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
-    alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=True)) < 2
+    alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=False)) < 2
+    count = Counter(c.effect for c in found.candidates)
     group: list[Rival] = []
     further: list[Rival] = []
-    for trial, behind, good in zip(found.trials, behind_by, sound, strict=True):
+    for trial, behind, good in zip(found.trials, behind_by, sound, strict=False):
         c = found.candidates[trial.pick.candidate]
-        more = trial.refit.count - found.winner.refit.count
-        spared = more == 1 and (not alone or _as_likely(found, c, options))
+        more = len(trial.refit.problem.free) - len(own.refit.problem.free)
+        spared = more == 1 and found.winner is not None and (not alone or _as_likely(found, c, options))
         sizes = FrozenMap(trial.refit.sizes(trial.refit.placed[-1]))
-        values, off = implied(trial.refit), off_given(trial.refit)
-        rival = Rival(c.effect, c.at, behind, sizes, c.source, values=values, off_given=off)
+        rival = Rival(
+            c.effect, c.at, behind, sizes, c.source, values=implied(trial.refit), off_given=off_given(trial.refit)
+        )
         if good and behind <= options.set_bic + (found.ruler.price if spared else 0.0):
             group.append(rival)
-        elif good and more <= 0 and trial.total_gain >= (1.0 - TOLERANCE) * found.winner.total_gain:
+        elif good and more <= 0 and trial.total_gain >= (1.0 - TOLERANCE) * own.total_gain:
             further.append(rival)
-    group += _unfitted(found, best_gain(found.trials), options)
+    group += _unfitted(found, best_gain([*found.trials, *others]), options)
     group += _at_rest(found, group)
     group += _equal(found, group, tries)
     each: dict[tuple[str, tuple[str, ...], str], Rival] = {}
@@ -72,17 +79,30 @@ def rivals(found: Round, options: DiagnosisOptions, tries: Callable[[str], bool]
         each.setdefault((r.effect, r.at, r.source), r)
         if r.same_as:
             same[r.effect, r.at, r.source] = r.same_as
-    count = Counter(c.effect for c in found.candidates)
     within = [replace(r, same_as=same.get(key, "")) for key, r in each.items()]
     further = [r for r in further if (r.effect, r.at, r.source) not in each]
     akin = _akin(found, within, further)
     whole = [replace(r, akin=a) for r, a in zip([*within, *further], akin, strict=True)]
-    return tuple(
-        replace(r, prior=1.0 / max(count[r.effect], 1)) for k, r in enumerate(whole) if k < len(within) or r.akin
-    )
+    whole = [replace(r, prior=1.0 / max(count[r.effect], 1)) for k, r in enumerate(whole) if k < len(within) or r.akin]
+    beside = zip(kept.others, behind_by[len(found.trials) :], strict=True)
+    kinds = max(len(count), 1)
+    whole += [
+        _other_rival(term, t.refit, behind, term.prior / P_EFFECT * kinds)
+        for (term, t), behind in beside
+        if behind <= options.set_bic
+    ]
+    return tuple(sorted(whole, key=lambda r: r.delta_bic))
 
 
-def _akin(found: Round, group: Sequence[Rival], further: Sequence[Rival] = ()) -> list[str]:
+def _other_rival(term: Term, refit: Refit, behind: float, prior: float) -> Rival:
+    """The member of a set that says that a stated value is another, or a component of another type."""
+    known = implied(refit)
+    sizes = FrozenMap({n: refit.values[n] for n in term.at} if term.kind == VALUE else {})
+    values = FrozenMap({n: v for n, v in known.items() if n not in sizes})
+    return Rival(term.kind, term.at, behind, sizes, term.source, prior=prior, values=values)
+
+
+def _akin(found: Expansion, group: Sequence[Rival], further: Sequence[Rival] = ()) -> list[str]:
     """For each of both the first effect of the group before it that does the same at its place in these records, within the
     tolerance; empty where none does.
 
@@ -114,7 +134,7 @@ def _akin(found: Round, group: Sequence[Rival], further: Sequence[Rival] = ()) -
     return akin
 
 
-def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) -> bool:
+def _as_likely(found: Expansion, other: CandidateEffect, options: DiagnosisOptions) -> bool:
     """Return True where a form with one more parameter stays possible though the winner is alone: at the same place, where the
     data would not show what the parameter does, or where both are kinds of delay and the winner is no case of the other.
     """
@@ -127,7 +147,7 @@ def _as_likely(found: Round, other: CandidateEffect, options: DiagnosisOptions) 
 
 
 def formula_rivals(
-    found: Round, formulas: Sequence[tuple[CandidateFit, float]], options: DiagnosisOptions
+    found: Expansion, formulas: Sequence[tuple[CandidateFit, float]], options: DiagnosisOptions
 ) -> tuple[float, tuple[Rival, ...]]:
     """By how much the winner is behind the best formula outside the catalogue, in BIC, and the formulas that are near it; infinite
     where one is further ahead than they can be distinguished.
@@ -156,7 +176,7 @@ def _rival(trial: CandidateFit, behind: float) -> Rival:
     return Rival(kind, c.at, behind, sizes, c.source, expression=formula, values=values, off_given=off)
 
 
-def _unfitted(found: Round, best: float, options: DiagnosisOptions) -> list[Rival]:
+def _unfitted(found: Expansion, best: float, options: DiagnosisOptions) -> list[Rival]:
     """Candidates that were not refitted but, being linear in their size, gain what their screen says."""
     assert found.ruler is not None
     done = {t.pick.candidate for t in (*found.trials, *found.failed)}
@@ -174,7 +194,7 @@ def _unfitted(found: Round, best: float, options: DiagnosisOptions) -> list[Riva
     return group
 
 
-def _at_rest(found: Round, group: Sequence[Rival]) -> list[Rival]:
+def _at_rest(found: Expansion, group: Sequence[Rival]) -> list[Rival]:
     """Nonlinear effects at a signal that never moves: they act as a gain there and have no signature of their own.
 
     A limit, a saturation and a deadband take away; levels may add too.
@@ -190,7 +210,7 @@ def _at_rest(found: Round, group: Sequence[Rival]) -> list[Rival]:
     return likes
 
 
-def _equal(found: Round, group: Sequence[Rival], tries: Callable[[str], bool]) -> list[Rival]:
+def _equal(found: Expansion, group: Sequence[Rival], tries: Callable[[str], bool]) -> list[Rival]:
     """The effects that are the same equation as one of the group at its place, under their own names."""
     known = [
         (r, other, equality) for r in group for other, equality in effects()[r.effect].equals.items() if tries(other)
@@ -254,7 +274,7 @@ def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
     Effects that are the same equation are one, and so are effects that add the same to a signal, and kinds of delay that are as
     long: what differs is within the tolerance.
     """
-    parent = {r.effect: r.effect for r in group} | {r.same_as: r.same_as for r in group if r.same_as}
+    parent = {r.kind: r.kind for r in group} | {r.same_as: r.same_as for r in group if r.same_as}
 
     def root(name: str) -> str:
         while parent[name] != name:
@@ -263,10 +283,10 @@ def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
 
     for r in group:
         for name in filter(None, (r.same_as, r.akin)):
-            parent[root(r.effect)] = root(name)
+            parent[root(r.kind)] = root(name)
     for one, other in combinations([r for r in group if (r.late or 0.0) > 0.0], 2):
         if _as_long(one, other):
-            parent[root(other.effect)] = root(one.effect)
+            parent[root(other.kind)] = root(one.kind)
     there = {(r.effect, r.at, r.source) for r in group}
     # One hypothesis under two names is one hypothesis.
     weights = [
@@ -278,7 +298,7 @@ def classes(group: Sequence[Rival]) -> tuple[EffectClass, ...]:
     total = sum(weights)
     found: dict[str, list[tuple[Rival, float]]] = {}
     for r, w in zip(group, weights, strict=True):
-        found.setdefault(root(r.effect), []).append((r, w / total))
+        found.setdefault(root(r.kind), []).append((r, w / total))
     each = []
     for members in found.values():
         ordered = sorted(members, key=lambda m: (-m[1], m[0].delta_bic))
@@ -307,24 +327,18 @@ def credible(each: Sequence[tuple[T, float]]) -> list[tuple[T, float]]:
     return [one for one, held in zip(each, before, strict=False) if held < CERTAIN * before[-1]]
 
 
-def compared(first: Refit, outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
-    """Every hypothesis that was refitted, the likeliest first, on the scale of the best model's noise."""
-    refits: dict[tuple[str, ...], Refit] = {(): first}
-    for r in outcome.rounds:
-        refits |= {tuple(p.candidate.label for p in t.refit.placed): t.refit for t in r.trials}
-    refits[tuple(p.candidate.label for p in outcome.refit.placed)] = outcome.refit
-    ruler = Ruler.of(min(refits.values(), key=lambda refit: refit.chi2))
-    own = len(first.problem.free)
-    evidence = {
-        k: 0.5 * evidence_between(first, refit, ruler, len(refit.problem.free) - own) for k, refit in refits.items()
-    }
-    most = max(evidence.values())
-    total = sum(np.exp(v - most) for v in evidence.values())
-    order = sorted(evidence, key=lambda k: -evidence[k])[:MAX_HYPOTHESES]
-    return tuple(_hypothesis(k, refits[k], evidence[k], float(np.exp(evidence[k] - most) / total)) for k in order)
-
-
-def _hypothesis(names: tuple[str, ...], refit: Refit, evidence: float, probability: float) -> Hypothesis:
-    sizes = tuple(FrozenMap(refit.sizes(p)) for p in refit.placed)
-    values = FrozenMap({n: size.value for n, size in implied(refit).items()})
-    return Hypothesis(names, evidence, refit.unseen, probability, sizes, values)
+def compared(outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
+    """Every hypothesis that was refitted, the likeliest first, by its score."""
+    most = min(score for _, score in outcome.pool)
+    total = sum(math.exp(0.5 * (most - score)) for _, score in outcome.pool)
+    return tuple(
+        Hypothesis(
+            tuple(t.label for t in h.terms),
+            -0.5 * score,
+            h.refit.unseen,
+            math.exp(0.5 * (most - score)) / total,
+            tuple(FrozenMap(h.refit.sizes(p)) for p in h.refit.placed),
+            FrozenMap({n: size.value for n, size in implied(h.refit).items()}),
+        )
+        for h, score in outcome.pool[:MAX_HYPOTHESES]
+    )

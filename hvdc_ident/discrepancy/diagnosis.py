@@ -9,40 +9,38 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from hvdc_ident.budget import Budget
 from hvdc_ident.codec import plain
 from hvdc_ident.data import Experiment
-from hvdc_ident.discrepancy.candidate_table import lines
-from hvdc_ident.discrepancy.candidates import entries
+from hvdc_ident.discrepancy.candidates import CandidateEffect, entries
 from hvdc_ident.discrepancy.classes import compared
-from hvdc_ident.discrepancy.evidence import all_far_from_noise, louder_than_noise
-from hvdc_ident.discrepancy.explain import at_given, beside_stand_ins, found_of, gap, off_given
-from hvdc_ident.discrepancy.findings import separating
-from hvdc_ident.discrepancy.forms import DescribedForm, best_form, described, disturbance_course, refitted_forms
-from hvdc_ident.discrepancy.hypothesis import Refit, judged
-from hvdc_ident.discrepancy.location import localise
-from hvdc_ident.discrepancy.moves import clock_sentence, clocks, stated
-from hvdc_ident.discrepancy.nominal import Nominal, nominal
-from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
-from hvdc_ident.discrepancy.remainder import share_left
-from hvdc_ident.discrepancy.residual_checks import Binned
-from hvdc_ident.discrepancy.result import AUGMENTED, Diagnosis, FoundEffect, StandIn
-from hvdc_ident.discrepancy.rounds import Round
-from hvdc_ident.discrepancy.screen import NOT_TRIED as NOT_BEGUN
-from hvdc_ident.discrepancy.search import SearchOutcome, two_start_search
-from hvdc_ident.discrepancy.stand_ins import stand_ins
-from hvdc_ident.discrepancy.unknown_noise import noise_with, without_names
-from hvdc_ident.discrepancy.verdict import (
+from hvdc_ident.discrepancy.clocks import clock_sentence, clocks
+from hvdc_ident.discrepancy.conclusion import (
     Conclusion,
     findings_of,
     headline,
     judge,
-    keeps_tolerance,
-    leaves_a_gap,
     leaves_more_than_noise,
-    noise_floor,
     tests_of,
 )
+from hvdc_ident.discrepancy.expansion import LEFT_BEHIND, Expansion
+from hvdc_ident.discrepancy.findings import separating
+from hvdc_ident.discrepancy.hypothesis import Refit, judged
+from hvdc_ident.discrepancy.location import localise
+from hvdc_ident.discrepancy.misfit import misfit_of
+from hvdc_ident.discrepancy.nominal import Nominal, nominal
+from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
+from hvdc_ident.discrepancy.outside import DescribedForm, best_form, described, disturbance_course, refitted_forms
+from hvdc_ident.discrepancy.remainder import share_left
+from hvdc_ident.discrepancy.residual_checks import Binned
+from hvdc_ident.discrepancy.result import AUGMENTED, Diagnosis, FoundEffect, Line, StandIn
+from hvdc_ident.discrepancy.score import CandidateFit, Ruler, with_gain
+from hvdc_ident.discrepancy.screen import NOT_TRIED as NOT_BEGUN
+from hvdc_ident.discrepancy.screen import Score
+from hvdc_ident.discrepancy.search import SearchOutcome, search_from
+from hvdc_ident.discrepancy.sentences import at_given, beside_stand_ins, found_of, gap, off_given
+from hvdc_ident.discrepancy.stand_ins import stand_ins
+from hvdc_ident.discrepancy.stated import stated
+from hvdc_ident.discrepancy.unknown_noise import noise_with, without_names
 from hvdc_ident.errors import StudyError, unknown_name
 from hvdc_ident.executor import Executor, Progress
 from hvdc_ident.fit import FitParameter, Simulator
@@ -59,7 +57,10 @@ CLOSED = (
 )
 
 UNFINISHED = "The diagnosis was ended by its budget, and says nothing yet of what is missing, or where."
-UNTESTED = "The budget ended: neither forms outside the catalogue nor whether anything else is missing was asked."
+UNTESTED = (
+    "The budget ended before everything was tried that could come near: something else may explain the records as well."
+)
+SLIGHT = "What remains is explained by stated values and recorded levels that are off by no more than they may be ({})."
 UNTRIED = (
     "No single effect came near the noise. {} candidates that promise less were not refitted; a thorough search refits more of "
     "them (thorough = true in [diagnose])."
@@ -104,7 +105,7 @@ def diagnose(
     search = SearchContext(
         names, None if places is None else tuple(places), FrozenMap(tolerance or {}), chosen, seed, executor,
         None if progress is None else Course(progress),
-        Budget.of(chosen.budget) if isinstance(chosen.budget, float | int) else chosen.budget,
+        chosen.budget_from_now(executor),
     )  # fmt: skip
     search.tell(0, 1, "the nominal model, refitted")
     start, notes = nominal(
@@ -112,10 +113,18 @@ def diagnose(
     )
     first = judged(Refit(model, (), start.problem, start.noise, start.theta))
     held_now = tuple(f for f in free if f.name not in first.problem.names)
-    search = replace(search, held=held_now, stated=stated(model, free), records=first.problem.experiments)
-    outcome = two_start_search(search, first)
-    if search.spent:
-        judgement, notes = unfinished(search, first, outcome), (*notes, UNTESTED)
+    search = replace(
+        search,
+        held=held_now,
+        stated=stated(model, free),
+        records=first.problem.experiments,
+        components=components_of(model),
+    )
+    outcome = search_from(search, first)
+    if not outcome.exhausted:
+        notes = (*notes, UNTESTED)
+    if not outcome.exhausted and not outcome.kept:
+        judgement = unfinished(search, first, outcome)
     else:
         judgement = judge(search, first, outcome)
     inside = is_white_box(model)
@@ -123,7 +132,7 @@ def diagnose(
     if judgement.instead is not None:
         other = described(judgement.instead)
     elif judgement.verdict == "unnameable" and chosen.fallback and inside:
-        other = _outside(search, outcome.rounds[0])
+        other = _outside(search, outcome.expansions[0])
     best = outcome.refit if other is None or other.refit is None else other.refit
     noise = noise_with(best)
     sure = without_names(search, first, best, noise, judgement)
@@ -131,11 +140,11 @@ def diagnose(
         judgement, other, noise = sure, None, noise_with(first)
     if not inside:
         notes = (*notes, CLOSED)
-    if left := 0 if chosen.thorough else _left_out(first, outcome.rounds[0]):
+    if left := 0 if chosen.thorough else _left_out(search, first, outcome):
         notes = (*notes, UNTRIED.format(left))
-    if left := sum(why == NOT_BEGUN for r in outcome.rounds for why in r.screen.failures.values()):
+    if left := sum(why == NOT_BEGUN for r in outcome.expansions for why in r.screen.failures.values()):
         notes = (*notes, f"The budget ended before {left} candidates were looked at: their status is {NOT_BEGUN!r}.")
-    if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.rounds for t in r.failed):
+    if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.expansions for t in r.trials):
         notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes), noise)
 
@@ -145,10 +154,10 @@ def unfinished(search: SearchContext, first: Refit, outcome: SearchOutcome) -> C
 
     What comes nearest so far is told as that, without its place.
     """
-    found = outcome.rounds[-1]
-    refitted, every = len({t.pick.candidate for t in found.trials}), len(found.candidates)
-    tried = f"Of {every} candidates of round {len(outcome.rounds)} {refitted} were refitted to their ends"
-    left = min((math.sqrt(t.refit.chi2 / t.refit.rows) for r in outcome.rounds for t in r.trials), default=math.inf)
+    every = sum(len(r.candidates) for r in outcome.expansions)
+    refitted = sum(not t.refit.failure for r in outcome.expansions for t in r.trials)
+    tried = f"Of {every} candidates {refitted} were refitted to their ends"
+    left = min((math.sqrt(h.refit.chi2 / h.refit.rows) for h, _ in outcome.pool if h.terms), default=math.inf)
     before = math.sqrt(first.chi2 / first.rows)
     best = (
         f"; the best of them leaves {figures(left, 3)} times the noise, the model alone {figures(before, 3)}"
@@ -158,18 +167,22 @@ def unfinished(search: SearchContext, first: Refit, outcome: SearchOutcome) -> C
     return Conclusion("unfinished", f"{UNFINISHED} {tried}{best}.", tests_of(search, first))
 
 
-def _outside(search: SearchContext, opened: Round) -> DescribedForm:
+def _outside(search: SearchContext, opened: Expansion) -> DescribedForm:
     """Return the form outside the catalogue that explains most of the gap, or what is missing over time where none stands."""
     forms = refitted_forms(search, opened) if opened.forms is None else opened.forms
     form = best_form(search, opened, forms)
     return disturbance_course(search, opened) if form is None else described(form)
 
 
-def _left_out(first: Refit, found: Round) -> int:
-    """Return how many candidates of a round were not refitted, where those that were leave more than anybody asks about; else 0."""
-    if not found.significant or not all_far_from_noise(first, found.trials):
+def _left_out(search: SearchContext, first: Refit, outcome: SearchOutcome) -> int:
+    """Return how many candidates of the first expansion were not refitted, where those that were leave more than anybody asks about."""
+    if not outcome.expansions or search.spent:
         return 0
-    tried = {t.pick.candidate for t in (*found.trials, *found.failed)}
+    found = outcome.expansions[0]
+    before = misfit_of(first)
+    if not all(misfit_of(h.refit).is_far_from_noise(before) for h, _ in outcome.pool):
+        return 0
+    tried = {t.pick.candidate for t in found.trials}
     return len(set(found.screen.best()) - tried)
 
 
@@ -185,6 +198,13 @@ def _model_of(subject: AnyModel | Simulator) -> AnyModel:
         expected="a model, or an FMU: something with insertion points and `with_effects`",
         got=type(subject).__name__,
     )
+
+
+def components_of(model: AnyModel) -> FrozenMap[str]:
+    """Return the components that a model is built of, by name, with their cards; none of a model that is closed inside."""
+    if not is_white_box(model):
+        return FrozenMap()
+    return FrozenMap((model.origin.root if model.origin else model).components)
 
 
 def _check_tolerance(tolerance: Mapping[str, float], experiments: tuple[Experiment, ...]) -> None:
@@ -214,15 +234,18 @@ def _assembled(
     in_place = judgement.verdict in ("named", "ambiguous")
     tests = judgement.tests
     effects: tuple[FoundEffect, ...] = ()
-    last = outcome.refit if judgement.verdict == "no-evidence" and not outcome.refit.placed else first
+    last = outcome.refit if judgement.verdict == "no-evidence" and not outcome.kept else first
     done = judgement.verdict != "unfinished"
     if in_place:
         last = outcome.refit
-        effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, outcome.kept, strict=True))
+        of_effects = [k.expansion for k in outcome.kept if k.term.is_effect]
+        effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, of_effects, strict=True))
     elif other is not None and other.refit is not None:
         last = other.refit
         tests = tests_of(search, last)
-    augmented = last.model.with_values(_own(last)) if last.placed else None
+    freed = tuple(f for f in (*search.held, *search.stated) if f.name in outcome.best.values) if in_place else ()
+    free = (*free, *(f for f in freed if f.name not in {c.name for c in free}))
+    augmented = last.model.with_values(_own(last)) if last.placed or freed else None
     given = at_given(first, {f.name: f.given for f in free})
     sets = tuple(g for g in judgement.sets if len(g) > 1 or judgement.doubt)
     rest = remaining(first, last, tests, search)
@@ -230,14 +253,26 @@ def _assembled(
         judgement, last, adequate=rest["adequate"], significance=search.options.significance
     )
     findings, depend = findings_of(search, outcome, judgement, effects, with_intervals=not beyond) if done else ((), {})
-    text = headline(judgement, findings, depend, tolerated=keeps_tolerance(search, last))
+    text = headline(judgement, findings, depend, tolerated=misfit_of(last).keeps(search.tolerance))
     others: tuple[StandIn, ...] = ()
     if judgement.verdict == "no-evidence":
-        moved = off_given(last, given, rest["adequate"], leaves_a_gap(search, last), known=not unknown)
+        moved = off_given(
+            last,
+            given,
+            rest["adequate"],
+            misfit_of(last).is_material(search.tolerance, search.options) and not outcome.explained_by_errors,
+            known=not unknown,
+        )
         if moved is not None:
-            others = () if unknown else stand_ins(search, last, outcome.rounds[0], tuple(moved.parameters))
+            others = (
+                ()
+                if unknown or not outcome.expansions
+                else stand_ins(search, last, outcome.expansions[0], tuple(moved.parameters))
+            )
             moved = beside_stand_ins(moved, others)
             findings, text = (moved,), moved.text if not unknown else f"{text} {moved.text}"
+        if outcome.explained_by_errors and moved is not None:
+            text = f"{text} {SLIGHT.format(outcome.slight)}"
     if off := clocks(search, last):
         text = f"{text} {clock_sentence(off)}"
     if louder := contradiction(model, first.noise, LOUDER):
@@ -268,7 +303,7 @@ def _assembled(
         doubt=judgement.doubt,
         findings=findings,
         remainder={} if left is None else plain(left) | {"below_tolerance": left.below_tolerance},
-        hypotheses=compared(first, outcome) if done and not unknown else (),
+        hypotheses=compared(outcome) if done and not unknown else (),
         values_by_place=FrozenMap(depend),
         stand_ins=others,
     )  # fmt: skip
@@ -306,7 +341,7 @@ def _own(refit: Refit) -> dict[str, float]:
 def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: SearchContext) -> dict[str, Any]:
     """Return the remaining residual: a test against noise, the explained share, and where it lies."""
     rest: Nominal = last.nominal()
-    left = share_left(first, last, noise_floor(last, rest, tests, search.options.significance))
+    left = share_left(first, last, misfit_of(last).floor)
     place = localise(rest)
     worst = min(tests, key=lambda b: b.p, default=None)
     return {
@@ -314,6 +349,48 @@ def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: Sear
         "explained_share": None if left is None else 1.0 - left,
         "band_hz": place["band_hz"],
         "block": next(iter(place["outputs"]), None),
-        "material": louder_than_noise(last, search.options.holdout_share),
+        "material": misfit_of(last).is_louder_than(search.options.holdout_share),
         "tests": [{"bins": b.name, "statistic": b.statistic, "expected": b.expected, "p": b.p} for b in tests],
     }
+
+
+def lines(outcome: SearchOutcome) -> tuple[Line, ...]:
+    """Every candidate of every round, those of the first round first, each round by what was found of them."""
+    found: list[Line] = []
+    for number, r in enumerate(outcome.expansions, start=1):
+        refits = {t.pick.candidate: t for t in r.trials}
+        best, absorbed = r.screen.best(), set(r.screen.absorbed())
+        sound = [t.refit for t in r.trials if not t.refit.failure]
+        ruler = Ruler.of(min(sound, key=lambda refit: refit.chi2, default=r.before))
+        # Of later rounds what was not refitted says nothing that the first has not said.
+        listed = [(k, c) for k, c in enumerate(r.candidates) if number == 1 or k in refits]
+        own = [
+            _line(r, k, c, best.get(k), refits.get(k), number, absorbed=k in absorbed, ruler=ruler) for k, c in listed
+        ]
+        found += sorted(own, key=lambda x: (-(x.delta_bic if x.delta_bic is not None else -np.inf), -x.score))
+    return tuple(found)
+
+
+def _line(
+    r: Expansion,
+    k: int,
+    c: CandidateEffect,
+    score: Score | None,
+    trial: CandidateFit | None,
+    number: int,
+    *,
+    absorbed: bool,
+    ruler: Ruler,
+) -> Line:
+    status = f"failed: {r.screen.failures[k]}" if k in r.screen.failures else "not-excited"
+    fall, values, delta, hold = 0.0, FrozenMap[float](), None, None
+    if score is not None:
+        fall, values = max(score.fall, 0.0), c.probes[score.probe].values
+        excited = any(r.screen.usable(column) for column in r.screen.size if column[0] == k)
+        status = "absorbed" if absorbed else "screened" if excited else "not-excited"
+    if trial is not None and trial.refit.failure != LEFT_BEHIND:
+        status = f"failed: {trial.refit.failure}" if trial.refit.failure else "refitted"
+        if not trial.refit.failure:
+            delta, hold = with_gain(trial, r.before, ruler).gain, trial.refit.unseen
+            values = FrozenMap(trial.refit.sizes(trial.refit.placed[-1]))
+    return Line(c.effect, c.at, fall, r.screen.p(fall), status, values, delta, hold, c.source, number)

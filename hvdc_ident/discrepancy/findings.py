@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
 
 from hvdc_ident.discrepancy.classes import EffectClass, credible
-from hvdc_ident.discrepancy.explain import advice, sentence
-from hvdc_ident.discrepancy.forms import with_values
+from hvdc_ident.discrepancy.expansion import Expansion
 from hvdc_ident.discrepancy.hypothesis import Refit
-from hvdc_ident.discrepancy.implied import apart
-from hvdc_ident.discrepancy.options import CERTAIN, LISTED
-from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Place, Rival, ValueAt
-from hvdc_ident.discrepancy.rounds import Round
+from hvdc_ident.discrepancy.options import CERTAIN, LISTED, SearchContext
+from hvdc_ident.discrepancy.outside import with_values
+from hvdc_ident.discrepancy.result import CARD, VALUE, EffectSize, Finding, FoundEffect, Place, Rival, ValueAt
+from hvdc_ident.discrepancy.score import apart, implied
+from hvdc_ident.discrepancy.search import Kept
+from hvdc_ident.discrepancy.sentences import advice, sentence
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import AnyModel
 from hvdc_ident.text import figures_of, listed, quantity
 
 SHARED = ("s", "rad/s", "Hz", "")
@@ -26,7 +29,7 @@ SHARED = ("s", "rad/s", "Hz", "")
 
 
 def finding(
-    found: Round,
+    found: Expansion,
     one: EffectClass,
     put_in: FoundEffect | None = None,
     values: Mapping[str, EffectSize] | None = None,
@@ -78,6 +81,69 @@ def finding(
     sizes = _sizes(parameters) if with_intervals else ""
     text = f"{does}{sizes}{_others(one, best)}{_apart(best, places)}."
     return Finding(best.effect, _names(one, best.effect), one.probability, FrozenMap(parameters), places, text, delay)
+
+
+def in_words(rival: Rival) -> str:
+    """Return what a stated value that is another, or a component of another type, is called beside effects."""
+    (name,) = rival.at
+    return f"another value of {name}" if rival.effect == VALUE else f"{rival.source} as {name}"
+
+
+def finding_beside(one: Rival, probability: float, kept: Kept, last: Refit, search: SearchContext) -> Finding:
+    """The finding that a stated value is another, or a component of another type, as the best hypothesis has it, or as its own refit has
+    it in the stead of that."""
+    own = next((t.refit for term, t in kept.others if (term.kind, term.at, term.source) == _key(one)), last)
+    is_kept = (kept.term.kind, kept.term.at, kept.term.source) == _key(one)
+    refit, (name,) = last if is_kept else own, one.at
+    if one.effect == CARD:
+        sizes = {n: v for n, v in implied(refit).items() if n.startswith(f"{name}.")}
+        each = listed([f"{n} {quantity(v.value, v.unit)}" for n, v in sizes.items()])
+        there = search.components.get(name)
+        text = (
+            f"{name} answers like {one.source}, not like {there.upper()}"
+            if there
+            else f"{one.source} is missing as {name}"
+        )
+        text = f"{text} ({each})." if each else f"{text}."
+    else:
+        stated = next(f.given for f in (*search.held, *search.stated) if f.name == name)
+        value, std, unit = refit.values[name], refit.std.get(name), refit.model.parameters[name].unit
+        interval = None if std is None else (value - 1.96 * std, value + 1.96 * std)
+        sizes = {name: EffectSize(value, interval, unit)}
+        around = "" if std is None else f" ± {quantity(1.96 * std, unit, 2)}"
+        known = base_factor(refit.model, unit, value / stated, 0.0 if std is None else 2.0 * std / abs(value))
+        text = f"{name} is {quantity(value, unit)}{around}, not {quantity(stated, unit)}{known}."
+    place = Place(one.at, 1.0, one.source, one.effect, FrozenMap(sizes))
+    return Finding(one.effect, (one.effect,), probability, FrozenMap(sizes), (place,), text)
+
+
+OF_UNITS = FrozenMap(
+    {
+        "2 pi": (2.0 * math.pi, ("rad/s", "Hz", "1/s")),
+        "sqrt 3": (math.sqrt(3.0), ("V", "kV", "A", "kA")),
+        "3": (3.0, ("V", "kV", "A", "kA", "Ohm", "ohm")),
+        "50 to 60 Hz": (1.2, ("Hz", "rad/s", "H", "mH", "F", "uF")),
+    }
+)
+"""Factors by which a value is off that was given in another unit or for another frequency, with the units of such values."""
+SURE_RATIO = 0.01
+"""Relative error of a ratio, at two deviations, from which it may be any of several factors: these are a fifth apart and more."""
+
+
+def base_factor(model: AnyModel, unit: str, ratio: float, error: float) -> str:
+    """Return in words the factor of a unit or base that a ratio is; empty where it is none, or known to no better than `SURE_RATIO`.
+
+    A value per unit may be on another of the model's own bases. unit: of the value; error: of the ratio, relative, two deviations.
+    """
+    if not 0.0 < error < SURE_RATIO:
+        return ""
+    factors = {n: f for n, (f, units) in OF_UNITS.items() if unit in units}
+    if unit in ("", "pu"):
+        bases = {n: p.value for n, p in model.parameters.items() if p.unit == "MVA" and p.value > 0.0}
+        pairs = ((n, m) for n, m in permutations(bases, 2) if bases[n] > 1.2 * bases[m])
+        factors |= {f"the bases {n} and {m}": bases[n] / bases[m] for n, m in pairs}
+    near = [n for n, f in factors.items() if min(abs(ratio / f - 1.0), abs(ratio * f - 1.0)) <= error]
+    return f" (the ratio is that of {near[0]})" if near else ""
 
 
 def _one_each(members: Sequence[tuple[Rival, float]], best: Rival) -> dict[tuple[tuple[str, ...], str], Rival]:
@@ -245,6 +311,13 @@ def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> 
     """For each set with more than one member what would distinguish them, in words; empty where there is none."""
     texts = []
     for group in groups:
+        values = [r.at[0] for r in group if r.effect == VALUE]
+        if values and len(group) > 1:
+            texts.append(f"a value of {listed(values)} from another source, or a record in which they act apart")
+        cards = [r.source for r in group if r.effect == CARD]
+        if cards and len(group) > 1:
+            texts.append(f"the type of the component ({listed(cards)}) from its vendor, or a larger step")
+        group = [r for r in group if r.in_catalogue]
         if len(group) > 1:
             first = group[0]
             # No experiment distinguishes one equation from itself under another name.

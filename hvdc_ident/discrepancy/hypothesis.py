@@ -154,7 +154,8 @@ class Refit:
 
     chi2: sum of squared residuals (`ResidualBlock.chi2`); rows: their number; correlation: lag-1 autocorrelation left in them.
     holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. predicted: root
-    mean score of their prediction, or without them of parts of the fitted ones predicted from the rest (`prediction`). std: standard
+    mean score of their prediction, or without them of parts of the fitted ones predicted from the rest (`prediction`); unseen_rows: of
+    what it is the score of. std: standard
     deviation of each free parameter, of the effects and of the model, by its name in the model. apart: of each effect, by how many
     standard deviations its parameters together are off doing nothing. ended: whether it came to its end, and was not only left where
     its evaluations were used up.
@@ -170,6 +171,7 @@ class Refit:
     correlation: float = 0.0
     holdout: float | None = None
     predicted: float | None = None
+    unseen_rows: int = 0
     std: FrozenMap[float | None] = field(default_factory=FrozenMap)
     apart: tuple[float, ...] = ()
     failure: str = ""
@@ -262,6 +264,7 @@ class RefitResult:
     correlation: float
     holdout: float | None
     predicted: float | None
+    unseen_rows: int
     std: FrozenMap[float | None]
     apart: tuple[float, ...]
     failure: str
@@ -330,7 +333,8 @@ def _cost_at(job: RefitJob, begin: Array) -> float:
     """Sum of squared residuals at a start; infinite where the model does not run there."""
     try:
         # The values alone of a model that is not moved would need machine code of their own.
-        blocks = job.problem.blocks(begin, derivatives=not job.placed[-1].movable)
+        moves = bool(job.placed) and job.placed[-1].movable
+        blocks = job.problem.blocks(begin, derivatives=not moves)
     except FAILURES:
         return math.inf
     return sum(b.chi2 for b in blocks)
@@ -362,7 +366,8 @@ def judged(refit: Refit) -> Refit:
     others = held_out(refit.problem, refit.theta)
     return replace(
         refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=root_mean_square(others),
-        predicted=predictive_score(blocks, others), std=FrozenMap(std), apart=apart,
+        predicted=predictive_score(blocks, others),
+        unseen_rows=rows if others is None else sum(b.residual.size for b in others), std=FrozenMap(std), apart=apart,
     )  # fmt: skip
 
 
@@ -594,3 +599,9 @@ def slot_signals(before: Refit) -> dict[str, tuple[Array, ...]]:
         for p in kept:
             found[p].append(np.asarray(run[kinds[p][1]]))
     return {p: tuple(own) for p, own in found.items()}
+
+
+def last_placed(refit: Refit, k: int) -> Refit:
+    """Return the refit with the effect in place k moved to the end, as that of a trial is."""
+    order = [*(j for j in range(len(refit.placed)) if j != k), k]
+    return replace(refit, placed=tuple(refit.placed[j] for j in order), apart=tuple(refit.apart[j] for j in order))

@@ -11,7 +11,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hvdc_ident.data import Array, Experiment, Trajectory
+from hvdc_ident.data import FEWEST_QUIET, Array, Experiment, Trajectory, event_time, quiet_rows
 from hvdc_ident.data.noise import TANH
 from hvdc_ident.errors import SimulationError, StudyError
 from hvdc_ident.executor import Executor
@@ -367,3 +367,26 @@ def of_held_out(problem: Problem) -> Problem | None:
     others = [e.with_(role="fit", nuisance=()) for e in problem.experiments if e.role == "holdout" and e.outputs]
     others = [e for e in others if set(e.outputs) & set(problem.outputs)]
     return replace(problem, experiments=tuple(others)) if others else None
+
+
+def noise_left(left: Nominal) -> float:
+    """The mean square that noise alone leaves in whitened residuals, from the rows before the events that are at rest; at least 1.
+
+    It is 1 where the noise is as supposed. AR coefficients from few rows are not: with a standard deviation that is
+    given, a coefficient that is wrong by a tenth makes of whitened noise half or three times its size.
+    """
+    experiments = {e.name: e for e in left.problem.fitted_experiments}
+    rows: dict[str, int] = {}
+    quiet: dict[str, list[Array]] = {}
+    for b, run in zip(left.blocks, left.fitted(), strict=True):
+        e = experiments[b.experiment]
+        event = e.event if e.event is not None else event_time(e.inputs)
+        rows[b.output] = rows.get(b.output, 0) + b.residual.size
+        if b.slope is None:  # one level between two steps is no measure of the others
+            rest = quiet_rows(e.time[b.rows], b.misfit + run, event, run, b.profile)
+            quiet.setdefault(b.output, []).append(b.residual[rest.rows])
+    total = 0.0
+    for output, count in rows.items():
+        own = np.concatenate(quiet.get(output) or [np.zeros(0)])
+        total += count * (float(np.mean(own**2)) if own.size >= FEWEST_QUIET else 1.0)
+    return max(total / max(sum(rows.values()), 1), 1.0)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, field
 from typing import Literal
 
 from hvdc_ident.budget import Budget
@@ -23,6 +24,8 @@ SHORTLIST = 6
 """The best by a cheap measure (a score, a regression) that are tried in full: formulas, filters, places, earlier rivals."""
 FIELD = 40
 """Proposals refitted at a time."""
+BUDGET = 60.0
+"""Seconds of a search for which no budget is given."""
 LISTED = 3
 """Items that a sentence lists; of more it says how many there are."""
 BEAM = 2
@@ -41,8 +44,9 @@ class DiagnosisOptions:
     holdout_share: the held-out gap has to shrink by more than this share of the noise.
     starts: runs of the nominal multistart; None: 8, and more where only one of them came to the lowest cost.
     fallback: search for a form outside the catalogue.
-    thorough: refit four times as many candidates of each effect.
-    budget: after which nothing further is looked for; in seconds one that begins with the diagnosis; None: no limit.
+    thorough: refit four times as many candidates of each effect, and, unless a budget is given, look until nothing is left to look for.
+    budget: after which nothing further is looked for; in seconds one that begins with the diagnosis, of the processor's time, or with
+    workers of the clock; None: `BUDGET`.
 
     Declared nuisances are estimated with the parameters; a start state is one where the card leaves it free.
     """
@@ -68,6 +72,13 @@ class DiagnosisOptions:
             )
         if min(self.most, self.starts or 1) < 1:
             raise StudyError("a number of effects or starts is below 1", where="options of a diagnosis")
+
+    def budget_from_now(self, executor: Executor | None) -> Budget | None:
+        """Return the budget of a diagnosis that begins now; None: no limit."""
+        if isinstance(self.budget, Budget) or (self.budget is None and self.thorough):
+            return self.budget
+        seconds = BUDGET if self.budget is None else self.budget
+        return Budget.of(seconds, time.process_time if executor is None else time.monotonic)
 
 
 @dataclass(eq=False)
@@ -99,7 +110,7 @@ class SearchContext:
 
     budget: after which it begins nothing further; None: no limit. held: candidates of the fit that the nominal
     model holds; stated: its other parameters, with bounds as near as they are known. records: the experiments, on their
-    own clocks; none where it is not asked whether these are off.
+    own clocks; none where it is not asked whether these are off. components: those of the model, by name, with their cards.
     """
 
     effects: tuple[str, ...] | Literal["all"]
@@ -113,6 +124,12 @@ class SearchContext:
     held: tuple[FitParameter, ...] = ()
     stated: tuple[FitParameter, ...] = ()
     records: tuple[Experiment, ...] = ()
+    components: FrozenMap[str] = field(default_factory=FrozenMap)
+
+    def may_exchange(self, component: str) -> bool:
+        """Return True where a component may be of another type: a search for some effects, or at other places, is for these alone."""
+        slots = [p for g in self.places or () for p in ((g,) if isinstance(g, str) else g)]
+        return self.effects == "all" and (self.places is None or any(p.startswith(f"{component}.") for p in slots))
 
     @property
     def spent(self) -> bool:

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.evidence import left_by, unseen_rows
 from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals
+from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.nominal import Nominal, draws, of_held_out
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.prediction import root_mean_square_by_record
@@ -73,13 +73,6 @@ class Remainder:
         return self.largest <= TOLERANCE or (within and self.largest <= REFUTED)
 
 
-def is_small(search: SearchContext, first: Refit, last: Refit) -> bool:
-    """Return True where the hypothesis `last` leaves a small part of the gap of `first`, and no output more than its tolerance."""
-    if not left_by(last) <= REFUTED * left_by(first):
-        return False
-    return max(_beyond(search.tolerance, last, 1.0).values(), default=np.inf) <= 1.0
-
-
 @dataclass(frozen=True, eq=False)
 class _LatentJob:
     """One insertion point's share of the work."""
@@ -125,7 +118,7 @@ def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
     if not np.isfinite(square):
         return 0.0
     if others is None:  # parts of the fitted records, whose noise is known from before the event
-        rows = unseen_rows(last) * last.effective / last.rows
+        rows = last.unseen_rows * last.effective / last.rows
         freedom = freedom_of(last.noise, last.problem.outputs)
         return float(chdtrc(rows, square * rows) if np.isinf(freedom) else fdtrc(rows, freedom, square))
     held = Nominal(others, last.theta[: len(last.problem.free)], last.noise)
@@ -156,9 +149,10 @@ def _beyond(tolerance: Mapping[str, float], last: Refit, floor: float) -> Frozen
 
 
 def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
-    """The remainder with the test for a latent input; as it is for a model that is closed inside, or cannot be linearised."""
+    """The remainder with the test for a latent input; as it is where it is noise, for a model that is closed inside, or cannot be
+    linearised. Once the budget is over no further place is looked at."""
     nominal = last.nominal()
-    if not is_white_box(last.model) or search.spent:
+    if not is_white_box(last.model) or search.spent or misfit_of(last).is_noise:
         return found
     try:
         signals = slot_signals(last)
@@ -168,8 +162,12 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     search.tell(0, 1, "anything else that is missing")
     places = _apart(paths, list(signals), search.seed)
     noise = nominal.projected(nominal.drawn(_least_draws(search), search.seed + 5))
-    inversions = list(mapped(search.executor, _inverted, [_LatentJob(nominal, paths, p) for p in places]))
-    best = sorted(range(len(places)), key=lambda k: -_beyond_noise(inversions[k]))[:SHORTLIST]
+    inversions: list[Inversion] = []
+    for inversion in mapped(search.executor, _inverted, [_LatentJob(nominal, paths, p) for p in places]):
+        inversions.append(inversion)
+        if search.spent:
+            break
+    best = sorted(range(len(inversions)), key=lambda k: -_beyond_noise(inversions[k]))[:SHORTLIST]
     table = np.array([_log_evidence(inversions[k], noise) for k in best]).reshape(len(best), -1)
     if not table.size:
         return found

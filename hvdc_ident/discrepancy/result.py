@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 
 Verdict = Literal["named", "no-evidence", "not-excited", "ambiguous", "unnameable", "unfinished"]
+VALUE, CARD = "parameter", "card"
+"""Names, beside those of the effects, of a stated value that is another, and of a component that is of another type."""
 AUGMENTED = "augmented-model.toml"
 MAX_DRAWN = 10
 """Candidates in the figure, the best by BIC."""
@@ -101,9 +103,19 @@ class Rival:
         return f"{self.effect} {self.expression}".rstrip()
 
     @property
+    def in_catalogue(self) -> bool:
+        """Whether it is an effect, and no stated value or component."""
+        return self.effect not in (VALUE, CARD)
+
+    @property
+    def kind(self) -> str:
+        """What it is wherever it is: the effect; of a stated value or a component that itself."""
+        return self.effect if self.in_catalogue else f"{self.effect} {self.at[0]} {self.source}".rstrip()
+
+    @property
     def late(self) -> float | None:
         """By how long it delays a slow signal, s; None for what is no delay of any kind, or was not refitted."""
-        return effects()[self.effect].delay_with(self.parameters) if self.parameters else None
+        return effects()[self.effect].delay_with(self.parameters) if self.parameters and self.in_catalogue else None
 
 
 @dataclass(frozen=True)

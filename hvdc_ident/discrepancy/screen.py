@@ -89,6 +89,20 @@ class Screen:
             found.setdefault(s.candidate, s)
         return found
 
+    def with_(self, other: Screen, candidates: Sequence[CandidateEffect]) -> Screen:
+        """Return both in one. other: of further candidates or sizes, from the same point beside the same noise."""
+        scores = ranked((*self.scores, *other.scores), candidates)
+        ran = {s.candidate for s in scores}
+        failures = {k: why for k, why in {**other.failures, **self.failures}.items() if k not in ran}
+        return Screen(
+            scores,
+            {**self.size, **other.size},
+            {**self.left, **other.left},
+            np.maximum(self.largest, other.largest),
+            failures,
+            {**self.answers, **other.answers},
+        )
+
     def reordered(self, at: Linearised, candidates: Sequence[CandidateEffect]) -> list[int]:
         """Return the candidates by chi2 after a step from elsewhere, the best first, with the answers that they had where they were run.
 

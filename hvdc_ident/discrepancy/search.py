@@ -1,669 +1,797 @@
-"""The search: one effect after the other, each looked for again beside the others, or done without.
+"""The search: a queue of hypotheses and moves, the best first by one score.
 
-A round screens everything on the model as it stands, refits the best, and judges the winner. From the gains of the best refits
-the candidates at their places, and their effects at all places, are screened again, until nothing comes nearer. The gains that
-the misfit has moved, and the given ones, are where a round begins.
+A hypothesis is the nominal model with terms: effects at places, stated values set free, clocks that are off. A move makes of a
+hypothesis others with one term more; doing without a term, or with another one in its stead, is a move of the hypothesis without it.
+The best hypothesis so far is the answer at every instant. The search ends when no hypothesis that is still open can come near the best,
+or when the budget is over.
+
+The score is minus twice the log evidence, up to a constant: chi2 of the fitted and of the held-out records in units of what the best
+hypothesis leaves, the logarithm of the independent rows for each free parameter, and minus twice the log prior of the terms. Slight errors
+of what is stated go with every hypothesis (`slight`).
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
-from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates, leaks
-from hvdc_ident.discrepancy.evidence import (
-    CandidateFit,
-    Pick,
-    Ruler,
-    all_far_from_noise,
-    at_edge,
-    best_each,
-    by_cost,
-    cost_of,
-    deficits,
-    evidence_between,
-    exceeds_noise,
-    fall_beyond_loud_noise,
-    is_clear,
-    is_far_from_noise,
-    is_noise,
-    left_by,
-    objections,
-    resembles_noise,
-    with_gain,
+from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.candidates import leaks
+from hvdc_ident.discrepancy.clocks import clocks, on_their_clocks
+from hvdc_ident.discrepancy.effect_moves import (
+    beside_leaders,
+    best_from_given,
+    from_given,
+    opened,
+    outside,
+    raced,
+    searched_sizes,
 )
-from hvdc_ident.discrepancy.forms import best_form, refitted_forms
+from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel, FoundForm, Race, refits_of, with_candidate
 from hvdc_ident.discrepancy.hypothesis import (
     FAILURES,
-    Placed,
     Refit,
     RefitJob,
     built_in,
-    gains_moved_far,
     joint_refit_job,
-    judged,
+    last_placed,
     refit_again,
-    scaled_sizes,
     slot_signals,
-    with_given_gains,
 )
-from hvdc_ident.discrepancy.implied import TIED, implied, nearest, off_given
-from hvdc_ident.discrepancy.movable import in_proportion
-from hvdc_ident.discrepancy.moves import clocks, held_again, on_their_clocks, released
-from hvdc_ident.discrepancy.options import BEAM, FIELD, SHORTLIST, TOLERANCE, SearchContext
-from hvdc_ident.discrepancy.remainder import is_small
-from hvdc_ident.discrepancy.residual_checks import tones
-from hvdc_ident.discrepancy.rounds import LEFT_BEHIND, REFITS_PER_EFFECT, Race, Round, RoundModel, gains_of, refits_of
-from hvdc_ident.discrepancy.screen import Score, ranked
-from hvdc_ident.discrepancy.size_search import with_closer_sizes, with_searched_sizes
+from hvdc_ident.discrepancy.misfit import misfit_of
+from hvdc_ident.discrepancy.nominal import noise_left
+from hvdc_ident.discrepancy.options import REFUTED, SearchContext
+from hvdc_ident.discrepancy.result import CARD, VALUE
+from hvdc_ident.discrepancy.score import (
+    TIED,
+    CandidateFit,
+    Pick,
+    Ruler,
+    implied,
+    nearest,
+    objections,
+    off_given,
+    with_gain,
+)
+from hvdc_ident.discrepancy.screen import Score, Screen
+from hvdc_ident.discrepancy.stated import Errors, SlightErrors, differences, stated, with_free, with_held
 from hvdc_ident.effects import effects
-from hvdc_ident.model import AnyModel
+from hvdc_ident.errors import SimulationError
+from hvdc_ident.fit import FitParameter
+from hvdc_ident.fit.noise import SURE
+from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.model import is_white_box, recording
+from hvdc_ident.plants.exchange import CardChange, exchanges
+from hvdc_ident.simulate import ModelSimulator
 
-THOROUGH_FACTOR = 4
-"""Times as many of a thorough search."""
-MAX_FAMILIES = 6
-"""Effects at several places in a field: each takes a compilation of its own."""
-MAX_FOLLOWED = 3
-"""Times that a round goes on from the gains of its best refits."""
-LEADING_SHARE = 0.9
-"""Share of the best fall of chi2 from which a refit leads on."""
-NEARLY_SIGNIFICANT = 0.1
-"""Chance under noise of the best fall below which a closer look is taken before nothing is said to be there."""
-ONLY_A_FORM = "none of it leaves noise, and what is found from the data alone does"
+P_VALUE, P_EFFECT, P_CARD, P_CLOCKS = 0.45, 0.45, 0.1, 0.25
+"""Prior probability that a stated value is wrong, that an effect is missing, that a card is of another type, each in the stead of the
+others, and that the clocks are off, beside them."""
+SET = 6.0
+"""In the score: within it a hypothesis stands beside the best."""
+EXCHANGED = 4
+"""Moves, the cheapest, by which something is looked for in the stead of a term."""
+CARD_LAPS = (8, 12)
+"""Evaluations of the laps of a race of cards: with six values free beside the others they come near their ends in so many."""
+CLOCKS = "clocks"
+"""Kind of the term that the clocks of records are off."""
+NO_PICK = Pick(-1, 0, 1.0, 0.0)
+NO_SCREEN = Screen((), {}, {}, np.zeros(0), {})
+BEAM = 3
+"""Hypotheses of one number of terms, of different kinds, that are opened."""
+VALUES = 8
+"""Values that are refitted at a time, those that promise most."""
+ELSEWHERE = (0.2, 0.35, 0.6, 1.6, 3.0)
+"""Shares of a stated value without a trace at which it is run."""
+LEAST_INDEPENDENT_POWER = 1e-6
+"""Share of a squared derivative that the free parameters have to leave for a value to be determined."""
 
 
-def one_round(search: SearchContext, before: Refit, number: int, *, little: bool = False) -> Round:
-    """Return a round on the model as it stands. Raises SimulationError where that model cannot be run.
+@dataclass(frozen=True)
+class Term:
+    """What a hypothesis has more than the nominal model.
 
-    little: whether so little is left that only an effect that explains it is worth adding: a few refits show whether one may.
+    kind: an effect of the catalogue, `VALUE`, `CARD` or `CLOCKS`; at: its places, the value's name, the component, or the records whose
+    clocks are off; source: the signal that an effect brings in, or the card. prior: its probability before any data.
     """
-    nominal = before.nominal()
-    search.tell(0, 1, f"round {number}: the signals")
-    signals = slot_signals(before)
-    times = [e.time for e in before.problem.fitted_experiments]
-    found = candidates(before.model, signals, times, search.effects, search.places, tones(nominal))
-    there = {(p.candidate.effect, p.candidate.at, p.candidate.source) for p in before.placed}
-    found = tuple(c for c in found if (c.effect, c.at, c.source) not in there and c.probes)
-    round_model = RoundModel.of(search, before, found, number)
-    text = f"round {number}: {len(found)} candidates"
-    screen = round_model.screen(found, text)
-    opened = Round(before, signals, found, screen)
-    if not screen.scores:
-        return replace(opened, why="no candidate leaves a trace in these data")
-    p = screen.p(max(screen.scores[0].fall, 0.0))
-    nothing = f"the best of all is what noise gives (p = {p:.2g})"
-    loud = exceeds_noise(before) and not resembles_noise(before)
-    if p > NEARLY_SIGNIFICANT and not loud:
-        return replace(opened, why=nothing)
-    if little or (p > search.options.significance and not loud):
-        first = round_model.refitted(found, _field(search, found, screen.scores)[:SHORTLIST], f"round {number}")
-        gains = [Ruler.of(t.refit).between(before, t.refit) for t in first if not t.refit.failure]
-        named = max(gains, default=0.0) > search.options.named_bic
-        if not (named and _significant(search, opened, first)) or (little and all_far_from_noise(before, first)):
-            return replace(opened, failed=tuple(t for t in first if t.refit.failure), why=nothing)
-    opened, trials = _explored(search, round_model, opened, number)
-    if not _significant(search, opened, trials):
-        return replace(opened, failed=tuple(t for t in trials if t.refit.failure), why=nothing)
-    return judged_round(search, replace(opened, significant=True), trials, number)
+
+    kind: str
+    at: tuple[str, ...] = ()
+    source: str = ""
+    prior: float = field(default=1.0, compare=False)
+
+    @property
+    def is_effect(self) -> bool:
+        """Whether it is an effect that stands in the model."""
+        return self.kind not in (VALUE, CARD, CLOCKS)
+
+    @property
+    def is_form(self) -> bool:
+        """Whether it is a form outside the catalogue, which no name stands for."""
+        return self.is_effect and bool(effects()[self.kind].outside)
+
+    @property
+    def label(self) -> str:
+        """The term in tables."""
+        return f"{self.kind} at {', '.join(self.at)}" + (f" from {self.source}" if self.source else "")
 
 
-def _significant(search: SearchContext, opened: Round, trials: Sequence[CandidateFit]) -> bool:
-    """Return True where a refit makes chi2 fall by more than noise gives anywhere."""
-    falls = [opened.before.chi2 - t.refit.chi2 for t in trials if not t.refit.failure]
-    return opened.screen.p(max(falls, default=0.0)) <= search.options.significance
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """The nominal model with some terms, refitted.
 
-
-def _explored(
-    search: SearchContext, round_model: RoundModel, opened: Round, number: int
-) -> tuple[Round, list[CandidateFit]]:
-    """Return the round with its refits."""
-    found, text = opened.candidates, f"round {number}"
-    most = opened.screen.scores[0].fall
-    hopeful = [
-        s for s in opened.screen.scores if s.fall >= Race().reach * most
-    ]  # where none explains the records, all are
-    opened, trials = _with_neighbours_of_leaders(
-        round_model, opened, round_model.refitted(found, _field(search, found, hopeful), text), number
-    )
-    given = with_given_gains(opened.before)
-    far = not search.spent and all_far_from_noise(opened.before, trials, near=TOLERANCE)
-    if far:
-        # Bends are missed between two sizes.
-        opened = replace(opened, candidates=tuple(map(_denser, opened.candidates)))
-        # A form shows by a few refits whether the catalogue lacks something, before all of it is looked at more closely.
-        opened, trials = _outside(search, round_model, opened, trials, number)
-        if opened.form is not None:
-            return opened, trials
-    if far and not search.spent:
-        found = opened.candidates
-        # Gains that make up for an effect may leave no trace of it.
-        for point in (None,) if given is None else (None, given):
-            if point is None:
-                where = f"{text}: once more"
-                denser = round_model.screen(found, where, known=opened.screen)
-                every = ranked((*opened.screen.scores, *denser.scores), found)
-            else:
-                where = f"{text}: from the given values"
-                which = round_model.promising(opened.screen, found, point)
-                every = round_model.screen(found, where, which, point).scores
-            scores = _field(search, found, every)
-            trials = best_each([*trials, *round_model.refitted(found, scores, where, trials)])
-        opened, trials = _with_neighbours_of_leaders(round_model, opened, trials, number)
-    elif given is not None and not search.spent:
-        # Beside an effect the records may be explained by other values of the parameters too.
-        where, which = f"{text}: from the given values", [t.pick.candidate for t in by_cost(trials)[:REFITS_PER_EFFECT]]
-        scores = [*round_model.screen(opened.candidates, where, which, given).best().values()]
-        more = round_model.refitted(opened.candidates, scores, where, trials)
-        opened, trials = _with_neighbours_of_leaders(round_model, opened, best_each([*trials, *more]), number)
-    if not search.spent:
-        opened, trials = with_searched_sizes(
-            round_model, opened, trials, number, far=all_far_from_noise(opened.before, trials)
-        )
-    return _outside(search, round_model, opened, trials, number)
-
-
-def _field(search: SearchContext, found: Sequence[CandidateEffect], scores: Sequence[Score]) -> list[Score]:
-    """Return the scores that are refitted: of each effect the best candidates."""
-    count: Counter[str] = Counter()
-    several, most = 0, REFITS_PER_EFFECT * (THOROUGH_FACTOR if search.options.thorough else 1)
-    taken: dict[int, Score] = {}
-    for s in scores:
-        c = found[s.candidate]
-        if s.candidate in taken or count[c.effect] >= most or (len(c.at) > 1 and several >= MAX_FAMILIES):
-            continue
-        count[c.effect] += 1
-        several += len(c.at) > 1
-        taken[s.candidate] = s
-    return [*taken.values()]
-
-
-def _with_neighbours_of_leaders(
-    round_model: RoundModel, opened: Round, trials: Sequence[CandidateFit], number: int
-) -> tuple[Round, list[CandidateFit]]:
-    """Return the trials with what is found from the gains and beside the sizes of the best, again while something comes nearer."""
-    trials, led = best_each(trials), dict(opened.led)
-    for _ in range(MAX_FOLLOWED):
-        leaders = [t for t in _leaders(opened, trials) if cost_of(t) < led.get(t.pick.candidate, math.inf) - TIED]
-        if not leaders or round_model.search.spent:
-            break
-        led |= {t.pick.candidate: cost_of(t) for t in leaders}
-        least = cost_of(by_cost(trials)[0])
-        more: list[CandidateFit] = []
-        for t in leaders:
-            opened, scores = _neighbours(round_model, opened, t, number)
-            scores = _promising(opened.before, scores, [*trials, *more])
-            more += round_model.refitted(opened.candidates, scores, f"round {number}: neighbours", [*trials, *more])
-        opened, trials = with_closer_sizes(round_model, opened, best_each([*trials, *more]), number)
-        if cost_of(by_cost(trials)[0]) > least - TIED:
-            break
-    return replace(opened, led=led), trials
-
-
-def _promising(before: Refit, scores: Sequence[Score], trials: Sequence[CandidateFit]) -> list[Score]:
-    """Return the scores that promise more than their candidates' refits have come to."""
-    came_to: dict[int, float] = {}
-    for t in trials:
-        if t.refit.failure in ("", LEFT_BEHIND):
-            came_to[t.pick.candidate] = min(t.refit.chi2, came_to.get(t.pick.candidate, math.inf))
-    return [s for s in scores if before.chi2 - s.fall < came_to.get(s.candidate, math.inf) - TIED]
-
-
-def _leaders(opened: Round, trials: Sequence[CandidateFit]) -> list[CandidateFit]:
-    """Return the best refit of each of the best effects."""
-    sound = by_cost(trials)
-    if not sound:
-        return []
-    least = LEADING_SHARE * (opened.before.chi2 - sound[0].refit.chi2)
-    each: dict[str, CandidateFit] = {}
-    for t in sound:
-        if opened.before.chi2 - t.refit.chi2 >= least:
-            each.setdefault(opened.candidates[t.pick.candidate].effect, t)
-    return list(each.values())[:BEAM]
-
-
-def _neighbours(round_model: RoundModel, opened: Round, lead: CandidateFit, number: int) -> tuple[Round, list[Score]]:
-    """Return the round and the scores of what is at the leader's places, is its effect, or promises most, from the gains that the leader
-    came to.
-
-    Its effect elsewhere, and at several places of which one is the leader's, is tried in the leader's size too, and another kind
-    of delay there with a delay as long. What promises most there is ranked by the answers of the screen: beside gains that make up for
-    what is missing, it was misjudged.
+    refit: judged. base: the nominal model that its effects are put on: with the values that are free, on the records as they are timed.
+    before: the refit without the last effect, where that one is still a movable one.
     """
-    own = opened.candidates[lead.pick.candidate]
-    sizes = lead.refit.sizes(lead.refit.placed[-1])
-    found = list(opened.candidates)
-    same = [k for k in opened.screen.best() if found[k].effect == own.effect]
-    like = [k for k in same if len(found[k].at) == len(own.at)]
-    around = [k for k in same if set(found[k].at) > set(own.at)]
-    parts = [k for k in same if len(found[k].at) == 1 and any(found[k].at[0] in found[f].at for f in around)]
-    here = [k for k, c in enumerate(found) if set(c.at) <= set(own.at) and not c.still]
-    theta = gains_of(opened.before, lead.refit)
-    promising = [k for k in round_model.order(opened.screen, found, theta)[:FIELD] if k not in opened.promised]
-    which = list(dict.fromkeys((*here, *like[: 2 * REFITS_PER_EFFECT], *parts, *around, *promising)))
-    late = effects()[own.effect].delay_with(sizes)
-    for k in promising:  # bends are missed between two sizes
-        found[k] = _denser(found[k])
-    for k in which:
-        if found[k].effect == own.effect:
-            found[k] = found[k].with_sizes([sizes])
-        elif late:
-            found[k] = found[k].with_sizes(_delaying(found[k], late))
-    screen = round_model.screen(found, f"round {number}: beside {own.label}", which, theta)
-    best = opened.before.chi2 - lead.refit.chi2
-    near = [
-        s
-        for s in screen.scores
-        if s.candidate != lead.pick.candidate
-        # Of an effect in proportion to its size the fall is exact in that, and at the leader's gains hardly moves with them.
-        and s.fall >= (Race().near if in_proportion(found[s.candidate], s.probe) else Race().reach) * best
-    ]
-    opened = replace(opened, candidates=tuple(found), promised=opened.promised | frozenset(promising))
-    return opened, _field(round_model.search, found, near)
+
+    refit: Refit
+    base: Refit
+    terms: tuple[Term, ...] = ()
+    before: Refit | None = None
+
+    @cached_property
+    def key(self) -> frozenset[Term]:
+        """The terms, whatever their order."""
+        return frozenset(self.terms)
+
+    @property
+    def kind(self) -> str:
+        """Kind of the last term; empty where there is none."""
+        return self.terms[-1].kind if self.terms else ""
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """Names of the stated values that are free."""
+        return tuple(t.at[0] for t in self.terms if t.kind == VALUE)
+
+    def without(self, term: Term) -> frozenset[Term]:
+        """The key of the hypothesis without one of its terms."""
+        return self.key - {term}
 
 
-def _denser(candidate: CandidateEffect) -> CandidateEffect:
-    """Return a candidate with three times as many sizes, where it has one size and bends what it acts on."""
-    values = [p.values[n] for p in candidate.probes for n in p.free if len(p.free) == 1]
-    if len(values) < max(2, len(candidate.probes)) or min(values) <= 0.0 or in_proportion(candidate, 0):
-        return candidate
-    (name,) = candidate.probes[0].free
-    ends = sorted(values)
-    between = [a * (b / a) ** share for a, b in pairwise(ends) for share in (1 / 3, 2 / 3)]
-    return candidate.with_sizes([{**candidate.probes[0].values, name: v} for v in between])
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """A term of the best hypothesis, and what was looked for in its stead beside the others.
 
-
-def _delaying(candidate: CandidateEffect, late: float) -> list[dict[str, float]]:
-    """Return the sizes at which a candidate delays so long, from its probe that delays most alike; none of what is no delay."""
-    delays = [effects()[candidate.effect].delay_with(p.values) for p in candidate.probes]
-    near = {n: abs(math.log(d / late)) for n, d in enumerate(delays) if d is not None and d * late > 0.0}
-    if not near:
-        return []
-    n = min(near, key=lambda k: near[k])
-    return [scaled_sizes(candidate, n, late / (delays[n] or late))]
-
-
-def _outside(
-    search: SearchContext, round_model: RoundModel, opened: Round, trials: list[CandidateFit], number: int
-) -> tuple[Round, list[CandidateFit]]:
-    """Return the round with the refits of forms outside the catalogue, and the form that comes nearer than any effect, if one does.
-
-    A form with many values finds the place and the gains where an effect, beside biased gains, did not: a filter whose poles and zeros
-    meet is a gain. So every effect is tried there, begun with the gains that the form came to. Where one of them comes near the
-    noise too, the catalogue lacks nothing. Forms are looked for in the first round, where the best refit takes away some of the misfit
-    and leaves more than noise.
+    expansion: of the hypothesis without it, its trials the best first, with the term's own as the winner where it is an effect. others:
+    the stated values and cards that were tried in its stead, with their refits.
     """
-    best = next(iter(by_cost(trials)), None)
-    if number > 1 or not search.options.fallback or search.spent or best is None or not _explains_some(opened, trials):
-        return opened, trials
-    if is_noise(best.refit, search.seed):
-        return opened, trials
-    if opened.forms is None:
-        opened = replace(opened, forms=refitted_forms(search, opened))
-    form = best_form(search, opened, opened.forms or (), best.refit)
-    if form is None or search.spent:
-        return opened, trials
-    at = form.refit.placed[-1].candidate.at
-    which = [k for k, c in enumerate(opened.candidates) if c.at == at and not c.still]
-    text = "round 1: in the stead of a form"
-    screen = round_model.screen(opened.candidates, text, which, gains_of(opened.before, form.refit))
-    scores = list(screen.best().values())[:FIELD]
-    trials = best_each([*trials, *round_model.refitted(opened.candidates, scores, text, trials)])
-    return replace(opened, form=form if all_far_from_noise(opened.before, trials) else None), trials
 
-
-def _explains_some(opened: Round, trials: Sequence[CandidateFit]) -> bool:
-    """Return True where a refit takes away a share of what is beyond noise: where none does, the noise is louder than stated."""
-    least = opened.before.chi2 - fall_beyond_loud_noise(opened.before)
-    return any(not t.refit.failure and t.refit.chi2 < least for t in trials)
-
-
-def judged_round(search: SearchContext, opened: Round, trials: Sequence[CandidateFit], number: int) -> Round:
-    """The round with its refits ranked and its winner, put into the model; or what speaks against the best.
-
-    Ranked by what the fitted and the held-out data say together. Of those that are as good the likeliest wins: an effect's
-    probability before any data is shared by all its places and sources, so an offset goes before one of many couplings. Of those
-    that are as likely and imply other values of the parameters that one wins whose values are nearest to the given ones.
-    """
-    refitted = {t.pick.candidate for t in trials}
-    trials = [*trials, *(t for t in opened.failed if t.pick.candidate not in refitted)]
-    sound, failed = [t for t in trials if not t.refit.failure], tuple(t for t in trials if t.refit.failure)
-    if not sound:
-        return replace(opened, failed=failed, why="no candidate could be refitted")
-    before, found = opened.before, opened.candidates
-    ruler = Ruler.of(min(sound, key=lambda t: t.refit.chi2).refit)
-    ranked = sorted((with_gain(t, before, ruler) for t in sound), key=lambda t: -t.total_gain)
-    if opened.form is not None:
-        return replace(opened, trials=tuple(ranked), failed=failed, ruler=ruler, why=ONLY_A_FORM)
-    level = [t for t, behind in zip(ranked, deficits(ranked), strict=True) if behind <= search.options.set_bic]
-    refused = {id(t): objection(search, before, t, opened, first=number == 1) for t in level}
-    many = Counter(c.effect for c in found)
-    unlikely = {id(t): 2.0 * np.log(many[found[t.pick.candidate].effect]) - t.total_gain for t in level}
-    likeliest = sorted((t for t in level if not refused[id(t)]), key=lambda t: unlikely[id(t)])
-    winner = next(iter(likeliest), None)
-    if winner is not None:
-        tied = [t for t in likeliest if unlikely[id(t)] <= unlikely[id(winner)] + TIED]
-        winner = nearest(winner, tied, lambda t: implied(t.refit), lambda t: off_given(t.refit))
-        winner = _well_named(before.model, found, winner, tied)
-        placed = built_in(before, winner.refit)
-        if placed.failure:
-            return replace(
-                opened,
-                trials=tuple(ranked),
-                failed=failed,
-                ruler=ruler,
-                why=f"{found[winner.pick.candidate].label}: {placed.failure}",
-            )
-        new = with_gain(replace(winner, refit=placed), before, ruler)
-        ranked, winner = [new if t is winner else t for t in ranked], new
-    why = "" if winner else f"{found[level[0].pick.candidate].label}: {refused[id(level[0])]}"
-    return replace(opened, trials=tuple(ranked), failed=failed, winner=winner, why=why, ruler=ruler)
-
-
-def _well_named(
-    model: AnyModel, found: Sequence[CandidateEffect], winner: CandidateFit, tied: Sequence[CandidateFit]
-) -> CandidateFit:
-    """Return of those that explain as much as the winner, there and from there, one whose name suits these signals, where its own
-    does not: reactive power that acts on a voltage is a droop, and no conductance."""
-    own = found[winner.pick.candidate]
-    if own.effect != "conductance" or all(leaks(model, own.at, s) for s in own.sources):
-        return winner
-    others = [t for t in tied if found[t.pick.candidate].effect in ("droop", "coupling")]
-    there = [t for t in others if (found[t.pick.candidate].at, found[t.pick.candidate].source) == (own.at, own.source)]
-    return next(iter(there), winner)
-
-
-def objection(search: SearchContext, before: Refit, trial: CandidateFit, opened: Round, *, first: bool) -> str:
-    """Objection to naming a trial's effect, in words; empty where there is none. opened: the round that knows what noise does."""
-    p = opened.screen.p(before.chi2 - trial.refit.chi2)
-    return objections(before, trial, p, search.options, search.tolerance, first=first)
+    term: Term
+    expansion: Expansion
+    others: tuple[tuple[Term, CandidateFit], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class SearchOutcome:
     """Where the search ended.
 
-    rounds: all of them; kept: by effect of the final model, the round that judges its rivals; notes: what could not be done.
+    best: the hypothesis that is the answer, its effects in the model; kept: by term of it, clocks aside. pool: every hypothesis, the best
+    first, with its score less that of the model without terms. expansions: what was looked for beside which hypothesis, the first
+    first. form: outside the catalogue, where that is better than the answer and stands its tests. objection: why a better one is not
+    the answer; empty where the best is. exhausted: whether nothing that was open could have
+    come near; notes: what could not be done, or was not.
     """
 
-    refit: Refit
-    rounds: tuple[Round, ...]
-    kept: tuple[Round, ...]
+    best: Hypothesis
+    kept: tuple[Kept, ...]
+    pool: tuple[tuple[Hypothesis, float], ...]
+    expansions: tuple[Expansion, ...]
+    slight: Errors
+    form: FoundForm | None = None
+    objection: str = ""
+    exhausted: bool = True
     notes: tuple[str, ...] = ()
 
+    @property
+    def explained_by_errors(self) -> bool:
+        """Whether slight errors of what is stated explain what the best hypothesis leaves, and it is no noise without them."""
+        misfit = misfit_of(self.refit)
+        power = (self.refit.chi2 - self.slight.fall_fitted) / self.refit.rows
+        return not misfit.is_noise and power <= misfit.floor * (1.0 + SURE * misfit.power_error)
 
-def two_start_search(search: SearchContext, first: Refit) -> SearchOutcome:
-    """The search from the refitted gains; where that leaves more than anybody asks about, from the given ones if it then ends nearer.
-
-    Gains that have moved far to make up for what is missing may leave no room for it: beside them a lag of its true size is
-    unstable, and no score shows it. first: the nominal model, refitted.
-    """
-    outcome = forward_search(search, first)
-    theta = with_given_gains(first)
-    last = outcome.refit
-    if (
-        theta is None
-        or not gains_moved_far(first)
-        or not is_far_from_noise(first, last)
-        or is_small(search, first, last)
-        or search.spent
-    ):
-        return outcome
-    search.tell(0, 1, "once more, from the given values")
-    try:
-        again = forward_search(search, judged(replace(first, theta=theta)))
-    except FAILURES as error:
-        return replace(outcome, notes=(*outcome.notes, f"from the given values nothing was looked for: {error}"))
-    ruler = Ruler.of(min(last, again.refit, key=lambda r: r.chi2))
-    nearer = bool(again.kept) and ruler.between(last, again.refit) > search.options.named_bic
-    return again if nearer else outcome
+    @property
+    def refit(self) -> Refit:
+        """The best hypothesis, refitted."""
+        return self.best.refit
 
 
-def forward_search(search: SearchContext, first: Refit) -> SearchOutcome:
-    """The effects that are added one after the other, each with all others refitted, until nothing is worth adding.
+@dataclass(frozen=True)
+class Move:
+    """What makes of a hypothesis others. rank: when its turn is, beside the same of a hypothesis with a term less or more. of_root:
+    whether it is one of the model without terms alone."""
 
-    Beside each of them, and beside none, parameters that were held are set free where the records speak against their values.
-    """
-    found = None
-    if not search.held:  # a stated value has to bring more than an effect that leaves noise could leave it
-        found = one_round(search, first, 1)
-        if found.winner is not None and is_noise(found.winner.refit, search.seed):
-            clocked = on_their_clocks(search, first, first)[1]
-            if clocked is first or _behind(search, found.winner.refit, clocked) <= 0.0:
-                return SearchOutcome(found.winner.refit, (found,), (found,))
-    base, here = (first, first) if is_noise(first, search.seed) else released(search, first, first)
-    if here is first:
-        return _added_one_by_one(search, first, first, [found] if found else [])
-    # Parameters may stand for a missing effect: then the effect has as much evidence, and they are asked again beside it.
-    # Where it has no more, a candidate that was held is the likelier cause, and a stated value the less likely one.
-    moved = set(here.problem.names) - set(first.problem.names)
-    level = search.options.set_bic if moved & {f.name for f in search.stated} else -search.options.set_bic
-    found = found or one_round(search, first, 1)
-    if found.winner is not None and _behind(search, found.winner.refit, here) <= level:
-        return _added_one_by_one(search, first, first, [found])
-    with_parameters = _added_one_by_one(search, base, here, [])
-    # A parameter may stand for one of several effects: that is seen when the others are there too.
-    if found.winner is None or not with_parameters.kept or search.spent:
-        return with_parameters
-    with_effects = _added_one_by_one(search, first, first, [found])
-    more = len(with_effects.kept) > len(with_parameters.kept)
-    behind = _behind(search, with_effects.refit, with_parameters.refit)
-    return with_effects if behind <= (-search.options.named_bic if more else level) else with_parameters
+    name: str
+    rank: int
+    make: Callable[[Search, Hypothesis], list[Hypothesis]]
+    of_root: bool = False
 
 
-def _behind(search: SearchContext, one: Refit, other: Refit) -> float:
-    """By how much evidence, in BIC, the first hypothesis is behind the other."""
-    ruler = Ruler.of(min(one, other, key=lambda r: r.chi2))
-    few, many = (len(r.problem.free) + len(clocks(search, r)) for r in (one, other))
-    return evidence_between(one, other, ruler, many - few)
+TERM_RANK = 3
+"""Ranks by which the moves of a hypothesis come after those of one with a term less."""
 
 
-def _added_one_by_one(search: SearchContext, base: Refit, here: Refit, rounds: list[Round]) -> SearchOutcome:
-    """The search from the nominal model `here`; rounds: its first, where that is done."""
-    nominal = here
-    kept: list[Round] = []
-    notes: tuple[str, ...] = ()
-    asked_again, little = None, False
-    while len(kept) < search.options.most:
-        if kept and search.spent:
-            notes += ("The budget ended: no further effect was looked for.",)
-            break
-        try:
-            if kept or not rounds:
-                rounds.append(one_round(search, here, len(rounds) + 1, little=little))
-        except FAILURES as error:
-            if not kept:
-                raise
-            notes += (f"nothing was looked for beside {here.placed[-1].candidate.label}: {error}",)
-            break
-        found = rounds[-1]
-        if found.winner is None:
-            hopeful = (
-                found.significant
-                and found.form is None
-                and not little
-                and len(kept) + 1 < search.options.most
-                and not (search.spent or is_noise(here, search.seed))
-            )
-            both = _masked_pair(search, here, found, len(rounds) + 1) if hopeful else None
-            if both is None:
+class Search:
+    """A search at work: its hypotheses, and what has been looked for beside which of them."""
+
+    def __init__(self, context: SearchContext, first: Refit) -> None:
+        self.context = context
+        self.root = Hypothesis(first, first)
+        self.slight = {id(first.problem.experiments): SlightErrors.of(first, context.stated)}
+        self.floor = noise_left(first.nominal())
+        self.pool: dict[frozenset[Term], Hypothesis] = {}
+        self.models: dict[frozenset[Term], ExpansionModel] = {}
+        self.expansions: dict[frozenset[Term], Expansion] = {}
+        self.done: set[tuple[frozenset[Term], str]] = set()
+        self.errors: dict[frozenset[Term], tuple[Refit, Errors]] = {}
+        self.noisy: dict[frozenset[Term], tuple[Refit, bool]] = {}
+        self.notes: list[str] = []
+        self.add([self.root])
+
+    # --- the score ---
+
+    @property
+    def ruler(self) -> Ruler:
+        """What scores are counted by: what the best hypothesis leaves, by chi2."""
+        best = min(self.pool.values(), key=lambda h: h.refit.chi2 / h.refit.rows)
+        errors = self.errors_under(best)
+        if errors.total is None:
+            return Ruler.of(best.refit)
+        return Ruler.of(replace(best.refit, chi2=best.refit.chi2 - errors.fall_fitted, correlation=errors.correlation))
+
+    def errors_under(self, h: Hypothesis) -> Errors:
+        """The likeliest slight errors under a hypothesis."""
+        known = self.errors.get(h.key)
+        if known is None or known[0] is not h.refit:
+            records = h.base.problem.experiments
+            if id(records) not in self.slight:
+                self.slight[id(records)] = SlightErrors.of(h.base, self.context.stated)
+            slight = self.slight[id(records)]
+            for card in (t for t in h.terms if t.kind == CARD):
+                slight = slight.without(card.at[0])
+            known = h.refit, slight.under(h.refit)
+            self.errors[h.key] = known
+        return known[1]
+
+    def cost(self, h: Hypothesis, ruler: Ruler, *, rough: bool = False) -> float:
+        """The score of a hypothesis: less is better. rough: without slight errors."""
+        r = h.refit
+        share = ruler.effective / ruler.rows / ruler.scale
+        known = None if rough else self.errors_under(h).total
+        chi2 = _chi2(r) if known is None else known
+        if known is not None and r.holdout is None and r.predicted is not None:
+            # Parts of the fitted records, predicted from the rest: errors explain as much of these.
+            chi2 += r.predicted**2 * r.unseen_rows * known / r.chi2
+        # The row that leaves a record with a late clock takes its share of the noise along.
+        chi2 += r.chi2 * (self.root.refit.rows / r.rows - 1.0)
+        prior = -2.0 * sum(math.log(t.prior) for t in h.terms)
+        count = len(r.problem.names) + sum(len(t.at) for t in h.terms if t.kind == CLOCKS)
+        return share * chi2 + ruler.price * count + prior
+
+    def ranked(self) -> list[Hypothesis]:
+        """Every hypothesis, the best first; of those far behind without slight errors."""
+        ruler = self.ruler
+        rough = sorted(self.pool.values(), key=lambda h: self.cost(h, ruler, rough=True))
+        # Slight errors take off the most where nothing else explains the records: by so much the first order may be wrong.
+        most = max(self.cost(self.root, ruler, rough=True) - self.cost(self.root, ruler), 0.0)
+        limit = min(self.cost(h, ruler) for h in rough[:3]) + most + SET
+        near = [h for h in rough if self.cost(h, ruler, rough=True) <= limit]
+        return [*sorted(near, key=lambda h: self.cost(h, ruler)), *rough[len(near) :]]
+
+    def is_noise(self, h: Hypothesis) -> bool:
+        """Whether a hypothesis leaves noise alone, by its size and over time, beside slight errors."""
+        known = self.noisy.get(h.key)
+        if known is None or known[0] is not h.refit:
+            known = h.refit, self._is_noise(h)
+            self.noisy[h.key] = known
+        return known[1]
+
+    def _is_noise(self, h: Hypothesis) -> bool:
+        r, misfit = h.refit, misfit_of(h.refit)
+        power = (r.chi2 - self.errors_under(h).fall_fitted) / r.rows
+        small = power <= self.floor * (1.0 + SURE * misfit.power_error)
+        return misfit.is_noise or (small and not misfit.has_shape)
+
+    # --- the pool ---
+
+    def add(self, hypotheses: Sequence[Hypothesis]) -> None:
+        """Put hypotheses into the pool; of those with the same terms the one that leaves least stays, and of those that leave as much
+        the one whose values are nearest to the given ones."""
+        for h in hypotheses:
+            if h.refit.failure:
+                continue
+            had = self.pool.get(h.key)
+            if had is None:
+                self.pool[h.key] = h
+                continue
+            more = h.refit.chi2 - had.refit.chi2
+            if more < -TIED or (more <= TIED and off_given(h.refit) < off_given(had.refit)):
+                self.pool[h.key] = h
+
+    def ready(self, h: Hypothesis) -> Hypothesis:
+        """Return a hypothesis whose effects are in the model; one that cannot be is returned with its failure."""
+        if h.before is None:
+            return h
+        built = replace(h, refit=built_in(h.before, h.refit), before=None)
+        if not built.refit.failure:
+            self.pool[h.key] = built
+        return built
+
+    def left(self, h: Hypothesis) -> float:
+        """What a hypothesis leaves, times the noise."""
+        return math.sqrt(max(h.refit.chi2 - self.errors_under(h).fall_fitted, 0.0) / h.refit.rows)
+
+    # --- the queue ---
+
+    def run(self) -> SearchOutcome:
+        """Return where the search ends."""
+        exhausted = False
+        while not self.context.spent:
+            todo = self._next()
+            if todo is None:
+                exhausted = True
                 break
-            rounds[-1] = both[0]
-            rounds.append(both[1])
-            kept += both
-            assert both[1].winner is not None
-            here = both[1].winner.refit
-            if not is_noise(here, search.seed):
-                base, here = released(search, base, here)
-            break
-        # Nobody asks about so little of the gap: an effect is added to it only if it explains that.
-        if little and is_far_from_noise(here, found.winner.refit):
-            break
-        kept.append(found)
-        base, here = held_again(search, base, found.winner.refit)
-        if is_noise(here, search.seed):
-            break
-        base, here = released(search, base, here)
-        if is_noise(here, search.seed):
-            break
-        little = left_by(here) <= TOLERANCE * left_by(nominal)
-        # An effect that stands for another one may be why something is left.
-        if 1 < len(kept) < search.options.most and not (little or search.spent):
-            here, kept, more = backward_elimination(search, base, here, kept, len(rounds))
-            notes, asked_again = notes + more, here
-            if is_noise(here, search.seed):
-                break
-    # Where a parameter was set free beside an effect, its rivals were refitted without that.
-    if kept and not search.spent and asked_again is not here and (len(kept) > 1 or _closed_to(base, kept[0])):
-        here, kept, more = backward_elimination(search, base, here, kept, len(rounds))
-        notes += more
-    return SearchOutcome(here, tuple(rounds), tuple(kept), notes)
-
-
-def _closed_to(base: Refit, found: Round) -> bool:
-    """Return True where a round held a parameter that has since been set free, or had the records on other clocks."""
-    freed = {f.name for f in base.problem.free} - set(found.before.problem.names)
-    return bool(freed) or base.problem.experiments[0].time is not found.before.problem.experiments[0].time
-
-
-def _masked_pair(search: SearchContext, before: Refit, found: Round, number: int) -> tuple[Round, Round] | None:
-    """Two rounds whose effects pass together though the first does not alone, for one masks the other; None where none do.
-
-    The best hypotheses, of different effects or places, are each searched one step further.
-    """
-    passed: list[tuple[Round, Round]] = []
-    for trial in _different(found)[:BEAM]:
-        try:
-            further = one_round(search, trial.refit, number)
-        except FAILURES:
-            continue
-        if further.winner is None or further.ruler is None:
-            continue
-        whole = with_gain(further.winner, before, further.ruler)
-        if not objection(search, before, whole, further, first=True):
-            passed.append((replace(found, winner=trial, why=""), further))
-    return max(passed, key=lambda pair: -pair[1].winner.refit.chi2 if pair[1].winner else -np.inf, default=None)
-
-
-def _different(found: Round) -> list[CandidateFit]:
-    """The best refit of each effect, the best first."""
-    each: dict[str, CandidateFit] = {}
-    for t in found.trials:
-        each.setdefault(found.candidates[t.pick.candidate].effect, t)
-    return list(each.values())
-
-
-def backward_elimination(
-    search: SearchContext, first: Refit, here: Refit, kept: Sequence[Round], number: int
-) -> tuple[Refit, list[Round], tuple[str, ...]]:
-    """The refit, by effect the round that judges its rivals, and what could not be done, after looking for each again and
-    doing without it.
-
-    here: the refit of the model `first` with several effects; kept: the rounds that brought them; number: rounds so far.
-    Where all of them together are far from noise none is what is missing, and none is looked for again.
-    """
-    kept, notes = list(kept), []
-    near = not is_far_from_noise(first, here)
-    k = 0
-    while k < len(kept):
-        search.tell(k, len(kept), f"again with the others: {here.placed[k].candidate.label}")
-        others = tuple(p for j, p in enumerate(here.placed) if j != k)
-        without = refit_again(first, here, others)
-        if without.failure:
-            k += 1
-            continue
-        ruler = kept[k].ruler
-        assert ruler is not None
-        gain = ruler.gain(without.chi2, here.chi2, here.count - without.count)
-        # An effect that was clearly there before the others came may be nothing beside them.
-        if gain <= search.options.named_bic or at_edge(here, k) or not is_clear(here, k):
-            here = without
-            del kept[k]
-            continue
-        searched = _beside_these(kept[k], others, last=k == len(kept) - 1) and not _closed_to(first, kept[k])
-        if near and not searched:
+            h, move = todo
+            self.done.add((h.key, move.name))
             try:
-                again, winner = _searched_again(
-                    search, first, here, kept[k], k, without, number + k + 1 if len(kept) > 1 else 1
-                )
-                kept[k] = again
-                here = _in_place(winner.refit, k)
-            except FAILURES as error:  # refitted it runs, as far as a refit needs it to
-                notes.append(f"{here.placed[k].candidate.label} was not looked for again beside the others: {error}")
-        k += 1
-    return here, kept, tuple(notes)
+                self.add(move.make(self, h))
+            except FAILURES as error:
+                if not self.expansions and move.name == "effects":
+                    raise
+                self.notes.append(f"nothing was looked for beside {_labels(h) or 'the model'} ({move.name}): {error}")
+            best = self.ranked()[0]
+            self.context.lead(_labels(best), self.left(best))
+        return self._outcome(exhausted)
+
+    def _next(self) -> tuple[Hypothesis, Move] | None:
+        """The next hypothesis and move; None where nothing open can come near the best."""
+        ranked, ruler = self.ranked(), self.ruler
+        best = ranked[0]
+        satisfied = self.is_noise(best)
+        order: list[tuple[int, int, Hypothesis, Move]] = []
+        # Beside a form that explains the records nothing is looked for in pairs.
+        ends = bool(ranked[0].terms) and ranked[0].terms[-1].is_form and bool(self._standing_forms())
+        for n, h in enumerate(self._beam(ranked)):
+            more = len(h.terms) + 1
+            if more > (1 if ends else self.context.options.most) or not self._may_win(h, best, ruler):
+                continue
+            for move in MOVES:
+                if (h.key, move.name) in self.done:
+                    continue
+                # A hypothesis that leaves noise is not bettered by more of its own kind: only what is cheap is still asked.
+                if (move.of_root and h.terms) or (move.name == "outside" and not self.context.options.fallback):
+                    continue
+                if satisfied and (more > max(len(best.terms), 1) or move.rank > 1):
+                    continue
+                order.append((move.rank + TERM_RANK * len(h.terms), n, h, move))
+        if not order:
+            return None
+        _, _, h, move = min(order, key=lambda o: o[:2])
+        return h, move
+
+    def _beam(self, ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """The best of each kind by number of terms: a pair whose members fail alone is reached from any of the first."""
+        kept: list[Hypothesis] = []
+        count: Counter[object] = Counter()
+        for h in ranked:
+            size = len(h.terms)
+            if any(t.is_form for t in h.terms):
+                continue
+            if count[size] < BEAM and count[h.kind, size] < 1:
+                count[size] += 1
+                count[h.kind, size] += 1
+                kept.append(h)
+        return kept
+
+    def _may_win(self, h: Hypothesis, best: Hypothesis, ruler: Ruler) -> bool:
+        """Whether the likeliest term more, leaving nothing but noise, could come near the best."""
+        if h is best and self.is_noise(best) and h.terms:
+            return False
+        share = ruler.effective / ruler.rows / ruler.scale
+        r = h.refit
+        every = r.rows + (0 if r.predicted is None else r.unseen_rows)
+        # Noise may be so much less than it was taken for, and than what the best leaves.
+        rows = min(every, (self.cost(best, ruler) - self.cost(best, ruler, rough=True)) / share + _chi2(best.refit))
+        rows -= SURE * math.sqrt(2.0 * every)
+        prior = -2.0 * sum(math.log(t.prior) for t in h.terms)
+        ideal = share * rows + ruler.price * (len(r.problem.names) + 1) + prior - 2.0 * math.log(P_VALUE)
+        return ideal < self.cost(best, ruler) + SET
+
+    def _answer(self) -> tuple[Hypothesis, str]:
+        """The best hypothesis to whose terms nothing objects, ready, and what spoke against the best of those before it."""
+        against = ""
+        for h in self.ranked():
+            if h.key == self.root.key:
+                break
+            if any(t.is_form for t in h.terms):  # it has no name: told as what it is
+                continue
+            why = self._objection(h)
+            if not why:
+                built = self.ready(self._preferred(h))
+                why = built.refit.failure
+                if not why:
+                    return built, against
+            against = against or f"{_labels(h)}: {why}"
+        return self.root, against
+
+    def _preferred(self, best: Hypothesis) -> Hypothesis:
+        """Of the hypotheses that are as likely as the best and differ in one term the one whose values are nearest to the given ones,
+        where they are others; and of those that explain as much there the one whose name suits the signals.
+
+        Reactive power that acts on a voltage is a droop, and no conductance.
+        """
+        ruler = self.ruler
+        own = self.cost(best, ruler)
+        tied = [
+            h
+            for h in tuple(self.pool.values())  # what speaks against one may add others
+            if len(h.key) == len(best.key)
+            and len(h.key - best.key) == 1
+            and abs(self.cost(h, ruler, rough=True) - self.cost(best, ruler, rough=True)) <= ruler.effective
+            and abs(self.cost(h, ruler) - own) <= TIED
+            and not any(t.is_form for t in h.terms)
+            and not self._objection(h)
+        ]
+        best = nearest(best, tied, lambda h: implied(h.refit), lambda h: off_given(h.refit))
+        last = best.terms[-1]
+        if last.kind != "conductance" or all(leaks(best.refit.model, last.at, s) for s in last.source.split(",")):
+            return best
+        like = [h for h in tied if h.terms[-1].kind in ("droop", "coupling")]
+        there = [h for h in like if (h.terms[-1].at, h.terms[-1].source) == (last.at, last.source)]
+        return next(iter(there), best)
+
+    def _objection(self, h: Hypothesis) -> str:
+        """What speaks against one of the terms of a hypothesis, in words; empty where nothing does."""
+        ruler, options = self.ruler, self.context.options
+        effect = 0
+        for t in h.terms:
+            less = self._without(h, t)
+            if less is None:
+                continue
+            if t.kind == CLOCKS:
+                continue
+            if not t.is_effect:
+                if self.cost(less, ruler) - self.cost(h, ruler) <= SET:
+                    return "it explains no more than its probability takes away"
+                continue
+            trial = CandidateFit(NO_PICK, last_placed(h.refit, effect), ruler.between(less.refit, h.refit))
+            known = self.expansions.get(less.key) or self.expansions.get(self.root.key)
+            p = 1.0 if known is None else known.screen.p(less.refit.chi2 - h.refit.chi2)
+            first = less.key == self.root.key
+            if why := objections(less.refit, trial, p, options, self.context.tolerance, first=first):
+                return why
+            effect += 1
+        return ""
+
+    def _without(self, h: Hypothesis, term: Term) -> Hypothesis | None:
+        """The hypothesis with one term less, refitted where it is not in the pool; None where it cannot be had."""
+        key = h.without(term)
+        if key in self.pool:
+            return self.pool[key]
+        if term.kind == CLOCKS or (h.before is not None and not (h := self.ready(h)).refit.placed):
+            return None
+        base = h.base
+        if term.kind == CARD:
+            base = self.root.base
+        if term.kind == VALUE:
+            (f,) = (f for f in (*self.context.held, *self.context.stated) if f.name == term.at[0])
+            base = with_held(base, f)
+        own = [t for t in h.terms if t.is_effect]
+        placed = [p for t, p in zip(own, h.refit.placed, strict=True) if t != term]
+        refit = refit_again(base, h.refit, placed)
+        if refit.failure:
+            return None
+        less = Hypothesis(refit, base, tuple(t for t in h.terms if t != term))
+        self.add([less])
+        return self.pool[less.key]
+
+    def _exchanged(self) -> None:
+        """Look for something else in the stead of each term of the best hypothesis of several, until nothing else is better."""
+        for _ in range(self.context.options.most):
+            best, _ = self._answer()
+            if len(best.terms) < 2:
+                return
+            for t in best.terms:
+                less = self._without(best, t)
+                if less is None or self.context.spent:
+                    continue
+                for move in (m for m in MOVES[:EXCHANGED] if not m.of_root):
+                    if (less.key, move.name) not in self.done and not self.context.spent:
+                        self.done.add((less.key, move.name))
+                        with suppress(*FAILURES):  # it cannot be run without the term: nothing stands in its stead
+                            self.add(move.make(self, less))
+            if self._answer()[0].key == best.key:
+                return
+
+    def _outcome(self, exhausted: bool) -> SearchOutcome:
+        if exhausted:
+            self._exchanged()
+        best, against = self._answer()
+        ranked, ruler = self.ranked(), self.ruler
+        none = self.cost(self.root, ruler)
+        return SearchOutcome(
+            best,
+            tuple(self._kept(best, t, ruler) for t in best.terms if t.kind != CLOCKS),
+            tuple((h, self.cost(h, ruler, rough=n >= 2 * VALUES) - none) for n, h in enumerate(ranked)),
+            tuple(self.expansions.values()),
+            self.errors_under(best),
+            self._form(best, ruler),
+            against,
+            exhausted,
+            tuple(self.notes),
+        )
+
+    def _form(self, best: Hypothesis, ruler: Ruler) -> FoundForm | None:
+        """The form outside the catalogue that is better than the answer by more than chance; None where none is."""
+        forms = [h for h in self._standing_forms() if not self._objection(h)]
+        ahead = [h for h in forms if self.cost(best, ruler) - self.cost(h, ruler) > SET]
+        if not ahead:
+            return None
+        first, cost = ahead[0], self.cost(ahead[0], ruler)
+        near = tuple(h.refit for h in ahead[1:] if self.cost(h, ruler) - cost <= SET)
+        before = self.expansions[self.root.key].before
+        return FoundForm(before, first.refit, ruler.between(before, first.refit), near)
+
+    def _standing_forms(self) -> list[Hypothesis]:
+        """Forms outside the catalogue that what they leave does not refute, the best first."""
+        most = REFUTED * misfit_of(self.root.refit).beyond
+        alone = [h for h in self.ranked() if len(h.terms) == 1 and h.terms[0].is_form]
+        return [h for h in alone if misfit_of(h.refit).beyond <= most]
+
+    def _kept(self, best: Hypothesis, term: Term, ruler: Ruler) -> Kept:
+        """What was looked for in the stead of a term of the best hypothesis."""
+        less = self._without(best, term) or self.root
+        known = self.expansions.get(less.key)
+        before = less.refit if known is None else known.before
+        own: CandidateFit | None = None
+        found: list[CandidateFit] = []
+        failed: tuple[CandidateFit, ...] = ()
+        if known is not None:
+            found = [with_gain(t, before, ruler) for t in known.trials if not t.refit.failure]
+            failed = tuple(t for t in known.trials if t.refit.failure)
+        expansion = known or Expansion(before, slot_signals(before), (), NO_SCREEN)
+        if term.is_effect:
+            effects_of_best = [t for t in best.terms if t.is_effect]
+            refit = last_placed(best.refit, effects_of_best.index(term))
+            expansion, number = with_candidate(expansion, refit.placed[-1].candidate)
+            mine = next((t for t in found if t.pick.candidate == number), None)
+            pick = Pick(number, 0, 1.0, 0.0) if mine is None else mine.pick
+            own = with_gain(CandidateFit(pick, refit, 0.0), before, ruler)
+            found = [own, *(t for t in found if t.pick.candidate != number)]
+        ranked = tuple(sorted(found, key=lambda t: -t.total_gain))
+        expansion = replace(expansion, trials=ranked, failed=failed, winner=own, ruler=ruler, significant=True)
+        others = []
+        for h in self.pool.values():
+            (other,) = h.key - less.key if len(h.key) == len(less.key) + 1 and less.key < h.key else (None,)
+            if other is not None and not other.is_effect and other.kind != CLOCKS:
+                trial = CandidateFit(NO_PICK, best.refit if h.key == best.key else h.refit, 0.0)
+                others.append((other, with_gain(trial, before, ruler)))
+        return Kept(term, expansion, tuple(others))
 
 
-def _beside_these(own: Round, others: Sequence[Placed], last: bool) -> bool:
-    """Return True where the round that brought the last effect searched beside the others as they are, and refitted its rivals."""
-    before = [p.candidate.label for p in own.before.placed]
-    return last and len(own.trials) > 1 and before == [p.candidate.label for p in others]
+def _chi2(refit: Refit) -> float:
+    """Return chi2 of the fitted records and the score of the others."""
+    return refit.chi2 + (0.0 if refit.predicted is None else refit.predicted**2 * refit.unseen_rows)
 
 
-def _searched_again(
-    search: SearchContext, first: Refit, here: Refit, found: Round, k: int, without: Refit, number: int
-) -> tuple[Round, CandidateFit]:
-    """The round that looks for the effect in place k beside the others, and its winner: one that was not best alone may be.
+def _labels(h: Hypothesis) -> str:
+    return " and ".join(t.label for t in h.terms)
 
-    Those that came near it in its own round are tried too. The effect itself stays where nothing better may be named.
+
+# --- moves ---
+
+
+def _values(search: Search, h: Hypothesis) -> list[Hypothesis]:
+    """Hypotheses with one stated value more set free: those with which chi2 falls most, to first order, or at another value where none
+    shows at the stated one."""
+    context, h = search.context, search.ready(h)
+    if h.refit.failure:
+        return []
+    here, share = h.refit, P_VALUE / max(len(context.stated), 1)
+    priors = {f.name: P_VALUE for f in context.held} | {f.name: share for f in context.stated}
+    known = h.base.model.parameters.keys() - here.problem.names
+    open_to = [f for f in (*context.held, *context.stated) if f.name in known]
+    worth, starts = _worth(search, here, open_to, [-2.0 * math.log(priors[f.name]) for f in open_to])
+    chosen = [k for k in np.argsort(-worth, kind="stable")[:VALUES] if worth[k] > 0.0]
+    wider = [with_free(h.base, open_to[k]) for k in chosen]
+    jobs = []
+    for k, w in zip(chosen, wider, strict=True):
+        job = joint_refit_job(w, here, here.placed, {})
+        (begin,) = job.begins
+        begin[job.problem.names.index(open_to[k].name)] = starts[k]
+        jobs.append(replace(job, begins=(begin,)))
+    refits = refits_of(context, jobs, [f"with {open_to[k].name} free" for k in chosen])
+    return [
+        Hypothesis(r, w, (*h.terms, Term(VALUE, (open_to[k].name,), prior=priors[open_to[k].name])))
+        for k, r, w in zip(chosen, refits, wider, strict=True)
+        if not r.failure and not open_to[k].on_bound(r.values[open_to[k].name])
+    ]
+
+
+def _worth(
+    search: Search, here: Refit, values: Sequence[FitParameter], prices: Sequence[float]
+) -> tuple[Array, list[float]]:
+    """Return (m,) by how much the score falls with each held value set free, to first order, and where its refit begins.
+
+    Of a value without a trace, such as a level that no signal reaches, the best of a few others is taken. prices: of the values' priors.
     """
-    again = one_round(search, without, number)
-    own = here.placed[k].candidate
-    again, mine = _with_candidate(again, own)
-    sound = [t for t in again.trials if t.pick.candidate != mine]
-    tried = {own.label, *(again.candidates[t.pick.candidate].label for t in sound)}
-    refits: list[tuple[Pick, RefitJob]] = []
-    for trial in found.trials[: SHORTLIST + 1]:
-        placed = trial.refit.placed[-1]
-        among = tuple(placed if j == k else p for j, p in enumerate(here.placed))
-        with suppress(*FAILURES):  # it cannot sit there beside the others: no rival
-            job = joint_refit_job(first, here, among, {k: trial.refit.sizes(placed)})
-            candidate = job.placed[k].candidate
-            # Places behind an effect that is left out are one place without it.
-            if candidate.label not in tried:
-                tried.add(candidate.label)
-                again, number_of = _with_candidate(again, candidate)
-                refits.append((Pick(number_of, 0, 1.0, 0.0), job))
-    texts = [f"again with the others: {again.candidates[p.candidate].label}" for p, _ in refits]
-    ended = refits_of(search, [j for _, j in refits], texts)
-    sound += [CandidateFit(p, _last(r, k), 0.0) for (p, _), r in zip(refits, ended, strict=True) if not r.failure]
-    mine_again = [t for t in again.trials if t.pick.candidate == mine and t.refit.chi2 < here.chi2]
-    sound.append(mine_again[0] if mine_again else CandidateFit(_pick(again, mine), _last(here, k), 0.0))
-    ranked = judged_round(search, again, [*sound, *again.failed], number)
-    winner = ranked.winner or next(t for t in ranked.trials if t.pick.candidate == mine)
-    return replace(ranked, winner=winner), winner
+    at = [here.values.get(f.name, f.given) for f in values]
+    if not values:
+        return np.zeros(0), at
+    nominal = here.nominal()
+    whole = differences(here.problem, here.theta, {f.name: v for f, v in zip(values, at, strict=True)})
+    columns = nominal.projected(whole)
+    power = np.sum(columns**2, axis=0)
+    shown = power > LEAST_INDEPENDENT_POWER * np.sum(whole**2, axis=0)
+    falls = np.where(shown, (columns.T @ nominal.residual) ** 2 / np.where(shown, power, 1.0), 0.0)
+    for k in np.flatnonzero(~whole.any(axis=0)).tolist():
+        for value in (v for share in ELSEWHERE if values[k].min < (v := share * at[k]) < values[k].max):
+            with suppress(SimulationError):  # it does not run there
+                moved = here.problem.residuals(here.problem.misfits(here.theta, {values[k].name: value})[:, None])
+                left = nominal.projected(moved)[:, 0]
+                fall = float(nominal.residual @ nominal.residual - left @ left)
+                if fall > falls[k]:
+                    falls[k], at[k] = fall, value
+    ruler = search.ruler
+    return np.asarray(ruler.effective / ruler.rows / ruler.scale * falls - ruler.price - np.array(prices)), at
 
 
-def _with_candidate(found: Round, candidate: CandidateEffect) -> tuple[Round, int]:
-    """The round with the candidate among its own, and where it stands there."""
-    for k, c in enumerate(found.candidates):
-        if c.label == candidate.label:
-            return found, k
-    return replace(found, candidates=(*found.candidates, candidate)), len(found.candidates)
+def _clocks(search: Search, h: Hypothesis) -> list[Hypothesis]:
+    """The hypothesis on records whose clocks are off, where they are."""
+    if any(t.kind == CLOCKS for t in h.terms) or search.is_noise(h):
+        return []
+    h = search.ready(h)
+    if h.refit.failure:
+        return []
+    base, refit = on_their_clocks(search.context, h.base, h.refit)
+    if refit is h.refit:
+        return []
+    return [Hypothesis(refit, base, (*h.terms, Term(CLOCKS, tuple(clocks(search.context, refit)), prior=P_CLOCKS)))]
 
 
-def _pick(found: Round, candidate: int) -> Pick:
-    """The size of a candidate that the screen likes best, or its first."""
-    score = found.screen.best().get(candidate)
-    return Pick(candidate, 0, 1.0, 0.0) if score is None else Pick(candidate, score.probe, score.factor, score.fall)
+def _cards(search: Search, h: Hypothesis) -> list[Hypothesis]:
+    """The units with another card in the place of one, or with one more, where the model is a unit and nothing explains the records."""
+    context, first = search.context, h.refit
+    if not is_white_box(first.model) or search.is_noise(search.ranked()[0]):
+        return []
+    places = [n for n in context.components if context.may_exchange(n)]
+    changes = [c for c in exchanges(first.model) if (c.component in places if c.stated else places)]
+    bases = [_with_card(first, c) for c in changes]
+    jobs = [RefitJob(b.model, (), b.problem, _begins(b, c), b.noise) for b, c in zip(bases, changes, strict=True)]
+    refits = Race(CARD_LAPS).run(context, first, jobs, [f"with {c.card.upper()} as {c.component}" for c in changes])
+    prior = P_CARD / max(len(changes), 1)
+    each = [
+        Hypothesis(r, replace(b, theta=r.theta), (Term(CARD, (c.component,), c.card.upper(), prior),))
+        for c, b, r in zip(changes, bases, refits, strict=True)
+        if not r.failure and r.rows
+    ]
+    search.add(each)
+    return [_all_of_it(search, h) for h in search.ranked() if h.kind == CARD and len(h.terms) == 1][:BEAM]
 
 
-def _last(refit: Refit, k: int) -> Refit:
-    """The refit with the effect in place k moved to the end, as that of a round is."""
-    return _ordered(refit, [*(j for j in range(len(refit.placed)) if j != k), k])
+def _all_of_it(search: Search, h: Hypothesis) -> Hypothesis:
+    """Return a hypothesis of another card with as many of the card's typical values set free as the records ask for, the most wanted
+    first: nobody has stated them."""
+    (component,) = h.terms[0].at
+    while not (search.context.spent or search.is_noise(h)):
+        own = [f for f in stated(h.base.model, h.base.problem.free) if f.name.startswith(f"{component}.")]
+        worth, _ = _worth(search, h.refit, own, [0.0] * len(own))
+        if not worth.size or worth.max() <= 0.0:
+            break
+        wider = with_free(h.base, own[int(np.argmax(worth))])
+        refit = refit_again(wider, h.refit, ())
+        more = Hypothesis(refit, replace(wider, theta=refit.theta), h.terms)
+        ruler = search.ruler
+        if refit.failure or search.cost(more, ruler, rough=True) >= search.cost(h, ruler, rough=True):
+            break
+        h = more
+    return h
 
 
-def _in_place(refit: Refit, k: int) -> Refit:
-    """The refit with the effect that is last back in place k."""
-    order = list(range(len(refit.placed) - 1))
-    order.insert(k, len(refit.placed) - 1)
-    return _ordered(refit, order)
+def _begins(base: Refit, change: CardChange) -> tuple[Array, ...]:
+    """Return where the refit of another card may begin: at its start, and there with one value a quarter of its range from either end.
+
+    No slope leads to a level that nothing reaches at the start.
+    """
+    begins = [base.theta]
+    for k, f in enumerate(base.problem.free):
+        for share in (0.25, 0.75) if f.name in change.free else ():
+            begins.append(np.concatenate([base.theta[:k], [f.min + share * (f.max - f.min)], base.theta[k + 1 :]]))
+    return tuple(begins)
 
 
-def _ordered(refit: Refit, order: Sequence[int]) -> Refit:
-    return replace(refit, placed=tuple(refit.placed[j] for j in order), apart=tuple(refit.apart[j] for j in order))
+def _with_card(first: Refit, change: CardChange) -> Refit:
+    """Return the nominal model with another card, what a fit frees of it at its start beside the parameters as they are refitted."""
+    model = recording(change.model, (o for e in first.problem.experiments for o in e.outputs))
+    own = tuple(FitParameter(n, p.value, p.min, p.max) for n, p in change.free.items())
+    old = model.parameters.keys() - change.free.keys()
+    stays = [k for k, f in enumerate(first.problem.free) if f.name in old]
+    held = FrozenMap({n: v for n, v in first.problem.held.items() if n in old})
+    free = (*(first.problem.free[k] for k in stays), *own)
+    problem = replace(first.problem, simulator=ModelSimulator(model, first.patience), free=free, held=held)
+    nuisance = first.theta[len(first.problem.free) :]
+    theta = np.concatenate([first.theta[stays], [f.start for f in own], nuisance])
+    return Refit(model, (), problem, first.noise, theta)
+
+
+def _effects(search: Search, h: Hypothesis) -> list[Hypothesis]:
+    """Hypotheses with one effect more, as the screen beside this one ranks them."""
+    h = search.ready(h)
+    if h.refit.failure:
+        return []
+    number = len(search.expansions) + 1
+    model, expansion = opened(search.context, h.refit, number)
+    search.models[h.key] = model
+    search.expansions[h.key] = expansion
+    if not expansion.screen.scores:
+        return []
+    ruler, found = search.ruler, expansion.candidates
+    share = ruler.effective / ruler.rows / ruler.scale
+    best, noise = search.ranked()[0], search.is_noise(h)
+    many = Counter(c.effect for c in found)
+
+    def worth(s: Score) -> bool:
+        c = found[s.candidate]
+        price = ruler.price * len(c.probes[s.probe].free) - 2.0 * math.log(P_EFFECT / len(many) / many[c.effect])
+        return not noise or share * s.fall > price
+
+    reached = h.refit.chi2 - best.refit.chi2 if search.is_noise(best) else 0.0
+    return _kept(search, h, raced(model, expansion, f"round {number}", reached, worth))
+
+
+def _again(
+    look: Callable[[ExpansionModel, Expansion, str], Expansion], text: str
+) -> Callable[[Search, Hypothesis], list[Hypothesis]]:
+    """A move that looks for more in an expansion that is open."""
+
+    def move(search: Search, h: Hypothesis) -> list[Hypothesis]:
+        expansion = search.expansions.get(h.key)
+        if expansion is None or not expansion.trials:
+            return []
+        return _kept(search, h, look(search.models[h.key], expansion, text))
+
+    return move
+
+
+def _kept(search: Search, h: Hypothesis, expansion: Expansion) -> list[Hypothesis]:
+    """Keep an expansion with its trials, and return these as hypotheses."""
+    search.expansions[h.key] = expansion
+    found = expansion.candidates
+    many = Counter(c.effect for c in found)
+    children = []
+    for t in (*expansion.trials, *(expansion.forms or ())):
+        r = t.refit
+        if r.failure or not r.rows or r.predicted is None:
+            continue
+        c = r.placed[-1].candidate
+        own = many[c.effect] or len(expansion.signals)
+        prior = P_EFFECT / max(len(many), 1) / own
+        term = Term(c.effect, c.at, c.source, prior)
+        children.append(Hypothesis(r, h.base, (*h.terms, term), expansion.before if r.placed[-1].movable else None))
+    return children
+
+
+MOVES = (
+    Move("values", 0, _values),
+    Move("clocks", 0, _clocks),
+    Move("cards", 0, _cards, of_root=True),
+    Move("effects", 1, _effects),
+    Move("the best from the given values", 1, _again(best_from_given, "from the given values")),
+    Move("from the given values", 2, _again(from_given, "from the given values")),
+    Move("beside the leaders", 2, _again(beside_leaders, "beside")),
+    Move("beside the new leaders", 3, _again(beside_leaders, "beside")),
+    Move("sizes", 3, _again(lambda m, e, t: searched_sizes(m, e, t, far=True), "sizes to be met")),
+    Move("outside", 4, _again(outside, "outside the catalogue"), of_root=True),
+)
+"""The moves, the cheapest first."""
+
+
+def search_from(context: SearchContext, first: Refit) -> SearchOutcome:
+    """Return the best hypotheses beside the refitted nominal model `first`."""
+    return Search(context, first).run()

@@ -13,17 +13,17 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import Ruler, at_edge, evidence_between, is_clear
-from hvdc_ident.discrepancy.explain import sentence
+from hvdc_ident.discrepancy.expansion import Expansion, refits_of
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, refit_job
 from hvdc_ident.discrepancy.options import SHORTLIST, SearchContext
 from hvdc_ident.discrepancy.result import StandIn
-from hvdc_ident.discrepancy.rounds import Round, refits_of
+from hvdc_ident.discrepancy.score import Ruler, at_edge, evidence_between, is_clear
+from hvdc_ident.discrepancy.sentences import sentence
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.immutable import FrozenMap
 
 
-def stand_ins(search: SearchContext, last: Refit, opened: Round, moved: Sequence[str]) -> tuple[StandIn, ...]:
+def stand_ins(search: SearchContext, last: Refit, opened: Expansion, moved: Sequence[str]) -> tuple[StandIn, ...]:
     """Return the effects that explain the records as well as other values of the parameters, with these as given, the best first.
 
     Only one in place of all of them: beside values that are off, an effect in place of another such value explains nothing more.

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.conclusion import Conclusion, tests_of
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.options import TOLERANCE, SearchContext
-from hvdc_ident.discrepancy.verdict import Conclusion, tests_of
 from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.fit.noise import AT_FLOOR, WHAT_TELLS_NOISE, OutputNoise, floor_of, of_misfit
 from hvdc_ident.immutable import FrozenMap

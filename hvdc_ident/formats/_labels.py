@@ -31,7 +31,7 @@ _SUBSCRIPT = re.compile(r"[\d,:\s]+")
 def name_and_unit(label: str) -> tuple[str, str]:
     """Name and unit of a header cell, "" where it has none.
 
-    What stands in square brackets is the unit unless it is an index. Round brackets, `in` and a stroke stand in names
+    What stands in square brackets is the unit unless it is an index. Expansion brackets, `in` and a stroke stand in names
     as well (`der(x)`, `U (L1)`, `P/Q`): there only a known unit counts.
     """
     name, unit = _split(label.strip())

@@ -645,7 +645,11 @@ class DiagnoseTable(TomlTable):
     most: Annotated[int, Field(ge=1)] = optional("Largest number of effects that are sought beside each other.", "most = 1", default=3)
     thorough: bool = optional("True refits also the effects that promise little, if no other comes near the noise.",
         "thorough = true", default=False)
-    budget: Positive | None = optional("Time after which nothing further is sought. If left out, unlimited.", "budget = 60", "s")
+    budget: Positive | None = optional(
+        "Time after which nothing further is sought. If left out, 60 s of the processor; with `thorough` no limit.",
+        "budget = 60",
+        "s",
+    )
 
     @model_validator(mode="after")
     def _one_name(self) -> DiagnoseTable:

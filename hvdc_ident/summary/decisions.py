@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from hvdc_ident.discrepancy import Diagnosis
-from hvdc_ident.discrepancy.result import EffectSize
+from hvdc_ident.discrepancy.result import CARD, VALUE, EffectSize
 from hvdc_ident.fit.judgement import Judgement, Judgements, SignalJudgement, Yardstick
 from hvdc_ident.fit.noise import of_misfit
 from hvdc_ident.fit.result import Estimate, FitResult
@@ -42,6 +42,8 @@ STAGES: dict[str, str] = {"given": "simulation", "fitted": "fit", "effect": "dis
 """Sets of values in the order of a page, with the stage that judges them and whose CSV files hold the runs with them."""
 ADDED = {"term": "formula", "filter": "filter", "curve": "curve"}
 """Words for what stands in the model in place of an effect of the catalogue."""
+CORRECTED = {VALUE: "value", CARD: "component"}
+"""Words for what the model has otherwise than the card states, where that is no effect."""
 SUMMARISED = ("run", "simulation", "identifiability", "fit", "discrepancy", "linearization")
 """Results that a summary is made of."""
 NO_SHARE = 0.005
@@ -156,18 +158,27 @@ def estimates_that_count(fit: FitResult | None, diagnosis: Diagnosis | None) -> 
 
 
 def added_to(diagnosis: Diagnosis | None) -> str:
-    """Return the kind of the addition in an augmented model: "effect", "formula", "filter" or "curve"; empty without one."""
+    """Return what an augmented model has otherwise: "effect", "formula", "filter", "curve", "component" or "value"; empty without one."""
     if diagnosis is None:
         return ""
     if diagnosis.effects:
         return "effect"
+    others = {f.effect for f in diagnosis.findings} & CORRECTED.keys()
+    if others and diagnosis.augmented_model and diagnosis.verdict in ("named", "ambiguous"):
+        return CORRECTED[CARD if CARD in others else VALUE]
     kind = (diagnosis.fallback or {}).get("kind", "") if diagnosis.augmented_model else ""
     return ADDED.get(kind, "")
 
 
 def _added(diagnosis: Diagnosis | None) -> str:
-    """Return the effects with their places and sizes in words, "lag at P (T = 350 ms)"; else the kind of the addition."""
+    """Return the effects with their places and sizes in words, "lag at P (T = 350 ms)", with the values and components that are others;
+    else the kind of the addition."""
     parts = []
+    for f in diagnosis.findings if diagnosis is not None and diagnosis.augmented_model else ():
+        if f.effect == VALUE:
+            parts += [f"{n} = {quantity(p.value, p.unit)}" for n, p in f.parameters.items()]
+        elif f.effect == CARD:
+            parts += [f"{p.source} as {listed(p.at)}" for p in f.places]
     for e in diagnosis.effects if diagnosis is not None else ():
         sizes = [f"{n} = {quantity(p.value, p.unit)}" for n, p in e.parameters.items() if math.isfinite(p.value)]
         source = f" from {e.source}" if e.source else ""

@@ -143,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     if unknown := sorted(set(asked.only or ()) - {n.label for n in numbers()}):
         parser.error(
-            f"--only: no such number: {', '.join(unknown)}; expected names such as options.TOLERANCE or evidence.CLEAR_CHI2"
+            f"--only: no such number: {', '.join(unknown)}; expected names such as options.TOLERANCE or score.CLEAR_CHI2"
         )
     asked.out.mkdir(parents=True, exist_ok=True)
     path = asked.out / "runs.jsonl"

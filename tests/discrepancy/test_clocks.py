@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import pytest
 
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, hypothesis
+from hvdc_ident.discrepancy.clocks import clocks, on_their_clocks
 from hvdc_ident.discrepancy.hypothesis import Refit
-from hvdc_ident.discrepancy.moves import _moved, _refitted, as_recorded, clocks, on_their_clocks
 from hvdc_ident.discrepancy.options import SearchContext
+from hvdc_ident.discrepancy.search import CLOCKS, MOVES, Search, search_from
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from tests.discrepancy.cases import FREE, TRUE, experiments, model
@@ -63,25 +65,33 @@ def test_a_clock_that_would_be_off_by_more_than_half_a_row_is_none() -> None:
     assert on_their_clocks(search_of(first), first, first)[1] is first
 
 
-def test_records_are_put_back_on_their_clocks_where_that_is_no_worse() -> None:
-    """Of what was moved for a misfit that an effect has since explained; what a clock has to explain stays moved."""
-    first = plain(experiments())
-    moved = _refitted(first, first, tuple(_moved(e, 1e-3) for e in first.problem.experiments))
-    assert moved is not None
-    assert clocks(search_of(first), moved[1]) == pytest.approx(dict.fromkeys(LATE, 1e-3))
-    _, here = as_recorded(search_of(first), *moved)
-    assert clocks(search_of(first), here) == {} and here.chi2 == pytest.approx(first.chi2, rel=1e-6)
-    late = plain(experiments(late=LATE))
-    off = on_their_clocks(search_of(late), late, late)
-    assert as_recorded(search_of(late), *off) == off
+def test_records_whose_misfit_an_effect_explains_are_on_their_clocks() -> None:
+    """A lag of less than half a row looks like late clocks by itself; what a clock has to explain stays moved."""
+    first = plain(experiments(lag=0.0015))
+    moved = on_their_clocks(search_of(first), first, first)[1]
+    assert clocks(search_of(first), moved), "without the lag they seem to be off"
+    outcome = search_from(replace(search_of(first), effects=("lag", "gain"), places=("wm",)), first)
+    assert [t.label for t in outcome.best.terms] == ["lag at wm"] and clocks(search_of(first), outcome.refit) == {}
+    late = plain(experiments(lag=0.03, late=LATE))
+    outcome = search_from(replace(search_of(late), effects=("lag", "gain"), places=("wm",)), late)
+    assert {t.kind for t in outcome.best.terms} == {CLOCKS, "lag"}
+    off = clocks(search_of(late), outcome.refit)
+    assert off.keys() == LATE.keys() and all(abs(off[n] - LATE[n]) < 4.0 * SCATTER[n] for n in LATE)
+
+
+def test_each_clock_that_is_off_has_its_price() -> None:
+    first = plain(experiments(late=LATE))
+    search = Search(search_of(first), first)
+    (timed,) = [h for m in MOVES if m.name == CLOCKS for h in m.make(search, search.root)]
+    ruler, fewer = search.ruler, replace(timed, terms=(replace(timed.terms[0], at=("fit-1",)),))
+    assert timed.terms[0].at == tuple(LATE)
+    assert search.cost(timed, ruler) - search.cost(fewer, ruler) == pytest.approx(2.0 * ruler.price)
 
 
 def test_records_stay_where_the_hypothesis_does_not_run_on_moved_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     first = plain(experiments(late=LATE))
-    search, done = search_of(first), on_their_clocks(search_of(first), first, first)
     monkeypatch.setattr(hypothesis, "joint_refit_job", raising)
-    assert on_their_clocks(search, first, first) == (first, first)
-    assert as_recorded(search, *done) == done
+    assert on_their_clocks(search_of(first), first, first) == (first, first)
 
 
 def raising(*_: object) -> None:

@@ -136,13 +136,15 @@ def test_a_form_outside_the_catalogue_is_not_given_a_name() -> None:
 
 
 def test_a_form_that_is_not_all_of_it_says_so_and_the_held_out_record_tells_its_place() -> None:
-    """A lag, where delays alone are looked for."""
+    """A lag, where one delay alone is looked for."""
+    one = DiagnosisOptions(most=1)
     found = diagnose(
         model(),
         [only(e, "w") for e in experiments(lag=0.05)[1:]],
         FREE,
         effects=["delay"],
         places=["wm", "err", "torque"],
+        options=one,
     )
     assert found.verdict == "ambiguous" and "It is not all of it" in found.text
     # The fitted record, a load step, is the same with the delay at any of the three; the reference step that is held out is not.

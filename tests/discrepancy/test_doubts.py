@@ -10,9 +10,9 @@ from scipy.stats import kstest
 
 from hvdc_ident import InputSignal
 from hvdc_ident.discrepancy import diagnose
+from hvdc_ident.discrepancy.conclusion import Doubt, _turned, doubt_of_direction, doubt_of_size
 from hvdc_ident.discrepancy.hypothesis import Refit, refitted
 from hvdc_ident.discrepancy.residual_checks import constancy
-from hvdc_ident.discrepancy.verdict import Doubt, _turned, doubt_of_direction, doubt_of_size
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 from tests.discrepancy.cases import FREE, TRUE, corners, experiments, model
@@ -101,6 +101,8 @@ def test_a_play_that_each_record_passes_one_way_may_be_a_dead_band_and_the_recor
     ]
     names = ("backlash", "deadband", "deadband-step", "offset")
     found = diagnose(model(), answered(played, moved, seed=3), FREE, effects=names, places=["load"])
-    assert found.verdict == "named" and "does the same in these records (deadband)" in found.findings[0].text
+    assert found.verdict == "named" and {"backlash", "deadband"} <= set(found.findings[0].same_as)
+    assert "does the same in these records" in found.findings[0].text
     assert "ramps both ways" in found.separating_experiment["text"]
-    assert found.findings[0].parameters["width"].value == pytest.approx(0.08, rel=0.02)
+    width = {"backlash": 0.08, "deadband": 0.04}[found.findings[0].effect]
+    assert found.findings[0].parameters["width"].value == pytest.approx(width, rel=0.02)

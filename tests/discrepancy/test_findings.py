@@ -13,13 +13,15 @@ import pytest
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy import findings as told_as
 from hvdc_ident.discrepancy.classes import classes
-from hvdc_ident.discrepancy.explain import at_given, off_given, sentence
+from hvdc_ident.discrepancy.conclusion import Conclusion, headline, leaves_more_than_noise
 from hvdc_ident.discrepancy.hypothesis import refitted
+from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
-from hvdc_ident.discrepancy.verdict import Conclusion, headline, keeps_tolerance, leaves_more_than_noise
+from hvdc_ident.discrepancy.sentences import at_given, off_given, sentence
 from hvdc_ident.immutable import FrozenMap
+from hvdc_ident.parameters import Parameter
 from tests.discrepancy.cases import FREE, SIGMA, TRUE, experiments, model
 from tests.discrepancy.refits import beside, plain
 
@@ -88,7 +90,7 @@ def test_more_than_noise_is_left_where_a_test_a_doubt_or_the_remainder_says_so(
     """loud: the residual of one of two outputs over its noise; that of the other is as loud as noise."""
     signs = np.tile([1.0, -1.0], 50)
     blocks = [SimpleNamespace(output=o, residual=k * signs) for o, k in (("w", 1.0), ("torque", loud))]
-    last: Any = SimpleNamespace(nominal=lambda: SimpleNamespace(blocks=blocks))
+    last: Any = type("Left", (), {"nominal": lambda self: SimpleNamespace(blocks=blocks)})()
     judgement = Conclusion("named", "", (), doubt=doubt, remainder=remainder)
     assert leaves_more_than_noise(judgement, last, adequate=adequate, significance=0.01) is more
 
@@ -100,8 +102,8 @@ def test_the_headline_speaks_of_a_tolerance_only_where_one_is_stated_and_kept(la
     first = plain(experiments(lag=0.03))
     largest = max(v for v in first.problem.rmse(first.theta)["w"].values() if v is not None)
     for band, kept in ((1.01 * largest, True), (0.99 * largest, False)):
-        assert keeps_tolerance(replace(SEARCH, tolerance=FrozenMap({"w": band})), first) is kept
-    assert keeps_tolerance(SEARCH, first) is False
+        assert misfit_of(first).keeps({"w": band}) is kept
+    assert misfit_of(first).keeps({}) is False
 
 
 def test_the_json_of_findings(lagged: Diagnosis) -> None:
@@ -303,3 +305,25 @@ def test_one_equation_under_two_names_counts_once() -> None:
     gain = Rival("gain", ("e",), 0.0, FrozenMap({"k": 0.9}), prior=0.1)
     one, other = classes([leak, loss, gain])
     assert one.probability == other.probability == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("unit", "ratio", "error", "said"),
+    [
+        ("rad/s", 6.283, 1e-3, "2 pi"),
+        ("Hz", 1.0 / 6.2832, 1e-3, "2 pi"),
+        ("kV", 1.732, 1e-3, "sqrt 3"),
+        ("pu", 2.5, 1e-3, "the bases Sn and Sb"),
+        ("", 0.4, 1e-3, "the bases Sn and Sb"),
+        ("s", 1.732, 1e-3, ""),  # no time is off by a base
+        ("kV", 1.732, 0.05, ""),  # it may be any of several
+        ("pu", 2.0, 1e-3, ""),
+    ],
+)
+def test_a_ratio_that_is_of_a_unit_or_base_is_told_where_the_unit_lets_it(
+    unit: str, ratio: float, error: float, said: str
+) -> None:
+    bases = {"Sn": Parameter(250.0, unit="MVA"), "Sb": Parameter(100.0, unit="MVA")}
+    plant = replace(model(), parameters=model().parameters | bases)
+    text = told_as.base_factor(plant, unit, ratio, error)
+    assert text == (f" (the ratio is that of {said})" if said else "")

@@ -10,9 +10,9 @@ import pytest
 
 from hvdc_ident.discrepancy import diagnose, hypothesis
 from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.expansion import Race
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, refitted
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
-from hvdc_ident.discrepancy.rounds import Race
 from hvdc_ident.discrepancy.screen import _Runner
 from hvdc_ident.errors import ComputationError, InputError
 from hvdc_ident.immutable import FrozenMap
@@ -123,7 +123,7 @@ def test_a_diagnosis_outlives_a_candidate_that_raises(monkeypatch: pytest.Monkey
             raise ValueError("no such delay")
         return plain(before, candidate, *given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("hvdc_ident.discrepancy.rounds.refit_job", fails)
+    monkeypatch.setattr("hvdc_ident.discrepancy.expansion.refit_job", fails)
     found = diagnose(model(), experiments(lag=0.03), FREE, effects=["lag", "delay"], places=["wm"])
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text
     statuses = {c.effect: c.status for c in found.candidates if c.round == 1}

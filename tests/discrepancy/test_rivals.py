@@ -10,29 +10,22 @@ import pytest
 
 from hvdc_ident import Experiment, InputSignal, simulate
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy import search as searching
 from hvdc_ident.discrepancy.classes import _akin, _equal, classes
-from hvdc_ident.discrepancy.evidence import (
-    CandidateFit,
-    Pick,
-    as_recorded,
-    deficits,
-    exceeds_noise,
-    objections,
-    predicts_worse,
-    resembles_noise,
-)
+from hvdc_ident.discrepancy.conclusion import Conclusion, _weighed
+from hvdc_ident.discrepancy.effect_moves import opened
+from hvdc_ident.discrepancy.expansion import Expansion
 from hvdc_ident.discrepancy.hypothesis import Refit, refitted
+from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder
 from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.rounds import Round
-from hvdc_ident.discrepancy.search import SearchOutcome, objection, one_round
-from hvdc_ident.discrepancy.verdict import Conclusion, _weighed
+from hvdc_ident.discrepancy.score import CandidateFit, Pick, deficits, objections
+from hvdc_ident.discrepancy.search import Hypothesis, Search, SearchOutcome, search_from
+from hvdc_ident.discrepancy.stated import Errors
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 from tests.discrepancy.cases import FREE, SIGMA, TRUE, experiments, model
-from tests.discrepancy.refits import answered, beside, plain
+from tests.discrepancy.refits import answered, beside, expanded, plain
 
 
 @pytest.fixture(scope="module")
@@ -53,8 +46,8 @@ def test_what_held_out_data_refute_sets_no_mark_for_the_others(before: Refit) ->
 def test_somewhat_louder_noise_is_noise_and_a_shape_is_not(lag: float, loud: float, expected: bool) -> None:
     told = FrozenMap({n: s / loud for n, s in SIGMA.items()})
     refit = plain([replace(e, noise=told) for e in experiments(lag=lag)])
-    assert exceeds_noise(refit) == (lag > 0.0 or loud > 1.0), "by its size alone it would not be"
-    assert resembles_noise(refit) == expected
+    assert misfit_of(refit).is_loud == (lag > 0.0 or loud > 1.0), "by its size alone it would not be"
+    assert misfit_of(refit).is_noise == expected
 
 
 @pytest.mark.parametrize(("lag", "loud", "expected"), [(0.0, 1.12, True), (0.001, 1.0, False)])
@@ -63,8 +56,8 @@ def test_held_out_records_may_be_somewhat_louder_and_may_have_no_shape(lag: floa
     told = FrozenMap({n: s / loud for n, s in SIGMA.items()})
     held = [replace(o, noise=told) for o in other if o.role == "holdout"]
     refit = plain([*(e for e in own if e.role == "fit"), *held])
-    assert predicts_worse(refit), "by its size alone it would not be noise"
-    assert resembles_noise(refit) == expected
+    assert misfit_of(refit).is_louder_unseen, "by its size alone it would not be noise"
+    assert misfit_of(refit).is_noise == expected
 
 
 def clipped(level: float) -> tuple[Experiment, ...]:
@@ -106,7 +99,7 @@ def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it()
 def test_somewhat_louder_noise_is_not_looked_at_more_closely() -> None:
     told = FrozenMap({n: s / 1.1 for n, s in SIGMA.items()})
     records = [replace(e, noise=told) for e in experiments(seed=2)]
-    assert exceeds_noise(plain(records)), "by its size alone it would be"
+    assert misfit_of(plain(records)).is_loud, "by its size alone it would be"
     looks: list[str] = []
     found = diagnose(model(), records, FREE, progress=lambda _done, _total, text: looks.append(text))
     assert found.verdict == "no-evidence"
@@ -120,7 +113,7 @@ def test_a_slow_gap_in_slow_noise_matters_as_it_is_recorded() -> None:
     assert 0.0 < before.holdout - refit.holdout < DiagnosisOptions().holdout_share, (
         "whitened there is hardly anything to see"
     )
-    recorded = [as_recorded(r)[role] for role in ("fit", "holdout") for r in (before, refit)]
+    recorded = [misfit_of(r).as_recorded[role] for role in ("fit", "holdout") for r in (before, refit)]
     assert recorded[0] > 1.5 * recorded[1] and recorded[2] > 1.5 * recorded[3]
     trial = CandidateFit(Pick(0, 0, 1.0, 500.0), refit, before.chi2 - refit.chi2)
     assert objections(before, trial, 0.005, DiagnosisOptions(), {}, first=True) == ""
@@ -178,7 +171,8 @@ def rated(groups: Sequence[Sequence[Rival]], **remainder: float) -> Conclusion:
     refit = plain(experiments())
     left = Remainder(**({"share": 0.0, "held_out": 0.0, "noise_units": 1.0} | remainder), at="wm")  # type: ignore[arg-type]
     found = Conclusion("named", "", (), tuple(tuple(g) for g in groups), remainder=left)
-    return _weighed(SearchOutcome(refit, (), ()), refit.nominal(), 1000.0, found, "lag at wm", 0.01)
+    outcome = SearchOutcome(Hypothesis(refit, refit), (), (), (), Errors({}, {}, 0.0, 0.0))
+    return _weighed(outcome, refit.nominal(), 1000.0, found, "lag at wm", 0.01)
 
 
 def rival(effect: str, at: str, behind: float = 0.0, **values: float) -> Rival:
@@ -241,19 +235,16 @@ def test_unlike_forms_that_leave_much_are_not_named() -> None:
 
 def test_a_conductance_is_a_loss_too_while_its_source_keeps_its_sign() -> None:
     """b |w| is b w as long as the drive does not turn; the load's sign changes."""
-    found = one_round(
-        SearchContext(("conductance", "loss"), ("torque",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0),
-        plain(experiments()),
-        1,
-    )
+    search = SearchContext(("conductance", "loss"), ("torque",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
+    _, found = opened(search, plain(experiments()), 1)
     leaks = [Rival("conductance", ("torque",), 0.5, FrozenMap({"g": 0.1}), source=s) for s in ("w", "load")]
     assert [(r.effect, r.at, r.source, r.delta_bic, r.refitted) for r in _equal(found, leaks, lambda _: True)] == [
         ("loss", ("torque",), "w", 0.5, False)
     ]
 
 
-def tried(records: Sequence[Experiment], jobs: Sequence[tuple[str, str, dict[str, float], str]]) -> Round:
-    """A round in which these (effect, place, sizes to begin at, source) were refitted."""
+def tried(records: Sequence[Experiment], jobs: Sequence[tuple[str, str, dict[str, float], str]]) -> Expansion:
+    """An expansion in which these (effect, place, sizes to begin at, source) were refitted."""
     first = plain(records)
     places, names = tuple({at for _, at, _, _ in jobs}), tuple({effect for effect, _, _, _ in jobs})
     search = SearchContext(names, places, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
@@ -262,9 +253,8 @@ def tried(records: Sequence[Experiment], jobs: Sequence[tuple[str, str, dict[str
         for effect, at, sizes, source in jobs
     ]
     assert not any(r.failure for r in refits)
-    return replace(
-        one_round(search, first, 1), trials=tuple(CandidateFit(Pick(0, 0, 1.0, 1.0), r, 0.0) for r in refits)
-    )
+    trials = tuple(CandidateFit(Pick(0, 0, 1.0, 1.0), r, 0.0) for r in refits)
+    return replace(opened(search, first, 1)[1], trials=trials)
 
 
 def test_effects_that_add_the_same_to_a_signal_in_these_records_are_one_class() -> None:
@@ -297,21 +287,27 @@ def test_what_differs_by_an_offset_that_no_record_shows_is_one_class(place: str,
 def test_a_refit_that_takes_away_what_noise_gives_is_no_evidence() -> None:
     """Whatever its pick promised: it is what the refit came to that is judged."""
     search = SearchContext(("lag",), ("wm",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    found = one_round(search, plain(experiments(lag=0.03)), 1)
-    assert found.winner is not None
-    poor = replace(found.winner, pick=replace(found.winner.pick, fall=1e-3))
-    assert objection(search, found.before, poor, found, first=True) == ""
-    little = replace(poor, refit=replace(poor.refit, chi2=found.before.chi2 - 2.0))
-    assert "its score is what noise gives" in objection(search, found.before, little, found, first=True)
+    at_work = Search(search, plain(experiments(lag=0.03)))
+    at_work.run()
+    (found,) = [h for h in at_work.pool.values() if [t.label for t in h.terms] == ["lag at wm"]]
+    assert at_work._objection(found) == ""
+    little = replace(found, refit=replace(found.refit, chi2=at_work.root.refit.chi2 - 2.0))
+    assert "its score is what noise gives" in at_work._objection(little)
 
 
-def test_of_effects_that_explain_as_much_the_one_with_the_fewest_places_wins(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_effects_that_explain_as_much_the_one_with_the_fewest_places_wins() -> None:
+    """Before any data an effect shares its probability with all its places and sources: with those of a conductance at the load."""
     search = SearchContext(("offset", "conductance"), ("load",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    found = one_round(search, plain(experiments(offset=0.05)), 1)
-    kinds = [c.effect for c in found.candidates]
+    first = plain(experiments(offset=0.05))
+    kinds = [c.effect for c in expanded(search, first).candidates]
     assert kinds.count("offset") == 1 < kinds.count("conductance")
-    as_good = [CandidateFit(Pick(k, 0, 1.0, 500.0), found.trials[0].refit, 0.0) for k in range(len(kinds))]
-    monkeypatch.setattr(searching, "objection", lambda *_args, **_first: "")
-    for trials in (as_good, as_good[::-1]):
-        winner = searching.judged_round(search, found, trials, 1).winner
-        assert winner is not None and kinds[winner.pick.candidate] == "offset"
+    outcome = search_from(search, first)
+    scores = {h.terms[0]: (score, h) for h, score in outcome.pool if len(h.terms) == 1}
+    (offset,) = [t for t in scores if t.kind == "offset"]
+    others = [t for t in scores if t.kind == "conductance"]
+    assert others and offset.prior == pytest.approx(others[0].prior * kinds.count("conductance"))
+    at_work = Search(search, first)
+    as_good = [replace(scores[t][1], refit=scores[offset][1].refit) for t in (*others, offset)]
+    for hypotheses in (as_good, as_good[::-1]):
+        at_work.pool = {at_work.root.key: at_work.root} | {h.key: h for h in hypotheses}
+        assert at_work.ranked()[0].kind == "offset"

@@ -13,10 +13,10 @@ from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions
 from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
+from hvdc_ident.discrepancy.expansion import ExpansionModel
 from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals, with_given_gains
 from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.rounds import RoundModel
 from hvdc_ident.discrepancy.screen import ANY_FACTOR, SKETCHED, UP_TO_ONE, Linearised, Sketch, _Runner, screened
 from hvdc_ident.effects import apply_effects, effects
 from hvdc_ident.immutable import FrozenMap
@@ -43,10 +43,10 @@ def test_what_runs_away_is_none_of_it() -> None:
     assert left > 0.5 * without.cost and np.all(step >= low) and np.all(step <= high)
 
 
-def round_model(before: Refit, found: tuple[CandidateEffect, ...], bootstraps: int = 200) -> RoundModel:
+def expansion_model(before: Refit, found: tuple[CandidateEffect, ...], bootstraps: int = 200) -> ExpansionModel:
     """Return what the candidates of a first round are compared on."""
     search = SearchContext("all", None, FrozenMap(), DiagnosisOptions(bootstraps=bootstraps), seed=0)
-    return RoundModel.of(search, before, found, 1)
+    return ExpansionModel.of(search, before, found, 1)
 
 
 def listed(before: Refit, names: tuple[str, ...], places: tuple[str, ...] | None = None) -> tuple[CandidateEffect, ...]:
@@ -103,7 +103,7 @@ def lagged() -> Refit:
 
 def test_a_hidden_lag_is_best_at_its_place(lagged: Refit) -> None:
     found = listed(lagged, ("lag", "gain", "limit", "offset"), ("wm", "err", "torque", "drag"))
-    told = round_model(lagged, found).screen(found, "screen")
+    told = expansion_model(lagged, found).screen(found, "screen")
     best = told.scores[0]
     assert found[best.candidate].label == "lag at wm"
     assert found[best.candidate].probes[best.probe].values["T"] == pytest.approx(0.03, rel=0.7)
@@ -121,10 +121,10 @@ def test_gains_that_hide_an_effect_are_left_for_those_given() -> None:
     found = listed(first, ("lag", "gain", "limit", "offset", "delay", "second-order", "deadband"))
     given = with_given_gains(first)
     assert given is not None
-    ranks = [found[k].label for k in round_model(first, found).screen(found, "given", point=given).best()]
+    ranks = [found[k].label for k in expansion_model(first, found).screen(found, "given", point=given).best()]
     assert ranks.index("lag at wm") < 5
     # The answers from beside the fitted gains tell it, too: those at other unknowns need a run for the best of them only.
-    stand = round_model(first, found)
+    stand = expansion_model(first, found)
     known = stand.screen(found, "fitted")
     promising = [found[k].label for k in stand.promising(known, found, given)]
     assert promising.index("lag at wm") < 5 and len(promising) < len(known.best())
@@ -136,13 +136,13 @@ def test_a_sine_that_begins_at_its_peak_is_no_state_to_begin_from(lagged: Refit)
     (sine,) = listed(lagged, ("disturbance",), ("err",))
     wave = {"amplitude": 0.05, "frequency": 5.0}
     sine = replace(sine, probes=()).with_sizes([wave | {"phase": p} for p in (0.0, np.pi / 2)], like=sine.probes)
-    screen = round_model(lagged, (sine,)).screen((sine,), "both phases")
+    screen = expansion_model(lagged, (sine,)).screen((sine,), "both phases")
     assert screen.size[0, 1] == pytest.approx(screen.size[0, 0], rel=0.05)
 
 
 def test_sizes_that_were_run_are_not_run_again(lagged: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
     found = listed(lagged, ("lag", "limit"), ("wm", "err"))
-    stand = round_model(lagged, found)
+    stand = expansion_model(lagged, found)
     known = stand.screen(found, "once")
     more = tuple(c.with_sizes([{"T": 0.0123}]) if c.effect == "lag" else c for c in found)
     runs: list[tuple[int, int]] = []
@@ -174,7 +174,7 @@ def test_the_largest_score_under_noise_is_that_of_a_direct_computation(lagged: R
     """Of one size of one effect, whose score under white noise is chi2 with one degree of freedom."""
     (lag,) = listed(lagged, ("lag",), ("wm",))
     only = replace(lag, probes=lag.probes[:1])
-    setup = round_model(lagged, (lag,), bootstraps=3000).setup
+    setup = expansion_model(lagged, (lag,), bootstraps=3000).setup
     told = screened(setup, [only])
     nominal = setup.nominal
     placed = apply_effects(model(), [only.use(only.probes[0])])
@@ -193,7 +193,7 @@ def test_the_largest_score_under_noise_is_that_of_a_direct_computation(lagged: R
 
 def test_of_many_candidates_the_largest_score_is_that_of_any(lagged: Refit) -> None:
     found = listed(lagged, ("lag", "gain"), ("wm", "err", "drag"))
-    setup = round_model(lagged, found).setup
+    setup = expansion_model(lagged, found).setup
     alone = [screened(setup, [c]).largest for c in found]
     assert screened(setup, found).largest == pytest.approx(np.max(alone, axis=0), rel=0.01)
 

@@ -1,4 +1,4 @@
-"""Once several effects are in: each can be taken out alone, also one that another sits behind, and is told as itself."""
+"""Once several effects are in: each can be taken out or exchanged, also one that another sits behind, and is told as itself."""
 
 from __future__ import annotations
 
@@ -8,17 +8,30 @@ import numpy as np
 import pytest
 
 from hvdc_ident.discrepancy import search as searching
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, is_clear
-from hvdc_ident.discrepancy.hypothesis import Refit, joint_refit_job, refitted, slot_signals
+from hvdc_ident.discrepancy.diagnosis import lines
+from hvdc_ident.discrepancy.effect_moves import opened
+from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel
+from hvdc_ident.discrepancy.hypothesis import Refit, joint_refit_job, last_placed, refitted, slot_signals
 from hvdc_ident.discrepancy.options import DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.pushes import pushed
-from hvdc_ident.discrepancy.rounds import Round
-from hvdc_ident.discrepancy.search import _last, backward_elimination, forward_search, one_round
+from hvdc_ident.discrepancy.score import is_clear
+from hvdc_ident.discrepancy.search import MOVES, P_EFFECT, Hypothesis, Search, Term, search_from
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import insertion_point_of
 from tests.discrepancy.cases import experiments
 from tests.discrepancy.refits import beside, plain
+
+
+def looking_for(effects: tuple[str, ...], places: tuple[str, ...]) -> SearchContext:
+    """A search for some effects at some places."""
+    return SearchContext(effects, places, FrozenMap(), DiagnosisOptions(bootstraps=100, fallback=False), seed=0)
+
+
+def hypothesis(first: Refit, refit: Refit) -> Hypothesis:
+    """A refit with effects as a hypothesis beside the model `first`."""
+    placed = [p.candidate for p in refit.placed]
+    return Hypothesis(refit, first, tuple(Term(c.effect, c.at, c.source, P_EFFECT / 2.0) for c in placed))
 
 
 @pytest.fixture(scope="module")
@@ -48,46 +61,93 @@ def test_what_is_not_there_is_not_clear_and_what_is_told_last_takes_its_evidence
     one = refitted(beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)}))
     both = refitted(beside(one, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
     assert [is_clear(both, k) for k in range(2)] == [False, True]
-    turned = _last(both, 0)
+    turned = last_placed(both, 0)
     assert [p.candidate.effect for p in turned.placed] == ["lag", "gain"]
     assert [is_clear(turned, k) for k in range(2)] == [True, False]
 
 
-def test_a_search_takes_out_again_what_is_nothing_beside_the_others(first: Refit) -> None:
+def test_a_search_does_without_what_is_nothing_beside_the_others(first: Refit) -> None:
     one = refitted(beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)}))
     both = refitted(beside(one, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
-    search = SearchContext(("gain", "lag"), ("ref", "wm"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    begun = one_round(search, first, 1)
-    rounds = tuple(replace(begun, winner=CandidateFit(begun.trials[0].pick, r, 100.0), trials=()) for r in (one, both))
-    here, kept, notes = backward_elimination(search, first, both, rounds, 2)
-    assert notes == ()
-    assert [p.candidate.label for p in here.placed] == ["lag at wm"]
-    assert [k.winner.refit.placed[-1].candidate.label for k in kept if k.winner] == ["lag at wm"]
+    search = Search(looking_for(("gain", "lag"), ("ref", "wm")), first)
+    pair = hypothesis(first, both)
+    search.add([pair])
+    outcome = search.run()
+    assert pair.key in {h.key for h, _ in outcome.pool}
+    assert [t.label for t in outcome.best.terms] == ["lag at wm"]
+    assert [p.candidate.label for p in outcome.refit.placed] == ["lag at wm"]
+    assert [k.term.label for k in outcome.kept] == ["lag at wm"]
 
 
-def test_what_could_not_be_refitted_stays_told(first: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
-    lagged = refitted(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
-    search = SearchContext(("gain", "lag"), ("ref", "wm"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    begun = one_round(search, first, 1)
-    lost = CandidateFit(begun.trials[-1].pick, replace(begun.trials[-1].refit, failure="it does not run"), -np.inf)
-    monkeypatch.setattr(searching, "one_round", lambda *_: replace(begun, trials=begun.trials[:-1], failed=(lost,)))
-    _, kept, _ = backward_elimination(search, first, lagged, [replace(begun, winner=begun.trials[0], trials=())], 1)
-    assert kept[0].failed == (lost,)
+def test_an_effect_that_another_explains_better_is_exchanged_for_it() -> None:
+    """Beside the offset a delay is nearly the lag that it stands for; what is beside it stays."""
+    first = plain(experiments(lag=0.03, offset=0.3))
+    late = refitted(beside(first, "delay", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
+    both = refitted(beside(late, "offset", "drag", {"c": -0.3}, {"c": (-1.0, 1.0)}))
+    search = Search(looking_for(("lag", "delay", "offset"), ("wm", "drag")), first)
+    (looked,) = [m for m in MOVES if m.name == "effects"]
+    search.add([*looked.make(search, search.root), hypothesis(first, both)])
+    assert {t.label for t in search._answer()[0].terms} == {"delay at wm", "offset at drag"}
+    search._exchanged()
+    best, _ = search._answer()
+    assert {t.label for t in best.terms} == {"lag at wm", "offset at drag"}
+    sizes = {p.candidate.effect: best.refit.sizes(p) for p in best.refit.placed}
+    assert sizes["lag"]["T"] == pytest.approx(0.03, rel=0.02) and sizes["offset"]["c"] == pytest.approx(-0.3, rel=0.02)
 
 
-def test_what_could_not_be_looked_for_again_stays_and_is_told(first: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
-    lagged = refitted(beside(first, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
-    search = SearchContext(("gain", "lag"), ("ref", "wm"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    begun = replace(one_round(search, first, 1), trials=())
-    begun = replace(begun, winner=CandidateFit(Pick(0, 0, 1.0, 0.0), lagged, 100.0), ruler=Ruler.of(lagged))
+def test_a_card_is_exchanged_in_the_model_without_terms_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a model with effects the one with another card would lose them."""
+    asked: list[str] = []
 
-    def stopped(*_: object) -> Round:
+    def cards(_: Search, h: Hypothesis) -> list[Hypothesis]:
+        asked.append(" and ".join(t.label for t in h.terms))
+        return []
+
+    moves = tuple(replace(m, make=cards) if m.name == "cards" else m for m in MOVES)
+    monkeypatch.setattr(searching, "MOVES", moves)
+    outcome = search_from(looking_for(("lag", "offset"), ("wm", "drag")), plain(experiments(lag=0.03, offset=0.3)))
+    assert len(outcome.best.terms) == 2
+    assert asked == [""]
+
+
+def test_what_could_not_be_refitted_stays_told(first: Refit) -> None:
+    search = Search(looking_for(("gain", "lag"), ("ref", "wm")), first)
+    search.run()
+    key = search.root.key
+    *others, last = search.expansions[key].trials
+    lost = replace(last, refit=replace(last.refit, failure="it does not run"))
+    search.expansions[key] = replace(search.expansions[key], trials=(*others, lost))
+    outcome = search._outcome(exhausted=True)
+    assert [k.term.label for k in outcome.kept] == ["lag at wm"]
+    assert outcome.kept[0].expansion.failed == (lost,)
+    assert [line.status for line in lines(outcome) if line.status.startswith("failed")] == ["failed: it does not run"]
+
+
+def test_what_could_not_be_looked_for_beside_an_effect_is_told_and_the_effect_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def stopped(context: SearchContext, here: Refit, number: int) -> tuple[ExpansionModel, Expansion]:
+        if here.placed:
+            raise SimulationError("the simulation stopped", got="step-limit")
+        return opened(context, here, number)
+
+    monkeypatch.setattr(searching, "opened", stopped)
+    outcome = search_from(looking_for(("lag", "offset"), ("wm", "drag")), plain(experiments(lag=0.03, offset=0.3)))
+    (term,) = outcome.best.terms
+    assert term.label in ("lag at wm", "offset at drag")
+    told = [n for n in outcome.notes if f"beside {term.label}" in n]
+    assert told and all("step-limit" in n for n in told)
+
+
+def test_a_model_beside_which_nothing_can_be_looked_for_ends_the_search(
+    first: Refit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> tuple[ExpansionModel, Expansion]:
         raise SimulationError("the simulation stopped", got="step-limit")
 
-    monkeypatch.setattr(searching, "one_round", stopped)
-    here, kept, notes = backward_elimination(search, first, lagged, [begun], 1)
-    assert [p.candidate.label for p in here.placed] == ["lag at wm"] and kept == [begun]
-    assert len(notes) == 1 and "lag at wm" in notes[0] and "step-limit" in notes[0]
+    monkeypatch.setattr(searching, "opened", stopped)
+    with pytest.raises(SimulationError, match="stopped"):
+        search_from(looking_for(("lag",), ("wm",)), first)
 
 
 @pytest.mark.parametrize(
@@ -115,19 +175,18 @@ def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Ref
     inner = [s for s in two.model.insertion_points if any(p.use.made(s) for p in two.placed)]
     assert {"second_order_wm_y", "second_order_wm_v"} <= set(inner) and len(inner) > 40
     assert "wm" not in inner and "wm_before_second_order" not in inner
-    search = SearchContext(("gain", "coupling"), None, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    found = one_round(search, two, 2)
+    _, found = opened(
+        SearchContext(("gain", "coupling"), None, FrozenMap(), DiagnosisOptions(bootstraps=100), 0), two, 2
+    )
     assert {c.at[0] for c in found.candidates} >= {"wm", "wm_before_second_order", "torque"}
     assert not {*inner} & {p for c in found.candidates for p in (*c.at, c.source)}
 
 
-def test_rounds_that_are_over_have_the_answers_of_their_model() -> None:
-    recorded = experiments(lag=0.03, offset=0.3)
-    first = plain(recorded)
-    search = SearchContext(("lag", "offset"), ("wm", "drag"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    outcome = forward_search(search, first)
+def test_expansions_that_are_over_have_the_answers_of_their_model() -> None:
+    first = plain(experiments(lag=0.03, offset=0.3))
+    outcome = search_from(looking_for(("lag", "offset"), ("wm", "drag")), first)
     assert len(outcome.kept) == 2
-    again, anew = outcome.rounds[0].answers(), pushed(first, slot_signals(first))
+    again, anew = outcome.expansions[0].answers(), pushed(first, slot_signals(first))
     assert again.keys() == anew.keys() == {"fit-1", "fit-2"}
     for name, path in anew.items():
         np.testing.assert_array_equal(again[name].values["wm"], path.values["wm"])

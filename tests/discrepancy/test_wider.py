@@ -13,17 +13,16 @@ from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import is_clear
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, refit_job, refitted, with_given_gains
 from hvdc_ident.discrepancy.movable import Form, movable
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.residual_checks import is_louder_after_breaks
-from hvdc_ident.discrepancy.search import one_round
+from hvdc_ident.discrepancy.score import is_clear
 from hvdc_ident.effects import Probe, apply_effects
 from hvdc_ident.immutable import FrozenMap
 from tests.discrepancy.cases import EVENT, FREE, SIGMA, TIME, TRUE, experiments, model
 from tests.discrepancy.meters import noisy, records
-from tests.discrepancy.refits import answered, beside, plain
+from tests.discrepancy.refits import answered, beside, expanded, plain
 
 pytestmark = pytest.mark.nightly
 
@@ -62,9 +61,9 @@ def sampled(inputs: dict[str, InputSignal]) -> Array:
 
 
 def searched(before: Refit, effects: tuple[str, ...], places: tuple[str, ...]) -> list[Refit]:
-    """The refits of one round that looks for some effects at some places, the best first."""
+    """The refits of some effects at some places beside a model, the best first."""
     search = SearchContext(effects, places, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    found = one_round(search, before, 1)
+    found = expanded(search, before)
     assert found.trials, found.why
     return sorted((t.refit for t in found.trials), key=lambda r: r.chi2)
 

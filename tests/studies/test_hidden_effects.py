@@ -17,11 +17,11 @@ from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.hypothesis import Refit, judged, refit_job, refitted
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.search import one_round
 from hvdc_ident.effects import EffectUse, Probe, apply_effects, effects
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
+from tests.discrepancy.refits import expanded
 from tests.studies.study_module import STUDIES, load
 
 sys.path.insert(0, str(STUDIES / "hidden_effects"))
@@ -401,7 +401,7 @@ def test_levels_are_met_that_a_loop_slides_between(large):
     probe = Probe("quantisation", FrozenMap({"step": 0.08}), FrozenMap({"step": (1e-3, 0.5)}))
     begun = refit_job(before, CandidateEffect("quantisation", ("Iline",), (probe,)), 0, 1.0, before.theta)
     search = SearchContext(("quantisation",), ("Iline",), FrozenMap(), DiagnosisOptions(), 0)
-    found = min((t.refit for t in one_round(search, before, 1).trials), key=lambda r: r.chi2)
+    found = min((t.refit for t in expanded(search, before).trials), key=lambda r: r.chi2)
     assert found.sizes(found.placed[-1])["step"] == pytest.approx(0.0638, rel=1e-3)
     assert found.chi2 < 0.05 * refitted(begun).chi2
 
@@ -411,7 +411,7 @@ def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere(large):
     case = holding(large, Hidden("rate-limit", "xi", {"rate": 1.4}), "small", 3, 2e-3, "ar")
     before, options = refitted_plain(case), DiagnosisOptions()
     search = SearchContext(("rate-limit", "lag"), None, FrozenMap(), options, 0)
-    found = one_round(search, before, 1)
+    found = expanded(search, before)
     assert found.winner is not None
     best = found.winner.refit
     assert (best.placed[0].candidate.effect, best.placed[0].candidate.at) == ("rate-limit", ("xi",))
@@ -419,14 +419,14 @@ def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere(large):
 
 
 def test_the_sensitivity_study_sets_a_number_wherever_it_is_used_and_sets_it_back() -> None:
-    from hvdc_ident.discrepancy import options, remainder, verdict
+    from hvdc_ident.discrepancy import conclusion, options, remainder
 
     study = load("hidden_effects", "sensitivity")
     by_label = {n.label: n for n in study.numbers()}
-    assert {"options.TOLERANCE", "evidence.PARAMETER_PRICE", "options.set_bic"} <= set(by_label)
+    assert {"options.TOLERANCE", "score.PARAMETER_PRICE", "options.set_bic"} <= set(by_label)
     with study.changed(by_label["options.TOLERANCE"], 0.3) as changed:
-        assert options.TOLERANCE == remainder.TOLERANCE == verdict.TOLERANCE == 0.3 and changed == DiagnosisOptions()
-    assert options.TOLERANCE == remainder.TOLERANCE == verdict.TOLERANCE == by_label["options.TOLERANCE"].value
+        assert options.TOLERANCE == remainder.TOLERANCE == conclusion.TOLERANCE == 0.3 and changed == DiagnosisOptions()
+    assert options.TOLERANCE == remainder.TOLERANCE == conclusion.TOLERANCE == by_label["options.TOLERANCE"].value
     with study.changed(by_label["options.set_bic"], 12.0) as changed:
         assert changed == DiagnosisOptions(set_bic=12.0)
     share, count = study.Number("m", "CERTAIN", 0.95), study.Number("m", "FIELD", 5)

@@ -112,15 +112,24 @@ def test_a_run_tells_what_it_did_not_come_to(tmp_path: Path) -> None:
     assert not any(d.failed for d in run_study(study, folder, StageOptions()))
 
 
-def test_a_diagnosis_ended_by_its_budget_names_no_place(tmp_path: Path) -> None:
-    """The small plant is late by a lag; a search that ends after its first look tells none of what it has refitted as found."""
+def test_a_diagnosis_ended_by_its_budget_tells_what_it_found_and_what_was_not_tried(tmp_path: Path) -> None:
+    """The small plant is late by a lag; a search that ends after its first look has an answer, and no confident one."""
     folder = tmp_path / "r"
     ended(tmp_path, "candidates", lambda study, options: run_study(study, folder, options), to=90.0)
     data = json.loads((folder / "discrepancy.json").read_text())
+    assert data["verdict"] == "ambiguous"
+    assert any("budget ended" in note for note in data["notes"])
+    assert data["hypotheses"] and any("the budget ended" in line["status"] for line in data["candidates"])
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["diagnosis"] == "ambiguous"
+
+
+def test_a_diagnosis_ended_before_anything_was_found_says_so(tmp_path: Path) -> None:
+    folder = tmp_path / "r"
+    ended(tmp_path, "with clocks", lambda study, options: run_study(study, folder, options), to=90.0)
+    data = json.loads((folder / "discrepancy.json").read_text())
     assert data["verdict"] == "unfinished" and data["failed"] == data["text"] and not data["fingerprint"]
     assert not data["effects"] and not data["findings"] and not data["ambiguity"] and not data["augmented_model"]
-    assert not data["hypotheses"] and "times the noise" in data["text"]
-    assert any(line["status"] == "refitted" for line in data["candidates"])
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["diagnosis"] == "unfinished" and not summary["effects"] and not summary["findings"]
     assert "was ended by its budget" in (folder / "report.html").read_text()

@@ -15,11 +15,12 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import CandidateFit, best_each, by_cost, exceeds_noise
+from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel, Race, gains_of
 from hvdc_ident.discrepancy.hypothesis import Refit, with_given_gains
+from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
-from hvdc_ident.discrepancy.rounds import Race, Round, RoundModel, gains_of
+from hvdc_ident.discrepancy.score import CandidateFit, best_each, by_cost
 from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.effects import SignalScales, effects, size_grid
 
@@ -38,55 +39,54 @@ SIMILAR_DELAY = 0.3
 
 
 def with_searched_sizes(
-    round_model: RoundModel, opened: Round, trials: list[CandidateFit], number: int, *, far: bool
-) -> tuple[Round, list[CandidateFit]]:
+    expansion_model: ExpansionModel, opened: Expansion, trials: list[CandidateFit], text: str, *, far: bool
+) -> tuple[Expansion, list[CandidateFit]]:
     """Return the round and its trials with effects whose size has to be met. far: whether nothing explains the records so far.
 
     A quantiser is looked for at the places that promise most, where nothing else explains the records. A sampler is a delay to first
     order: it is looked for in periods that delay as long as what was refitted, or as a quantiser is where no other delay is tried.
     """
-    text = f"round {number}: sizes to be met"
     grids = _grids(opened, trials, far=far)
     if not grids:
         return opened, trials
-    opened, trials = _with_best_of_all_sizes(round_model, opened, trials, grids, text)
+    opened, trials = _with_best_of_all_sizes(expansion_model, opened, trials, grids, text)
     return _refined(
-        round_model, opened, trials, text, lambda ranked: [t for t in ranked if t.pick.candidate in grids], grids
+        expansion_model, opened, trials, text, lambda ranked: [t for t in ranked if t.pick.candidate in grids], grids
     )
 
 
 def with_closer_sizes(
-    round_model: RoundModel, opened: Round, trials: list[CandidateFit], number: int
-) -> tuple[Round, list[CandidateFit]]:
+    expansion_model: ExpansionModel, opened: Expansion, trials: list[CandidateFit], text: str
+) -> tuple[Expansion, list[CandidateFit]]:
     """Return the round and its trials with those of the best effects that have one size and bend their signal refined, while the best
     of all leaves more than noise."""
 
     def bent(ranked: Sequence[CandidateFit]) -> list[CandidateFit]:
-        rough = ranked[:BEAM] if ranked and exceeds_noise(ranked[0].refit) else ()
+        rough = ranked[:BEAM] if ranked and misfit_of(ranked[0].refit).is_loud else ()
         return [t for t in rough if _bends(t.refit.placed[-1].candidate)]
 
-    return _refined(round_model, opened, trials, f"round {number}: sizes beside", bent)
+    return _refined(expansion_model, opened, trials, text, bent)
 
 
 def _refined(
-    round_model: RoundModel,
-    opened: Round,
+    expansion_model: ExpansionModel,
+    opened: Expansion,
     trials: list[CandidateFit],
     text: str,
     which: Callable[[Sequence[CandidateFit]], list[CandidateFit]],
     grids: Mapping[int, Array] | None = None,
-) -> tuple[Round, list[CandidateFit]]:
+) -> tuple[Expansion, list[CandidateFit]]:
     """Return the round and its trials with refits from ever closer beside the sizes that some refits came to, by their rank."""
     known = grids or {}
     for turn in range(1, N_REFINEMENTS + 1):
         for t in which(by_cost(trials))[:BEAM]:
-            if round_model.search.spent:
+            if expansion_model.search.spent:
                 break
             k, size = t.pick.candidate, _size(t.refit)
             away = np.delete(np.arange(-REFINEMENT, REFINEMENT + 1), REFINEMENT) / REFINEMENT**turn
             sizes = size + away * (_spacing(known[k], size) if k in known else BESIDE * size)
-            near = _best_sizes(round_model, opened, {k: sizes}, text, [gains_of(opened.before, t.refit)])
-            opened, trials = _refitted(round_model, opened, trials, near, text)
+            near = _best_sizes(expansion_model, opened, {k: sizes}, text, [gains_of(opened.before, t.refit)])
+            opened, trials = _refitted(expansion_model, opened, trials, near, text)
     return opened, trials
 
 
@@ -95,8 +95,12 @@ def _bends(candidate: CandidateEffect) -> bool:
 
 
 def _with_best_of_all_sizes(
-    round_model: RoundModel, opened: Round, trials: list[CandidateFit], grids: Mapping[int, Array], text: str
-) -> tuple[Round, list[CandidateFit]]:
+    expansion_model: ExpansionModel,
+    opened: Expansion,
+    trials: list[CandidateFit],
+    grids: Mapping[int, Array],
+    text: str,
+) -> tuple[Expansion, list[CandidateFit]]:
     """Return the round and its trials with the best of all sizes refitted."""
     # Beside the gains of what explains most of the misfit; where nothing does, beside those without an effect.
     best_of_all = [t.refit for t in by_cost(trials)[:1] if t.refit.chi2 < 0.5 * opened.before.chi2]
@@ -105,15 +109,17 @@ def _with_best_of_all_sizes(
     late = {k: g for k, g in grids.items() if effects()[opened.candidates[k].effect].equivalent_delay is not None}
     levels = {k: g for k, g in grids.items() if k not in late}
     # A sampler that is missing biases the gains as a delay does; levels hardly do.
-    best = _best_sizes(round_model, opened, late, text, [*points, *([] if given is None else [given])], most=SHORTLIST)
+    best = _best_sizes(
+        expansion_model, opened, late, text, [*points, *([] if given is None else [given])], most=SHORTLIST
+    )
     coarse = {k: g[::COARSE_STRIDE] for k, g in levels.items()}
-    rough = _best_sizes(round_model, opened, coarse, text, points, most=SHORTLIST)
+    rough = _best_sizes(expansion_model, opened, coarse, text, points, most=SHORTLIST)
     beside = {k: _beside(grids[k], [size for size, _ in own]) for k, own in rough.items()}
-    best |= _best_sizes(round_model, opened, beside, text, points)
-    return _refitted(round_model, opened, trials, best, text)
+    best |= _best_sizes(expansion_model, opened, beside, text, points)
+    return _refitted(expansion_model, opened, trials, best, text)
 
 
-def _grids(opened: Round, trials: Sequence[CandidateFit], *, far: bool) -> dict[int, Array]:
+def _grids(opened: Expansion, trials: Sequence[CandidateFit], *, far: bool) -> dict[int, Array]:
     """Return by candidate the sizes to be looked at, (m,), rising."""
     found, entries = opened.candidates, effects()
     better = [t for t in by_cost(trials) if t.refit.chi2 < opened.before.chi2][: None if far else BEAM]
@@ -142,7 +148,7 @@ def _grids(opened: Round, trials: Sequence[CandidateFit], *, far: bool) -> dict[
     return grids
 
 
-def _answer_per_size(opened: Round, candidate: int) -> float:
+def _answer_per_size(opened: Expansion, candidate: int) -> float:
     """Return the largest answer that the screen saw of a candidate, in noise units, per unit of its size."""
     found, screen = opened.candidates[candidate], opened.screen
     name = _named(found)
@@ -152,7 +158,7 @@ def _answer_per_size(opened: Round, candidate: int) -> float:
     )
 
 
-def _least_answer(opened: Round, trials: Sequence[CandidateFit]) -> float:
+def _least_answer(opened: Expansion, trials: Sequence[CandidateFit]) -> float:
     """Return the least answer, in noise units, with which an effect may come within reach of the best fall of chi2.
 
     With an answer a beside a residual r, chi2 = |r + a|^2 falls by no more than 2 |r| |a|.
@@ -210,8 +216,8 @@ def _at(candidate: CandidateEffect, sizes: Sequence[float]) -> CandidateEffect:
 
 
 def _best_sizes(
-    round_model: RoundModel,
-    opened: Round,
+    expansion_model: ExpansionModel,
+    opened: Expansion,
     sizes: Mapping[int, Array],
     text: str,
     points: Sequence[Array | None],
@@ -221,7 +227,7 @@ def _best_sizes(
     if not sizes:
         return {}
     found = [_at(c, sizes[k].tolist()) if k in sizes else c for k, c in enumerate(opened.candidates)]
-    scores = [s for point in points for s in round_model.screen(found, text, list(sizes), point, held=True).scores]
+    scores = [s for point in points for s in expansion_model.screen(found, text, list(sizes), point, held=True).scores]
     best: dict[int, list[Score]] = {}
     for s in sorted(scores, key=lambda s: -s.fall):
         own = best.setdefault(s.candidate, [])
@@ -231,12 +237,12 @@ def _best_sizes(
 
 
 def _refitted(
-    round_model: RoundModel,
-    opened: Round,
+    expansion_model: ExpansionModel,
+    opened: Expansion,
     trials: Sequence[CandidateFit],
     best: Mapping[int, Sequence[tuple[float, Score]]],
     text: str,
-) -> tuple[Round, list[CandidateFit]]:
+) -> tuple[Expansion, list[CandidateFit]]:
     """Return the round, whose candidates have these sizes too, and the trials with the refits begun there."""
     found, scores = list(opened.candidates), []
     for k, own in best.items():
@@ -244,4 +250,4 @@ def _refitted(
         scores += [replace(s, probe=len(found[k].probes) + n, factor=1.0) for n, (_, s) in enumerate(own)]
         found[k] = replace(found[k], probes=(*found[k].probes, *more))
     opened = replace(opened, candidates=tuple(found))
-    return opened, best_each([*trials, *round_model.refitted(found, scores, text, trials)])
+    return opened, best_each([*trials, *expansion_model.refitted(found, scores, text, trials)])

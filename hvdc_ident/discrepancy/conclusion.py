@@ -9,29 +9,27 @@ from typing import Any
 
 import numpy as np
 
-from hvdc_ident.data import FEWEST_QUIET, Array, event_time, quiet_rows
+from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.classes import EffectClass, classes, formula_rivals, likely, rivals
-from hvdc_ident.discrepancy.evidence import largest_rmse, louder_than_noise, material_gap
-from hvdc_ident.discrepancy.explain import moved_parameters
-from hvdc_ident.discrepancy.findings import finding, values_by_place
-from hvdc_ident.discrepancy.forms import alternatives
+from hvdc_ident.discrepancy.expansion import FoundForm
+from hvdc_ident.discrepancy.findings import finding, finding_beside, in_words, values_by_place
 from hvdc_ident.discrepancy.hypothesis import Refit, signal
-from hvdc_ident.discrepancy.implied import implied
-from hvdc_ident.discrepancy.known_errors import known_errors
+from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import CERTAIN, LISTED, REFUTED, TOLERANCE, SearchContext
+from hvdc_ident.discrepancy.outside import alternatives
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
 from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict
-from hvdc_ident.discrepancy.rounds import FoundForm
+from hvdc_ident.discrepancy.score import implied
 from hvdc_ident.discrepancy.search import SearchOutcome
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
-from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.text import figures, gap_text, listed, probability_text, value_by_place
 
 LEAST_EXPLAINED = 0.5
 """Share of the gap that what is named has to explain."""
+ONLY_A_FORM = "what is found from the data alone explains more than any of it"
 OUTSIDE = ("term", "filter")
 """Forms that no name of the catalogue stands for."""
 STRONG_SHARE = 0.1
@@ -65,23 +63,26 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
     options, last = search.options, outcome.refit
     left = last.nominal()
     tests = tests_of(search, last)
+    if outcome.form is not None:
+        text = f"Something is missing, and nothing of the catalogue can be named: {ONLY_A_FORM}."
+        return Conclusion("unnameable", text, tests, instead=outcome.form)
     if not outcome.kept:
         return _nothing(search, last, outcome, tests)
-    remainder = remainder_of(search, first, last, noise_floor(last, left, tests, options.significance))
-    labels = ", ".join(p.candidate.label for p in last.placed)
+    remainder = remainder_of(search, first, last, misfit_of(last).floor)
+    labels = ", ".join(k.term.label for k in outcome.kept)
     if remainder.share > 1.0 - LEAST_EXPLAINED:
-        text = f"Something is missing; the best of the catalogue ({labels}) explains only {gap_text(1.0 - remainder.share)} of the gap."
+        text = f"Something is missing; the best of what was tried ({labels}) explains only {gap_text(1.0 - remainder.share)} of the gap."
         return Conclusion("unnameable", text, tests, remainder=remainder)
-    sets = tuple(rivals(r, options, search.tries) for r in outcome.kept)
+    sets = tuple(rivals(k, options, search.tries) for k in outcome.kept)
     sets, better = _with_formulas(search, outcome, sets)
     if better is not None:
         text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
         return Conclusion("unnameable", text, tests, instead=better, remainder=remainder)
     explained = first.chi2 - last.chi2
     found = Conclusion("named", "", tests, sets, remainder=remainder)
-    weighed = _weighed(outcome, left, explained, found, labels, options.significance)
-    against = doubt_of_known_errors(search, outcome) if weighed.verdict == "named" else None
-    return weighed if against is None else _in_doubt(found, labels, against)
+    if not (outcome.exhausted or outcome.expansions):
+        return _in_doubt(found, labels, NOT_LOOKED_AT)
+    return _weighed(outcome, left, explained, found, labels, options.significance)
 
 
 def _weighed(
@@ -96,7 +97,7 @@ def _weighed(
     rest = _remainder_text(remainder, significance)
     if rest and remainder.largest > REFUTED:
         if sure or _all_of_one_kind(found.sets):
-            text = f"Missing: something like {names}. It is not all of it: {rest}."
+            text = f"{_prefix(found)}: something like {names}. It is not all of it: {rest}."
             return replace(
                 found,
                 verdict="ambiguous",
@@ -113,12 +114,12 @@ def _weighed(
         return _in_doubt(found, labels, against)
     if sure and any(c[0].differs for c in each):
         return replace(
-            found, verdict="ambiguous", text=f"Missing: {names}; the records do not distinguish these places."
+            found, verdict="ambiguous", text=f"{_prefix(found)}: {names}; the records do not distinguish these places."
         )
     unseen_of_it = doubt_of_direction(outcome.refit) if sure else None
     if unseen_of_it is not None:
         found = replace(found, caveat=unseen_of_it.why, experiment={"text": unseen_of_it.advice})
-    return replace(found, verdict="named" if sure else "ambiguous", text=f"Missing: {names}.")
+    return replace(found, verdict="named" if sure else "ambiguous", text=f"{_prefix(found)}: {names}.")
 
 
 def leaves_more_than_noise(judgement: Conclusion, last: Refit, *, adequate: bool, significance: float) -> bool:
@@ -131,15 +132,7 @@ def leaves_more_than_noise(judgement: Conclusion, last: Refit, *, adequate: bool
     """
     left = judgement.remainder if judgement.verdict in ("named", "ambiguous") else None
     shown = bool(judgement.doubt) or (left is not None and bool(_remainder_text(left, significance)))
-    return shown or (not adequate and max(_power_by_output(last.nominal()).values(), default=0.0) > MATTERS)
-
-
-def _power_by_output(left: Nominal) -> dict[str, float]:
-    """The mean square of the residual of each output, in units of its noise."""
-    each: dict[str, list[Array]] = {}
-    for b in left.blocks:
-        each.setdefault(b.output, []).append(b.residual)
-    return {o: float(np.mean(np.concatenate(parts) ** 2)) for o, parts in each.items()}
+    return shown or (not adequate and misfit_of(last).matters)
 
 
 def findings_of(
@@ -158,16 +151,20 @@ def findings_of(
     share = None if judgement.remainder is None else 1.0 - judgement.remainder.share
     found: list[Finding] = []
     values, depend = implied(outcome.refit), dict[str, tuple[ValueAt, ...]]()
-    for of, own, group in zip(outcome.kept, placed, judgement.sets, strict=False):
+    effects_placed = iter(placed)
+    for kept, group in zip(outcome.kept, judgement.sets, strict=False):
+        own = next(effects_placed) if kept.term.is_effect else None
         each = [
-            replace(finding(of, one, own, values, with_intervals=with_intervals), share=share)
+            replace(
+                finding(kept.expansion, one, own, values, with_intervals=with_intervals)
+                if one.best.in_catalogue
+                else finding_beside(one.best, one.probability, kept, outcome.refit, search),
+                share=share,
+            )
             for one in likely(classes(group))
         ]
         depend = values_by_place(each) | depend
         found += each
-    freed = {f.name for f in (*search.held, *search.stated)} & set(outcome.refit.problem.names)
-    if placed and freed and (moved := moved_parameters(outcome.refit, freed)) is not None:
-        found.append(replace(moved, share=share))
     return tuple(found), depend
 
 
@@ -206,6 +203,11 @@ def _remainder_text(remainder: Remainder, significance: float) -> str:
     return "; ".join(parts)
 
 
+def _prefix(found: Conclusion) -> str:
+    """Return what a list of terms begins with: of effects, or of values and components too."""
+    return "Missing" if all(r.in_catalogue for g in found.sets for r in g) else "Wrong or missing"
+
+
 def _names(found: Conclusion) -> list[str]:
     return [g[0].effect for g in found.sets]
 
@@ -217,7 +219,9 @@ def _class_text(each: Sequence[EffectClass]) -> str:
         at = list(dict.fromkeys([c.best.at, *(r.at for r, _ in c.members)]))
         where = ", or at ".join(listed(places) for places in at[:LISTED])
         more = f", or at one of {len(at) - LISTED} more places" if len(at) > LISTED else ""
-        texts.append(f"{' or '.join(c.kinds)} ({probability_text(c.probability)}) at {where}{more}")
+        kinds = c.kinds if c.best.in_catalogue else [in_words(c.best)]
+        where = f" at {where}{more}" if c.best.in_catalogue else ""
+        texts.append(f"{' or '.join(kinds)} ({probability_text(c.probability)}){where}")
     return "; or ".join(texts)
 
 
@@ -234,8 +238,10 @@ def _with_formulas(
     They are tried in the stead of an effect that would be named by the catalogue alone, unless no form outside it is asked for.
     """
     wider: list[tuple[Rival, ...]] = []
-    for found, group in zip(outcome.kept, sets, strict=True):
-        if not search.options.fallback or search.spent or classes(group)[0].probability < CERTAIN:
+    for kept, group in zip(outcome.kept, sets, strict=True):
+        found = kept.expansion
+        plain = found.winner is None or not search.options.fallback or search.spent
+        if plain or classes(group)[0].probability < CERTAIN or not group[0].in_catalogue:
             wider.append(group)
             continue
         formulas = alternatives(search, found)
@@ -254,7 +260,7 @@ def _with_formulas(
 def _in_doubt(found: Conclusion, labels: str, against: Doubt) -> Conclusion:
     """Ambiguous, though nothing else that was tried explains as much."""
     they = "they" if len(found.sets) > 1 else "it"
-    text = f"Missing: something like {labels}; {against.why}, so {they} may stand for something that is none of those tried."
+    text = f"{_prefix(found)}: something like {labels}; {against.why}, so {they} may stand for something that is none of those tried."
     return replace(found, verdict="ambiguous", text=text, experiment={"text": against.advice}, doubt=against.why)
 
 
@@ -265,75 +271,41 @@ def _all_of_one_kind(sets: tuple[tuple[Rival, ...], ...]) -> bool:
 
 def _one_kind(group: Sequence[Rival]) -> bool:
     """Return True where the members of a set are one effect at several places, or delays of one kind or another."""
-    return len({r.effect for r in group}) == 1 or all(effects()[r.effect].equivalent_delay is not None for r in group)
-
-
-def noise_floor(last: Refit, left: Nominal, tests: Sequence[Binned], significance: float) -> float:
-    """The mean square of the residuals of `last` that counts as noise. left: its residuals, tests: those of them."""
-    floor = noise_left(left)
-    # What looks like noise is the noise, as loud as it is: that of rounded records is not known beforehand.
-    return max(floor, last.chi2 / last.rows) if all(b.p > significance for b in tests) else floor
-
-
-def noise_left(left: Nominal) -> float:
-    """The mean square that noise alone leaves in whitened residuals, from the rows before the events that are at rest; at least 1.
-
-    It is 1 where the noise is as supposed. AR coefficients from few rows are not: with a standard deviation that is
-    given, a coefficient that is wrong by a tenth makes of whitened noise half or three times its size.
-    """
-    experiments = {e.name: e for e in left.problem.fitted_experiments}
-    rows: dict[str, int] = {}
-    quiet: dict[str, list[Array]] = {}
-    for b, run in zip(left.blocks, left.fitted(), strict=True):
-        e = experiments[b.experiment]
-        event = e.event if e.event is not None else event_time(e.inputs)
-        rows[b.output] = rows.get(b.output, 0) + b.residual.size
-        if b.slope is None:  # one level between two steps is no measure of the others
-            rest = quiet_rows(e.time[b.rows], b.misfit + run, event, run, b.profile)
-            quiet.setdefault(b.output, []).append(b.residual[rest.rows])
-    total = 0.0
-    for output, count in rows.items():
-        own = np.concatenate(quiet.get(output) or [np.zeros(0)])
-        total += count * (float(np.mean(own**2)) if own.size >= FEWEST_QUIET else 1.0)
-    return max(total / max(sum(rows.values()), 1), 1.0)
-
-
-def keeps_tolerance(search: SearchContext, last: Refit) -> bool:
-    """Return True where a tolerance is stated and a model keeps it in every signal that has one."""
-    largest = largest_rmse(last)
-    return bool(search.tolerance) and all(largest.get(o, np.inf) <= band for o, band in search.tolerance.items())
-
-
-def leaves_a_gap(search: SearchContext, last: Refit) -> bool:
-    """Return True where a model leaves more than the tolerance, or where none is stated clearly more than the noise."""
-    share, tolerance = search.options.holdout_share, search.tolerance
-    beyond_tolerance = largest_rmse(last), dict.fromkeys(tolerance, 0.0)
-    if not tolerance and louder_than_noise(last, share):
+    if len({r.kind for r in group}) == 1:
         return True
-    return material_gap(last.unseen, 1.0, share, tolerance, beyond_tolerance)
+    return all(r.in_catalogue and effects()[r.effect].equivalent_delay is not None for r in group)
 
 
 def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Conclusion:
-    found = outcome.rounds[-1]
+    """The conclusion where no hypothesis is better than the model as it is, or something speaks against each that is."""
     options = search.options
-    if found.form is not None:
-        text = f"Something is missing, and nothing of the catalogue can be named: {found.why}."
-        return Conclusion("unnameable", text, tests, instead=found.form)
-    refused = any(b.p <= options.significance and b.excess > STRONG_SHARE * last.rows for b in tests)
-    strong = found.significant and found.screen.scores[0].fall > STRONG_SHARE * last.rows
-    if (strong or refused) and leaves_a_gap(search, last):
-        why = found.why or "the residuals are not noise"
-        return Conclusion(
-            "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
-        )
+    if not outcome.expansions:
+        return Conclusion("no-evidence", "The data give no sign of a missing effect.", tests)
+    found = outcome.expansions[0]
     if not any(found.screen.usable(column) for column in found.screen.size):
         still = list(dict.fromkeys(c.effect for c in found.candidates))
         text = "None of the effects looked for is excited by these experiments."
         advice = {"text": ". ".join(f"{e}: {effects()[e].excited_by}" for e in still)}
         return Conclusion("not-excited", text, tests, experiment=advice)
-    if found.significant:
-        return Conclusion("no-evidence", f"No gap that matters: {found.why}.", tests)
-    return Conclusion("no-evidence", f"The data give no sign of a missing effect: {found.why}.", tests)
+    if outcome.explained_by_errors:
+        text = f"Stated values and recorded levels that are off by no more than they may be explain the gap ({outcome.slight})."
+        return Conclusion("no-evidence", f"No effect is named: {text[:1].lower()}{text[1:]}", tests)
+    refused = any(b.p <= options.significance and b.excess > STRONG_SHARE * last.rows for b in tests)
+    p = found.screen.p(max(found.screen.scores[0].fall, 0.0)) if found.screen.scores else 1.0
+    strong = p <= options.significance and found.screen.scores[0].fall > STRONG_SHARE * last.rows
+    if (strong or refused) and misfit_of(last).is_material(search.tolerance, options):
+        why = outcome.objection or "the residuals are not noise"
+        return Conclusion(
+            "unnameable", f"Something is missing, but nothing of the catalogue can be named: {why}.", tests
+        )
+    if outcome.objection and p <= options.significance:
+        return Conclusion("no-evidence", f"No gap that matters: {outcome.objection}.", tests)
+    why = (
+        f"the best of all is what noise gives (p = {p:.2g})"
+        if p > options.significance
+        else "nothing explains more than its price"
+    )
+    return Conclusion("no-evidence", f"The data give no sign of a missing effect: {why}.", tests)
 
 
 def _signals(last: Refit) -> dict[str, dict[str, Array]]:
@@ -357,6 +329,9 @@ class Doubt:
     advice: str
 
 
+NOT_LOOKED_AT = Doubt("the budget ended before effects were looked for", "Nothing yet: a larger budget may tell.")
+
+
 def doubt_of_size(last: Refit, left: Nominal, explained: float) -> Doubt | None:
     """Doubt because the experiments ask for different sizes of an effect in the refit `last`; None where they do not.
 
@@ -370,27 +345,16 @@ def doubt_of_size(last: Refit, left: Nominal, explained: float) -> Doubt | None:
     return None
 
 
-def doubt_of_known_errors(search: SearchContext, outcome: SearchOutcome) -> Doubt | None:
-    """Doubt because errors that stated values and recorded levels are known to have explain as much as an effect that was put in."""
-    for found in outcome.kept:
-        assert found.winner is not None
-        errors = known_errors(search, found.before)
-        if errors.in_place_of(found.before, found.winner.refit):
-            label = found.candidates[found.winner.pick.candidate].label
-            why = f"stated values and recorded levels that are off by no more than they may be explain as much as {label} ({errors})"
-            return Doubt(why, f"Stated values known better, or fitted, and larger inputs, in which {label} answers.")
-    return None
-
-
 def doubt_of_remainder(names: Sequence[str], left: str) -> Doubt:
     """Doubt because more than noise is left: the true effect leaves nothing, one in its place does.
 
     A relay looks like a coupling with a backlash, or like a quantiser. names: the effects that were put in; left: where the
     rest is, as a sentence.
     """
-    each = list(dict.fromkeys(names))
+    each = [n for n in dict.fromkeys(names) if n in effects()]
     apart = "Each of them by itself. " if len(names) > 1 else ""
-    return Doubt(left, apart + ". ".join(f"{n}: {effects()[n].excited_by}" for n in each))
+    more = ". ".join(f"{n}: {effects()[n].excited_by}" for n in each)
+    return Doubt(left, apart + (more or "Larger inputs, and the signals between the places that are in question"))
 
 
 def doubt_of_direction(last: Refit) -> Doubt | None:

@@ -14,12 +14,13 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.evidence import CandidateFit, Pick, Ruler, exceeds_noise
 from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, RefitResult, failed_at, refit_job, refit_result
+from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.movable import Form, Movable
 from hvdc_ident.discrepancy.nominal import thinned
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.pushes import Pushed, pushed
+from hvdc_ident.discrepancy.score import CandidateFit, Pick, Ruler
 from hvdc_ident.discrepancy.screen import NOT_TRIED, Score, Screen, ScreenSetup, screened
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import mapped
@@ -147,7 +148,7 @@ class FoundForm:
 
 
 @dataclass(frozen=True, eq=False)
-class Round:
+class Expansion:
     """Result of one round. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
 
     signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: every refit,
@@ -177,7 +178,7 @@ class Round:
 
 
 @dataclass(frozen=True, eq=False)
-class RoundModel:
+class ExpansionModel:
     """The model of a round, and what its candidates are compared on."""
 
     search: SearchContext
@@ -185,7 +186,7 @@ class RoundModel:
     setup: ScreenSetup
 
     @classmethod
-    def of(cls, search: SearchContext, before: Refit, found: Sequence[CandidateEffect], number: int) -> RoundModel:
+    def of(cls, search: SearchContext, before: Refit, found: Sequence[CandidateEffect], number: int) -> ExpansionModel:
         """Return what candidates are compared on, on a model; number: of the round, for its noise."""
         nominal = before.nominal()
         fewer = thinned(nominal)
@@ -209,14 +210,17 @@ class RoundModel:
         *,
         held: bool = False,
         known: Screen | None = None,
+        one_size: bool = False,
     ) -> Screen:
         """Return the screen of candidates in their simplest forms.
 
         point: where they are looked at from, instead of the optimum; held: whether their sizes are as they are. known: a screen from the
-        same point, whose candidates and sizes are not run again.
+        same point, whose candidates and sizes are not run again. one_size: whether each is run in one size alone, of several with one
+        equation that in the middle.
         """
         asked = [k for k in (range(len(found)) if which is None else which) if not found[k].still]
-        columns = [(k, n) for k in asked for n in _simplest(found[k]) if known is None or (k, n) not in known.answers]
+        sizes = _middle if one_size else _simplest
+        columns = [(k, n) for k in asked for n in sizes(found[k]) if known is None or (k, n) not in known.answers]
         setup = replace(self.setup, held=True) if held else self.setup  # it keeps what it has worked out
         if point is not None:
             setup = replace(setup, point=point, noise=setup.noise[:, :0])
@@ -254,7 +258,7 @@ class RoundModel:
         """Return the scores refitted, in a race with each other and with those refitted earlier; and their larger forms where none
         leaves noise: beside equations of one size that do, more sizes gain nothing but their price."""
         trials = self._raced(found, scores, text, earlier)
-        if any(not t.refit.failure and not exceeds_noise(t.refit) for t in (*earlier, *trials)):
+        if any(not t.refit.failure and not misfit_of(t.refit).is_loud for t in (*earlier, *trials)):
             return trials
         wider = {
             (t.pick.candidate, n): t
@@ -296,6 +300,14 @@ def _simplest(candidate: CandidateEffect) -> list[int]:
     return [n for n, f in enumerate(forms) if f in least]
 
 
+def _middle(candidate: CandidateEffect) -> list[int]:
+    """Return of each of the simplest equations of a candidate the probe in the middle."""
+    forms, by_form = _forms(candidate), dict[frozenset[str], list[int]]()
+    for n in _simplest(candidate):
+        by_form.setdefault(forms[n], []).append(n)
+    return [own[len(own) // 2] for own in by_form.values()]
+
+
 def larger_forms(candidate: CandidateEffect, probe: int) -> list[int]:
     """Return the probes in whose equations those of one probe are a part."""
     forms = _forms(candidate)
@@ -311,3 +323,11 @@ def gains_of(before: Refit, refit: Refit) -> Array:
     """Return the unknowns of the model before an effect was added, as the refit with it came to them."""
     k, whole = len(before.problem.free), len(refit.problem.free)
     return np.concatenate([refit.theta[:k], refit.theta[whole:]])
+
+
+def with_candidate(expansion: Expansion, candidate: CandidateEffect) -> tuple[Expansion, int]:
+    """Return the expansion with the candidate among its own, and where it stands there."""
+    for k, c in enumerate(expansion.candidates):
+        if c.label == candidate.label:
+            return expansion, k
+    return replace(expansion, candidates=(*expansion.candidates, candidate)), len(expansion.candidates)

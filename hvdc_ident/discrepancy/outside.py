@@ -16,22 +16,21 @@ import sympy as sp
 
 from hvdc_ident.codec import NOT_STORED, Coded
 from hvdc_ident.discrepancy.candidates import additive, candidates
-from hvdc_ident.discrepancy.evidence import (
-    CandidateFit,
-    Ruler,
-    best_each,
-    is_far_from_noise,
-    left_by,
-    same_answers,
-    with_gain,
-)
-from hvdc_ident.discrepancy.explain import sentence
+from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel, FoundForm
 from hvdc_ident.discrepancy.hypothesis import Refit, built_in, uncertainty_of
+from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.movable import equations, in_proportion
 from hvdc_ident.discrepancy.options import REFUTED, SearchContext
 from hvdc_ident.discrepancy.pushes import answered, hats
-from hvdc_ident.discrepancy.rounds import FoundForm, Round, RoundModel
+from hvdc_ident.discrepancy.score import (
+    CandidateFit,
+    Ruler,
+    best_each,
+    same_answers,
+    with_gain,
+)
 from hvdc_ident.discrepancy.screen import Score
+from hvdc_ident.discrepancy.sentences import sentence
 from hvdc_ident.effects import effects
 from hvdc_ident.expression import parse, symbol, to_text
 from hvdc_ident.immutable import FrozenMap
@@ -65,7 +64,7 @@ class DescribedForm(Coded):
 
 def refitted_forms(
     search: SearchContext,
-    opened: Round,
+    opened: Expansion,
     at: Collection[str] | None = None,
     kinds: Collection[str] = ("term", "filter", "curve"),
 ) -> tuple[CandidateFit, ...]:
@@ -86,17 +85,17 @@ def refitted_forms(
         if len(c.at) == 1 and c.at[0] in places and not c.still
     ]
     curves = [k for k, c in enumerate(found) if effects()[c.effect].outside == "curve"]
-    round_model = RoundModel.of(search, before, found, 1)
-    screen = round_model.screen(found, "outside the catalogue", [k for k in range(len(found)) if k not in curves])
+    expansion_model = ExpansionModel.of(search, before, found, 1)
+    screen = expansion_model.screen(found, "outside the catalogue", [k for k in range(len(found)) if k not in curves])
     scores: list[Score] = []
     for effect in {c.effect: None for c in found}:
         scores += [s for k, s in screen.best().items() if found[k].effect == effect][:REFITS_PER_FORM]
     scores += [Score(k, 0, 0.0, before.theta) for k in curves]
-    trials = best_each(round_model.refitted(found, scores, "outside the catalogue"))
+    trials = best_each(expansion_model.refitted(found, scores, "outside the catalogue"))
     return tuple(t for t in trials if not t.refit.failure and _is_own(t.refit))
 
 
-def _promising(opened: Round) -> list[str]:
+def _promising(opened: Expansion) -> list[str]:
     """Return the places at which an effect of the catalogue, whichever, makes chi2 fall most."""
     order = [opened.candidates[k].at for k in opened.screen.best()]
     return list(dict.fromkeys(at[0] for at in order if len(at) == 1))[:FORM_PLACES]
@@ -108,7 +107,7 @@ def _is_own(refit: Refit) -> bool:
 
 
 def best_form(
-    search: SearchContext, opened: Round, trials: Sequence[CandidateFit], best: Refit | None = None
+    search: SearchContext, opened: Expansion, trials: Sequence[CandidateFit], best: Refit | None = None
 ) -> FoundForm | None:
     """Return the form that leaves least for the price of its values, of those that stand the tests of an effect; None where none
     does.
@@ -134,12 +133,12 @@ def _gain(search: SearchContext, before: Refit, refit: Refit, best: Refit | None
     if was is None or now is None or gain <= search.options.named_bic or was - now <= search.options.holdout_share:
         return None
     if best is None:
-        return gain if left_by(refit) <= REFUTED * left_by(before) else None
+        return gain if misfit_of(refit).beyond <= REFUTED * misfit_of(before).beyond else None
     ahead = ruler.between(best, refit) > search.options.named_bic
-    return gain if ahead and not is_far_from_noise(before, refit) else None
+    return gain if ahead and not misfit_of(refit).is_far_from_noise(misfit_of(before)) else None
 
 
-def alternatives(search: SearchContext, opened: Round) -> tuple[tuple[CandidateFit, float], ...]:
+def alternatives(search: SearchContext, opened: Expansion) -> tuple[tuple[CandidateFit, float], ...]:
     """Return the refits of forms in the stead of a round's winner, each with its prior; none that failed.
 
     Of what bends a signal or brings one in, without memory, at one place inside a model: terms there, with what the winner brings
@@ -255,7 +254,7 @@ def _curve(refit: Refit) -> dict[str, Any]:
     return {"over": over, "at": at.tolist(), "value": value.tolist(), "std": std}
 
 
-def disturbance_course(search: SearchContext, opened: Round) -> DescribedForm:
+def disturbance_course(search: SearchContext, opened: Expansion) -> DescribedForm:
     """Return what would have to be added at the place that explains most, over time and the same in every experiment.
 
     Each of some hats over time is put on the place as the model runs; its answer at the outputs, whitened and freed of what the

@@ -1,21 +1,82 @@
-"""Refits of candidates compared: the scale of BIC, what each gains, whether its effect is clearly there, and what it leaves."""
+"""Refits of candidates compared: the scale of BIC, what each gains, and what speaks against naming its effect."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from hvdc_ident.discrepancy.hypothesis import Refit
-from hvdc_ident.discrepancy.implied import TIED, off_given
-from hvdc_ident.discrepancy.nominal import Nominal, of_held_out
+from hvdc_ident.discrepancy.misfit import is_material_fall, misfit_of
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.prediction import held_out, root_mean_square_by_record
-from hvdc_ident.discrepancy.residual_checks import is_louder_after_breaks, residual_tests
+from hvdc_ident.discrepancy.result import EffectSize
 from hvdc_ident.effects import effects
-from hvdc_ident.fit.noise import SURE, freedom_of
+from hvdc_ident.fit.noise import SURE
+from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures, percentage
+
+TIED = 2.0
+"""In BIC: evidence up to which one hypothesis is not to be preferred to another (Kass and Raftery, Bayes Factors, JASA 90, 1995)."""
+
+T = TypeVar("T")
+
+
+def implied(refit: Refit) -> FrozenMap[EffectSize]:
+    """Return the values of the model's own free parameters in a refit, by name, with their 95 % intervals where these are known."""
+    values = {}
+    for k in refit.gains:
+        free, value = refit.problem.free[k], float(refit.theta[k])
+        std = None if free.on_bound(value) else refit.std.get(free.name)
+        interval = None if std is None else (value - 1.96 * std, value + 1.96 * std)
+        values[free.name] = EffectSize(value, interval, refit.model.parameters[free.name].unit)
+    return FrozenMap(values)
+
+
+def off_given(refit: Refit) -> float:
+    """Return how far a refit's own free parameters are from their given values: root of the summed squares of relative differences.
+
+    Each is a difference over the larger of both magnitudes, so that half a value and twice a value are as far.
+    """
+    total = 0.0
+    for k in refit.gains:
+        given, value = refit.problem.free[k].given, float(refit.theta[k])
+        largest = max(abs(given), abs(value))
+        total += ((value - given) / largest) ** 2 if largest else 0.0
+    return math.sqrt(total)
+
+
+def apart(one: Mapping[str, EffectSize], other: Mapping[str, EffectSize]) -> tuple[str, ...]:
+    """Return the parameters whose values in two hypotheses differ by more than chance; none whose deviation is not known."""
+    found = []
+    for name in (n for n in one if n in other):
+        stds = [_std(values[name]) for values in (one, other)]
+        if None not in stds:
+            deviation = math.hypot(*(s for s in stds if s is not None))
+            if abs(one[name].value - other[name].value) > SURE * deviation:
+                found.append(name)
+    return tuple(found)
+
+
+def _std(size: EffectSize) -> float | None:
+    low, high = size.ci95 or (None, None)
+    return None if low is None or high is None else (high - low) / (2.0 * 1.96)
+
+
+def nearest(
+    best: T, tied: Sequence[T], values: Callable[[T], Mapping[str, EffectSize]], off: Callable[[T], float]
+) -> T:
+    """Return of a hypothesis and those that explain as much the one whose values, where they are others, are nearest to the given.
+
+    values: of the parameters by hypothesis; off: how far these are from the given ones.
+    """
+    own = values(best)
+    others = [t for t in tied if off(t) < off(best) and apart(own, values(t))]
+    return min([best, *others], key=off)
+
 
 CLEAR_CHI2 = 30.0
 """In BIC: from where held-out data speak clearly against a candidate, whatever the fitted ones say. With a smaller squared
@@ -123,28 +184,6 @@ def at_edge(refit: Refit, which: int) -> bool:
     return bool(edges) and all(edges)
 
 
-def material_gap(
-    before: float | None, after: float | None, share: float, bands: Mapping[str, float] | None,
-    tables: tuple[Mapping[str, float], Mapping[str, float]] | None,
-) -> bool:  # fmt: skip
-    """Return True where the fall from before to after (pooled, noise units; or by output where bands are given) is of interest."""
-    if bands and tables:
-        first, second = tables
-        return any(first[o] > band and first[o] - second[o] > share * band for o, band in bands.items() if o in first)
-    return before is not None and after is not None and before - after > share
-
-
-def louder_than_noise(refit: Refit, share: float) -> bool:
-    """Return True where the fitted residual is larger than the noise by more than a share of it, in amplitude, and by more than
-    an estimated noise may be off."""
-    return refit.chi2 > ((1.0 + share) ** 2 + SURE * level_error(refit)) * refit.rows
-
-
-def level_error(refit: Refit) -> float:
-    """Relative standard error of the noise's power, where its level is estimated; 0 where it is stated."""
-    return float(np.sqrt(2.0 / freedom_of(refit.noise, refit.problem.outputs)))
-
-
 LEAST_STEP = 0.05
 """Share of the gap that a second effect has to take away at least."""
 
@@ -175,22 +214,20 @@ def objections(
         return "nothing can be left out to judge it by"
     # Records that an effect does not move are better or worse by the noise they hold.
     if not now < was and (
-        (now**2 - was**2) * unseen_rows(refit) > options.named_bic or not leaves_holdout_alone(before, refit)
+        (now**2 - was**2) * refit.unseen_rows > options.named_bic or not leaves_holdout_alone(before, refit)
     ):
         pooled = f"held-out data speak against it ({now:.4g} after {was:.4g}, in noise units)"
         return worst_held_out_record(before, refit) or pooled
-    tables = (largest_rmse(before), largest_rmse(refit)) if tolerance else None
+    then, since = misfit_of(before), misfit_of(refit)
     fitted = (float(np.sqrt(before.chi2 / refit.rows)), float(np.sqrt(refit.chi2 / refit.rows)))
-    if not material_gap(was, now, options.holdout_share, tolerance, tables):
+    if not since.is_fall_material(then, tolerance, options):
         # Held-out experiments that hardly excite the effect cannot show much of it: then they have to agree, or to have
         # nothing to say, and the fitted ones show the size. Whitening hides a slow gap in slow noise, so the records as
         # they are may show it too.
-        then, since = as_recorded(before), as_recorded(refit)
-        gaps = (fitted, *((then.get(role), since.get(role)) for role in ("fit", "holdout")))
-        shown = not tolerance and any(material_gap(*gap, options.holdout_share, None, None) for gap in gaps)
+        roles = ((then.as_recorded.get(role), since.as_recorded.get(role)) for role in ("fit", "holdout"))
+        shown = not tolerance and any(is_material_fall(*gap, options.holdout_share) for gap in (fitted, *roles))
         if not (
-            shown
-            and ((was**2 - now**2) * unseen_rows(refit) > options.named_bic or leaves_holdout_alone(before, refit))
+            shown and ((was**2 - now**2) * refit.unseen_rows > options.named_bic or leaves_holdout_alone(before, refit))
         ):
             return f"the gap it closes is immaterial ({was:.4g} to {now:.4g} in noise units, held out)"
     if not first and max((was - now) / was, (fitted[0] - fitted[1]) / fitted[0]) < LEAST_STEP:
@@ -208,7 +245,7 @@ def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> fl
     if was is None or now is None or not np.isfinite(was) or not np.isfinite(now):
         return fitted
     share = ruler.effective / ruler.rows / ruler.scale
-    return fitted + share * (was**2 - now**2) * unseen_rows(after)
+    return fitted + share * (was**2 - now**2) * after.unseen_rows
 
 
 def with_gain(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
@@ -238,12 +275,6 @@ def worst_held_out_record(before: Refit, after: Refit) -> str:
     return f"the held-out record '{name}' speaks against it: {with_it} times the noise with it, {without} without"
 
 
-def unseen_rows(refit: Refit) -> int:
-    """Rows of the data that judge: the held-out ones, or all of the fitted ones, each left out in turn."""
-    held = [e for e in refit.problem.experiments if e.role == "holdout" and e.outputs]
-    return sum(int(e.compared.sum()) * len(e.outputs) for e in held) or refit.rows
-
-
 def leaves_holdout_alone(before: Refit, after: Refit) -> bool:
     """Return True where the held-out experiments would look the same with the effect and without."""
     one, two = (held_out(r.problem, r.theta) for r in (before, after))
@@ -252,48 +283,8 @@ def leaves_holdout_alone(before: Refit, after: Refit) -> bool:
     return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < CLEAR_CHI2
 
 
-def as_recorded(refit: Refit) -> dict[str, float]:
-    """By role of the experiments their misfit in standard deviations of the noise, pooled and not whitened."""
-    roles = {e.name: e.role for e in refit.problem.experiments}
-    squares: dict[str, list[float]] = {}
-    for output, row in refit.problem.rmse(refit.theta).items():
-        std = refit.noise[output].std
-        for name, rmse in row.items():
-            if rmse is not None and std:
-                squares.setdefault(roles[name], []).append((rmse / std) ** 2)
-    return {role: float(np.sqrt(np.mean(found))) for role, found in squares.items()}
-
-
-def largest_rmse(refit: Refit) -> dict[str, float]:
-    """The largest RMSE of each output over all experiments, in its unit."""
-    found: dict[str, float] = {}
-    for output, row in refit.problem.rmse(refit.theta).items():
-        known = [v for v in row.values() if v is not None]
-        if known:
-            found[output] = max(known)
-    return found
-
-
 PARAMETER_PRICE = 8.0
 """Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
-SMALL_REMAINDER = 0.05
-"""Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
-MAX_NOISE_POWER = 1.4
-"""Times the noise's power up to which what is left may be noise that is louder than it was taken for."""
-STRUCTURE_P = 0.01
-"""Chance under noise of sums over time below which what is left has a shape: as small as for an effect to be named. What is there is
-looked for by a whole round more, and by forms outside the catalogue."""
-MAX_LAG1_AUTOCORRELATION = 0.1
-"""Correlation of neighbours up to which nothing is made of it: records that stand still are rounded alike."""
-N_BEST = 3
-"""Of the refits the best, of which this is asked."""
-LOUD_NOISE_SHARE = 0.1
-"""Share of what the model before leaves beyond noise that a fall of chi2 has to come to: noise that is louder than stated falls too."""
-
-
-def fall_beyond_loud_noise(before: Refit) -> float:
-    """Return the fall of chi2 that noise which is louder than stated does not give."""
-    return LOUD_NOISE_SHARE * (before.chi2 - before.rows)
 
 
 def best_each(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
@@ -319,71 +310,4 @@ def by_cost(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
 def cost_of(trial: CandidateFit) -> float:
     """Chi2 of a refit on all data plus the price of its parameters, before the scale of BIC is known."""
     refit, held = trial.refit, trial.refit.predicted
-    return refit.chi2 + PARAMETER_PRICE * refit.count + (held**2 * unseen_rows(refit) if held is not None else 0.0)
-
-
-def exceeds_noise(refit: Refit) -> bool:
-    """Return True where a model leaves more than noise, by size."""
-    return refit.chi2 / refit.rows > 1.0 + SURE * _power_error(refit)
-
-
-def predicts_worse(refit: Refit) -> bool:
-    """Return True where a model leaves more of unseen data than of those it was fitted to, by more than chance."""
-    seen, now = max(refit.chi2 / refit.rows, 1.0), refit.predicted
-    return now is not None and now**2 > seen * (1.0 + SURE * _power_error(refit))
-
-
-def _power_error(refit: Refit) -> float:
-    """Standard error of the mean square of noise over its level: of the rows, and of a level that is estimated (F distribution)."""
-    return float(np.hypot(np.sqrt(2.0 / refit.effective), level_error(refit)))
-
-
-def left_by(refit: Refit) -> float:
-    """Misfit beyond noise per row, of the fitted data or of the others."""
-    return max(refit.chi2 / refit.rows, (refit.predicted or 0.0) ** 2) - 1.0
-
-
-def all_far_from_noise(before: Refit, trials: Sequence[CandidateFit], near: float = SMALL_REMAINDER) -> bool:
-    """Return True where no refit comes near the noise, or to a small share of the misfit before, on fitted and held-out data."""
-    far = all(_leaves_much(before, t.refit, near) for t in trials if not t.refit.failure)
-    return far and not any(resembles_noise(t.refit) for t in by_cost(trials)[:N_BEST])
-
-
-def is_far_from_noise(before: Refit, refit: Refit) -> bool:
-    """Return True where this refit does not come near the noise, or to a small share of the misfit before."""
-    return _leaves_much(before, refit, SMALL_REMAINDER) and not resembles_noise(refit)
-
-
-def _leaves_much(before: Refit, refit: Refit, near: float) -> bool:
-    return (exceeds_noise(refit) or predicts_worse(refit)) and left_by(refit) > near * left_by(before)
-
-
-def resembles_noise(refit: Refit) -> bool:
-    """Return True where the residual is without shape, though somewhat loud: noise is estimated from few rows.
-
-    Of the held-out data too, where more is left of them: their noise may be louder than that of the others.
-    """
-    seen, now = max(refit.chi2 / refit.rows, 1.0), refit.predicted
-    if (
-        seen > MAX_NOISE_POWER
-        or refit.correlation > MAX_LAG1_AUTOCORRELATION
-        or (now is not None and now**2 > MAX_NOISE_POWER * seen)
-    ):
-        return False
-    left = refit.nominal()
-    if is_louder_after_breaks(left) or not is_unstructured(left, 0):
-        return False
-    if not predicts_worse(refit):
-        return True
-    held = of_held_out(refit.problem)
-    return held is not None and is_unstructured(Nominal(held, refit.theta[: len(held.free)], refit.noise), 0)
-
-
-def is_noise(refit: Refit, seed: int) -> bool:
-    """Return True where the residual is noise, by its size and over time: then there is nothing more to look for."""
-    return not exceeds_noise(refit) and is_unstructured(refit.nominal(), seed)
-
-
-def is_unstructured(nominal: Nominal, seed: int) -> bool:
-    """Return True where sums of the residual over time are like those of noise."""
-    return all(b.p > STRUCTURE_P for b in residual_tests(nominal, {}, bootstraps=200, seed=seed))
+    return refit.chi2 + PARAMETER_PRICE * refit.count + (held**2 * refit.unseen_rows if held is not None else 0.0)
