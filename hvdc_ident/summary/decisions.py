@@ -42,7 +42,7 @@ STAGES: dict[str, str] = {"given": "simulation", "fitted": "fit", "effect": "dis
 """Sets of values in the order of a page, with the stage that judges them and whose CSV files hold the runs with them."""
 ADDED = {"term": "formula", "filter": "filter", "curve": "curve"}
 """Words for what stands in the model in place of an effect of the catalogue."""
-CORRECTED = {VALUE: "value", CARD: "component"}
+CORRECTED = {VALUE: "corrected value", CARD: "other component"}
 """Words for what the model has otherwise than the card states, where that is no effect."""
 SUMMARISED = ("run", "simulation", "identifiability", "fit", "discrepancy", "linearization")
 """Results that a summary is made of."""
@@ -158,7 +158,10 @@ def estimates_that_count(fit: FitResult | None, diagnosis: Diagnosis | None) -> 
 
 
 def added_to(diagnosis: Diagnosis | None) -> str:
-    """Return what an augmented model has otherwise: "effect", "formula", "filter", "curve", "component" or "value"; empty without one."""
+    """Return what an augmented model has otherwise: "effect", "formula", "filter", "curve", "other component" or "corrected value".
+
+    Empty without one.
+    """
     if diagnosis is None:
         return ""
     if diagnosis.effects:
