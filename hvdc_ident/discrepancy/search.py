@@ -597,7 +597,7 @@ def _values(search: Search, h: Hypothesis) -> list[Hypothesis]:
     priors = {f.name: P_VALUE for f in context.held} | {f.name: share for f in context.stated}
     known = h.base.model.parameters.keys() - here.problem.names
     open_to = [f for f in (*context.held, *context.stated) if f.name in known]
-    worth, starts = _worth(search, here, open_to, [-2.0 * math.log(priors[f.name]) for f in open_to])
+    worth, starts = _worth(here, open_to, [-2.0 * math.log(priors[f.name]) for f in open_to])
     chosen = [k for k in np.argsort(-worth, kind="stable")[:VALUES] if worth[k] > 0.0]
     wider = [with_free(h.base, open_to[k]) for k in chosen]
     jobs = []
@@ -614,10 +614,8 @@ def _values(search: Search, h: Hypothesis) -> list[Hypothesis]:
     ]
 
 
-def _worth(
-    search: Search, here: Refit, values: Sequence[FitParameter], prices: Sequence[float]
-) -> tuple[Array, list[float]]:
-    """Return (m,) by how much the score falls with each held value set free, to first order, and where its refit begins.
+def _worth(here: Refit, values: Sequence[FitParameter], prices: Sequence[float]) -> tuple[Array, list[float]]:
+    """Return (m,) by how much chi2 falls with each held value set free, to first order and less its price, and where its refit begins.
 
     Of a value without a trace, such as a level that no signal reaches, the best of a few others is taken. prices: of the values' priors.
     """
@@ -638,8 +636,8 @@ def _worth(
                 fall = float(nominal.residual @ nominal.residual - left @ left)
                 if fall > falls[k]:
                     falls[k], at[k] = fall, value
-    ruler = search.ruler
-    return np.asarray(ruler.effective / ruler.rows / ruler.scale * falls - ruler.price - np.array(prices)), at
+    # In chi2 of the noise: of a misfit its own size is no measure of what may be left.
+    return np.asarray(falls - math.log(here.rows) - np.array(prices)), at
 
 
 def _clocks(search: Search, h: Hypothesis) -> list[Hypothesis]:
@@ -681,7 +679,7 @@ def _all_of_it(search: Search, h: Hypothesis) -> Hypothesis:
     (component,) = h.terms[0].at
     while not (search.context.spent or search.is_noise(h)):
         own = [f for f in stated(h.base.model, h.base.problem.free) if f.name.startswith(f"{component}.")]
-        worth, _ = _worth(search, h.refit, own, [0.0] * len(own))
+        worth, _ = _worth(h.refit, own, [0.0] * len(own))
         if not worth.size or worth.max() <= 0.0:
             break
         wider = with_free(h.base, own[int(np.argmax(worth))])
