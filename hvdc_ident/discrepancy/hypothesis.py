@@ -497,16 +497,6 @@ def refit_job(
     return RefitJob(model, (*before.placed, placed), problem, begins, before.noise)
 
 
-FAR_SHARE = 0.4
-"""Share of its given value by which a gain has moved when it may have taken an effect's place."""
-
-
-def gains_moved_far(refit: Refit) -> bool:
-    """Return True where a gain has moved so far, or stands on a bound, that it may have taken an effect's place."""
-    gains = ((refit.problem.free[k], float(refit.theta[k])) for k in refit.gains)
-    return any(abs(value - f.given) > FAR_SHARE * abs(f.given) or f.on_bound(value) for f, value in gains)
-
-
 def with_given_gains(refit: Refit) -> Array | None:
     """The unknowns with the gains at their given values, as near as the bounds let; None where they are there already."""
     theta = refit.theta_at_given

@@ -34,7 +34,7 @@ def misfit_of(refit: Refit) -> Misfit:
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """What a refit leaves, in units of the noise."""
+    """The misfit of a refit, in units of the noise."""
 
     refit: Refit
 

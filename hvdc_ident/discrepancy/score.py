@@ -147,12 +147,16 @@ class Ruler:
 
     def gain(self, before: float, after: float, more: int) -> float:
         """The fall of BIC from one chi2 to another with `more` parameters more."""
-        share = self.effective / self.rows
-        return (before - after) * share / self.scale - more * self.price
+        return (before - after) * self.share - more * self.price
 
     def between(self, before: Refit, after: Refit) -> float:
         """Return the gain of one refit over another, by their chi2 and the number of their parameters."""
         return self.gain(before.chi2, after.chi2, len(after.problem.free) - len(before.problem.free))
+
+    @property
+    def share(self) -> float:
+        """Units of BIC for a unit of chi2."""
+        return self.effective / self.rows / self.scale
 
     @property
     def price(self) -> float:
@@ -244,8 +248,7 @@ def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> fl
     was, now = before.predicted, after.predicted
     if was is None or now is None or not np.isfinite(was) or not np.isfinite(now):
         return fitted
-    share = ruler.effective / ruler.rows / ruler.scale
-    return fitted + share * (was**2 - now**2) * after.unseen_rows
+    return fitted + ruler.share * (was**2 - now**2) * after.unseen_rows
 
 
 def with_gain(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:

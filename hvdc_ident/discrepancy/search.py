@@ -1,13 +1,14 @@
 """The search: a queue of hypotheses and moves, the best first by one score.
 
-A hypothesis is the nominal model with terms: effects at places, stated values set free, clocks that are off. A move makes of a
-hypothesis others with one term more; doing without a term, or with another one in its stead, is a move of the hypothesis without it.
+A hypothesis is the nominal model with terms: effects at places, stated values set free, another component, clocks that are off. A move
+makes of a hypothesis others with one term more; doing without a term, or with another one in its stead, is a move of the hypothesis
+without it.
 The best hypothesis so far is the answer at every instant. The search ends when no hypothesis that is still open can come near the best,
 or when the budget is over.
 
 The score is minus twice the log evidence, up to a constant: chi2 of the fitted and of the held-out records in units of what the best
 hypothesis leaves, the logarithm of the independent rows for each free parameter, and minus twice the log prior of the terms. Slight errors
-of what is stated go with every hypothesis (`slight`).
+of what is stated go with every hypothesis (`stated`).
 """
 
 from __future__ import annotations
@@ -82,7 +83,9 @@ CARD_LAPS = (8, 12)
 CLOCKS = "clocks"
 """Kind of the term that the clocks of records are off."""
 NO_PICK = Pick(-1, 0, 1.0, 0.0)
+"""Of a term that is no candidate of a screen."""
 NO_SCREEN = Screen((), {}, {}, np.zeros(0), {})
+"""Where no effects were looked for."""
 BEAM = 3
 """Hypotheses of one number of terms, of different kinds, that are opened."""
 VALUES = 8
@@ -95,7 +98,7 @@ LEAST_INDEPENDENT_POWER = 1e-6
 
 @dataclass(frozen=True)
 class Term:
-    """What a hypothesis has more than the nominal model.
+    """A part of a hypothesis that the nominal model has not.
 
     kind: an effect of the catalogue, `VALUE`, `CARD` or `CLOCKS`; at: its places, the value's name, the component, or the records whose
     clocks are off; source: the signal that an effect brings in, or the card. prior: its probability before any data.
@@ -108,12 +111,12 @@ class Term:
 
     @property
     def is_effect(self) -> bool:
-        """Whether it is an effect that stands in the model."""
+        """True for an effect that stands in the model."""
         return self.kind not in (VALUE, CARD, CLOCKS)
 
     @property
     def is_form(self) -> bool:
-        """Whether it is a form outside the catalogue, which no name stands for."""
+        """True for a form outside the catalogue, which no name stands for."""
         return self.is_effect and bool(effects()[self.kind].outside)
 
     @property
@@ -150,6 +153,11 @@ class Hypothesis:
         """Names of the stated values that are free."""
         return tuple(t.at[0] for t in self.terms if t.kind == VALUE)
 
+    @property
+    def prior_cost(self) -> float:
+        """Minus twice the logarithm of the prior probability of the terms."""
+        return -2.0 * sum(math.log(t.prior) for t in self.terms)
+
     def without(self, term: Term) -> frozenset[Term]:
         """The key of the hypothesis without one of its terms."""
         return self.key - {term}
@@ -175,8 +183,8 @@ class SearchOutcome:
     best: the hypothesis that is the answer, its effects in the model; kept: by term of it, clocks aside. pool: every hypothesis, the best
     first, with its score less that of the model without terms. expansions: what was looked for beside which hypothesis, the first
     first. form: outside the catalogue, where that is better than the answer and stands its tests. objection: why a better one is not
-    the answer; empty where the best is. exhausted: whether nothing that was open could have
-    come near; notes: what could not be done, or was not.
+    the answer; empty where the best is. exhausted: whether nothing that was open could have come near; notes: what could not be done, or
+    was not.
     """
 
     best: Hypothesis
@@ -191,7 +199,7 @@ class SearchOutcome:
 
     @property
     def explained_by_errors(self) -> bool:
-        """Whether slight errors of what is stated explain what the best hypothesis leaves, and it is no noise without them."""
+        """True where slight errors of what is stated explain what the best hypothesis leaves, and it is no noise without them."""
         misfit = misfit_of(self.refit)
         power = (self.refit.chi2 - self.slight.fall_fitted) / self.refit.rows
         return not misfit.is_noise and power <= misfit.floor * (1.0 + SURE * misfit.power_error)
@@ -262,7 +270,6 @@ class Search:
     def cost(self, h: Hypothesis, ruler: Ruler, *, rough: bool = False) -> float:
         """The score of a hypothesis: less is better. rough: without slight errors."""
         r = h.refit
-        share = ruler.effective / ruler.rows / ruler.scale
         known = None if rough else self.errors_under(h).total
         chi2 = _chi2(r) if known is None else known
         if known is not None and r.holdout is None and r.predicted is not None:
@@ -270,9 +277,8 @@ class Search:
             chi2 += r.predicted**2 * r.unseen_rows * known / r.chi2
         # The row that leaves a record with a late clock takes its share of the noise along.
         chi2 += r.chi2 * (self.root.refit.rows / r.rows - 1.0)
-        prior = -2.0 * sum(math.log(t.prior) for t in h.terms)
         count = len(r.problem.names) + sum(len(t.at) for t in h.terms if t.kind == CLOCKS)
-        return share * chi2 + ruler.price * count + prior
+        return ruler.share * chi2 + ruler.price * count + h.prior_cost
 
     def ranked(self) -> list[Hypothesis]:
         """Every hypothesis, the best first; of those far behind without slight errors."""
@@ -285,7 +291,7 @@ class Search:
         return [*sorted(near, key=lambda h: self.cost(h, ruler)), *rough[len(near) :]]
 
     def is_noise(self, h: Hypothesis) -> bool:
-        """Whether a hypothesis leaves noise alone, by its size and over time, beside slight errors."""
+        """Return True where a hypothesis leaves noise alone, by its size and over time, beside slight errors."""
         known = self.noisy.get(h.key)
         if known is None or known[0] is not h.refit:
             known = h.refit, self._is_noise(h)
@@ -324,7 +330,7 @@ class Search:
         return built
 
     def left(self, h: Hypothesis) -> float:
-        """What a hypothesis leaves, times the noise."""
+        """Return how many times the noise a hypothesis leaves."""
         return math.sqrt(max(h.refit.chi2 - self.errors_under(h).fall_fitted, 0.0) / h.refit.rows)
 
     # --- the queue ---
@@ -390,17 +396,17 @@ class Search:
         return kept
 
     def _may_win(self, h: Hypothesis, best: Hypothesis, ruler: Ruler) -> bool:
-        """Whether the likeliest term more, leaving nothing but noise, could come near the best."""
+        """Return True where the likeliest term more, leaving nothing but noise, could come near the best."""
         if h is best and self.is_noise(best) and h.terms:
             return False
-        share = ruler.effective / ruler.rows / ruler.scale
         r = h.refit
         every = r.rows + (0 if r.predicted is None else r.unseen_rows)
         # Noise may be so much less than it was taken for, and than what the best leaves.
-        rows = min(every, (self.cost(best, ruler) - self.cost(best, ruler, rough=True)) / share + _chi2(best.refit))
+        rows = min(
+            every, (self.cost(best, ruler) - self.cost(best, ruler, rough=True)) / ruler.share + _chi2(best.refit)
+        )
         rows -= SURE * math.sqrt(2.0 * every)
-        prior = -2.0 * sum(math.log(t.prior) for t in h.terms)
-        ideal = share * rows + ruler.price * (len(r.problem.names) + 1) + prior - 2.0 * math.log(P_VALUE)
+        ideal = ruler.share * rows + ruler.price * (len(r.problem.names) + 1) + h.prior_cost - 2.0 * math.log(P_VALUE)
         return ideal < self.cost(best, ruler) + SET
 
     def _answer(self) -> tuple[Hypothesis, str]:
@@ -447,7 +453,7 @@ class Search:
         return next(iter(there), best)
 
     def _objection(self, h: Hypothesis) -> str:
-        """What speaks against one of the terms of a hypothesis, in words; empty where nothing does."""
+        """Return in words an objection to one of the terms of a hypothesis; empty where there is none."""
         ruler, options = self.ruler, self.context.options
         effect = 0
         for t in h.terms:
@@ -545,7 +551,7 @@ class Search:
         return [h for h in alone if misfit_of(h.refit).beyond <= most]
 
     def _kept(self, best: Hypothesis, term: Term, ruler: Ruler) -> Kept:
-        """What was looked for in the stead of a term of the best hypothesis."""
+        """Return a term of the best hypothesis with what was looked for in its stead."""
         less = self._without(best, term) or self.root
         known = self.expansions.get(less.key)
         before = less.refit if known is None else known.before
@@ -565,11 +571,14 @@ class Search:
             own = with_gain(CandidateFit(pick, refit, 0.0), before, ruler)
             found = [own, *(t for t in found if t.pick.candidate != number)]
         ranked = tuple(sorted(found, key=lambda t: -t.total_gain))
-        expansion = replace(expansion, trials=ranked, failed=failed, winner=own, ruler=ruler, significant=True)
+        expansion = replace(expansion, trials=ranked, failed=failed, winner=own, ruler=ruler)
         others = []
         for h in self.pool.values():
-            (other,) = h.key - less.key if len(h.key) == len(less.key) + 1 and less.key < h.key else (None,)
-            if other is not None and not other.is_effect and other.kind != CLOCKS:
+            more = h.key - less.key
+            if len(more) != 1 or not less.key < h.key:
+                continue
+            (other,) = more
+            if not other.is_effect and other.kind != CLOCKS:
                 trial = CandidateFit(NO_PICK, best.refit if h.key == best.key else h.refit, 0.0)
                 others.append((other, with_gain(trial, before, ruler)))
         return Kept(term, expansion, tuple(others))
@@ -707,7 +716,7 @@ def _begins(base: Refit, change: CardChange) -> tuple[Array, ...]:
 def _with_card(first: Refit, change: CardChange) -> Refit:
     """Return the nominal model with another card, what a fit frees of it at its start beside the parameters as they are refitted."""
     model = recording(change.model, (o for e in first.problem.experiments for o in e.outputs))
-    own = tuple(FitParameter(n, p.value, p.min, p.max) for n, p in change.free.items())
+    own = tuple(FitParameter.of(n, p) for n, p in change.free.items())
     old = model.parameters.keys() - change.free.keys()
     stays = [k for k, f in enumerate(first.problem.free) if f.name in old]
     held = FrozenMap({n: v for n, v in first.problem.held.items() if n in old})
@@ -730,14 +739,12 @@ def _effects(search: Search, h: Hypothesis) -> list[Hypothesis]:
     if not expansion.screen.scores:
         return []
     ruler, found = search.ruler, expansion.candidates
-    share = ruler.effective / ruler.rows / ruler.scale
-    best, noise = search.ranked()[0], search.is_noise(h)
-    many = Counter(c.effect for c in found)
+    best, noise, prior = search.ranked()[0], search.is_noise(h), _prior(expansion)
 
     def worth(s: Score) -> bool:
         c = found[s.candidate]
-        price = ruler.price * len(c.probes[s.probe].free) - 2.0 * math.log(P_EFFECT / len(many) / many[c.effect])
-        return not noise or share * s.fall > price
+        price = ruler.price * len(c.probes[s.probe].free) - 2.0 * math.log(prior(c.effect))
+        return not noise or ruler.share * s.fall > price
 
     reached = h.refit.chi2 - best.refit.chi2 if search.is_noise(best) else 0.0
     return _kept(search, h, raced(model, expansion, f"round {number}", reached, worth))
@@ -760,19 +767,22 @@ def _again(
 def _kept(search: Search, h: Hypothesis, expansion: Expansion) -> list[Hypothesis]:
     """Keep an expansion with its trials, and return these as hypotheses."""
     search.expansions[h.key] = expansion
-    found = expansion.candidates
-    many = Counter(c.effect for c in found)
-    children = []
+    prior, children = _prior(expansion), []
     for t in (*expansion.trials, *(expansion.forms or ())):
         r = t.refit
         if r.failure or not r.rows or r.predicted is None:
             continue
         c = r.placed[-1].candidate
-        own = many[c.effect] or len(expansion.signals)
-        prior = P_EFFECT / max(len(many), 1) / own
-        term = Term(c.effect, c.at, c.source, prior)
+        term = Term(c.effect, c.at, c.source, prior(c.effect))
         children.append(Hypothesis(r, h.base, (*h.terms, term), expansion.before if r.placed[-1].movable else None))
     return children
+
+
+def _prior(expansion: Expansion) -> Callable[[str], float]:
+    """Return the probability of an effect at one of its places and sources, before any data: every effect is as likely as another, and
+    shares that with all its candidates; a form outside the catalogue with all places."""
+    many = Counter(c.effect for c in expansion.candidates)
+    return lambda effect: P_EFFECT / max(len(many), 1) / (many[effect] or len(expansion.signals))
 
 
 MOVES = (

@@ -66,8 +66,8 @@ class SlightErrors:
     """What slight errors do to the records of a model, to first order, one standard deviation of each.
 
     names: of the stated values, then of the outputs whose levels are off. fitted: (N, m) change of the whitened residuals of the fitted
-    records; held: (H, m) of the held-out ones. sizes: the standard deviations, relative of a value, in its unit of a level. records: the
-    problem's experiments that they hold for.
+    records; held: (H, m) of the held-out ones. sizes: the standard deviations, relative of a value, in its unit of a level. units: of
+    the outputs.
     """
 
     names: tuple[str, ...]
