@@ -15,11 +15,11 @@ from itertools import pairwise
 from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
 from hvdc_ident.discrepancy.expansion import (
     LEFT_BEHIND,
-    PROMISING,
     REFITS_PER_EFFECT,
     Expansion,
     ExpansionModel,
     Race,
+    first_of,
     gains_of,
 )
 from hvdc_ident.discrepancy.hypothesis import Refit, scaled_sizes, slot_signals, with_given_gains
@@ -28,7 +28,7 @@ from hvdc_ident.discrepancy.options import BEAM, FIELD, SearchContext
 from hvdc_ident.discrepancy.outside import best_form, refitted_forms
 from hvdc_ident.discrepancy.residual_checks import tones
 from hvdc_ident.discrepancy.score import TIED, CandidateFit, best_each, by_cost, cost_of
-from hvdc_ident.discrepancy.screen import Score, Screen
+from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.discrepancy.sizes import with_closer_sizes, with_searched_sizes
 from hvdc_ident.effects import effects
 
@@ -43,7 +43,7 @@ LEADING_SHARE = 0.9
 def opened(search: SearchContext, here: Refit, number: int) -> tuple[ExpansionModel, Expansion]:
     """Return what candidates are compared on beside a hypothesis, and their screen. Raises SimulationError where it cannot be run.
 
-    number: of the expansion, for its noise. Each candidate is run in one size at first, and in the others where that one promises much.
+    number: of the expansion, for its noise. Each candidate is run in two sizes at first, and in the others where these promise much.
     """
     search.tell(0, 1, f"round {number}: the signals")
     signals = slot_signals(here)
@@ -53,21 +53,13 @@ def opened(search: SearchContext, here: Refit, number: int) -> tuple[ExpansionMo
     found = tuple(c for c in found if (c.effect, c.at, c.source) not in there and c.probes)
     model = ExpansionModel.of(search, here, found, number)
     text = f"round {number}: {len(found)} candidates"
-    screen = model.screen(found, text, one_size=True)
+    screen = model.screen(found, text, few_sizes=True)
     if not search.spent:
-        screen = screen.with_(model.screen(found, text, _hopeful(screen, found), known=screen), found)
+        best = screen.best()
+        # A size at which a candidate does not run, as a slow filter in a loop does not, says nothing of its others.
+        which = [*first_of(list(best), found), *(k for k in range(len(found)) if k not in best)]
+        screen = screen.with_(model.screen(found, text, which, known=screen), found)
     return model, Expansion(here, signals, found, screen)
-
-
-def _hopeful(screen: Screen, found: Sequence[CandidateEffect]) -> list[int]:
-    """Return the candidates that are run in all their sizes: a share of all, the best, and of each effect as many as are refitted."""
-    count: Counter[str] = Counter()
-    kept, best = [], screen.best()
-    for n, k in enumerate(best):
-        count[found[k].effect] += 1
-        if n < PROMISING * len(best) or count[found[k].effect] <= REFITS_PER_EFFECT:
-            kept.append(k)
-    return kept
 
 
 def raced(

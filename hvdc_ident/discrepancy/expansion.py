@@ -21,7 +21,7 @@ from hvdc_ident.discrepancy.nominal import thinned
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.pushes import Pushed, pushed
 from hvdc_ident.discrepancy.score import CandidateFit, Pick, Ruler
-from hvdc_ident.discrepancy.screen import NOT_TRIED, Score, Screen, ScreenSetup, screened
+from hvdc_ident.discrepancy.screen import NOT_TRIED, Score, Screen, ScreenSetup, distance, screened
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit import Problem
@@ -149,11 +149,11 @@ class FoundForm:
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """Result of one round. winner: the best trial, where one is good enough; why: what speaks against it otherwise.
+    """What was looked for beside a hypothesis, `before`. winner: the trial that was kept, where one was.
 
     signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: every refit,
     the best first. ruler: what BIC counts by. forms: the refits of forms outside the catalogue; None where none was looked for.
-    form: the one that leaves next to nothing but noise, where no effect that was refitted does. led: by candidate the cost of the refit
+    led: by candidate the cost of the refit
     from whose gains others were looked for. promised: candidates that were run beside such gains because they promised most there.
     """
 
@@ -164,11 +164,8 @@ class Expansion:
     trials: tuple[CandidateFit, ...] = ()
     failed: tuple[CandidateFit, ...] = ()
     winner: CandidateFit | None = None
-    why: str = ""
-    significant: bool = False
     ruler: Ruler | None = None
     forms: tuple[CandidateFit, ...] | None = None
-    form: FoundForm | None = None
     led: Mapping[int, float] = field(default_factory=dict)
     promised: frozenset[int] = frozenset()
 
@@ -210,16 +207,15 @@ class ExpansionModel:
         *,
         held: bool = False,
         known: Screen | None = None,
-        one_size: bool = False,
+        few_sizes: bool = False,
     ) -> Screen:
         """Return the screen of candidates in their simplest forms.
 
         point: where they are looked at from, instead of the optimum; held: whether their sizes are as they are. known: a screen from the
-        same point, whose candidates and sizes are not run again. one_size: whether each is run in one size alone, of several with one
-        equation that in the middle.
+        same point, whose candidates and sizes are not run again. few_sizes: whether each is run in two of its sizes alone.
         """
         asked = [k for k in (range(len(found)) if which is None else which) if not found[k].still]
-        sizes = _middle if one_size else _simplest
+        sizes = _few if few_sizes else _simplest
         columns = [(k, n) for k in asked for n in sizes(found[k]) if known is None or (k, n) not in known.answers]
         setup = replace(self.setup, held=True) if held else self.setup  # it keeps what it has worked out
         if point is not None:
@@ -236,14 +232,7 @@ class ExpansionModel:
 
     def promising(self, screen: Screen, found: Sequence[CandidateEffect], point: Array) -> list[int]:
         """Return the candidates that promise most from other unknowns: a share of all, and of each effect as many as are refitted."""
-        order = self.order(screen, found, point)
-        count: Counter[str] = Counter()
-        kept = []
-        for n, k in enumerate(order):
-            count[found[k].effect] += 1
-            if n < PROMISING * len(order) or count[found[k].effect] <= REFITS_PER_EFFECT:
-                kept.append(k)
-        return kept
+        return first_of(self.order(screen, found, point), found)
 
     def movable(self, candidate: CandidateEffect, probe: int) -> Movable | None:
         """Return the model with the candidate's effect to be moved; None where it is put in: at several places, or in a closed model."""
@@ -293,6 +282,17 @@ class ExpansionModel:
         return [*trials, *(CandidateFit(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
 
 
+def first_of(order: Sequence[int], found: Sequence[CandidateEffect]) -> list[int]:
+    """Return of candidates in some order the first: a share of all, and of each effect as many as are refitted."""
+    count: Counter[str] = Counter()
+    kept = []
+    for n, k in enumerate(order):
+        count[found[k].effect] += 1
+        if n < PROMISING * len(order) or count[found[k].effect] <= REFITS_PER_EFFECT:
+            kept.append(k)
+    return kept
+
+
 def _simplest(candidate: CandidateEffect) -> list[int]:
     """Return the probes whose equations hold no other probe's: what a larger form does, its parts show."""
     forms = _forms(candidate)
@@ -300,12 +300,16 @@ def _simplest(candidate: CandidateEffect) -> list[int]:
     return [n for n, f in enumerate(forms) if f in least]
 
 
-def _middle(candidate: CandidateEffect) -> list[int]:
-    """Return of each of the simplest equations of a candidate the probe in the middle."""
+def _few(candidate: CandidateEffect) -> list[int]:
+    """Return of each of the simplest equations of a candidate two probes: the one in the middle, and the one nearest to doing nothing.
+
+    A large size in a loop may bend everything and tell nothing of a small one.
+    """
     forms, by_form = _forms(candidate), dict[frozenset[str], list[int]]()
     for n in _simplest(candidate):
         by_form.setdefault(forms[n], []).append(n)
-    return [own[len(own) // 2] for own in by_form.values()]
+    both = ((own[len(own) // 2], min(own, key=lambda n: distance(candidate, n))) for own in by_form.values())
+    return list(dict.fromkeys(n for pair in both for n in pair))
 
 
 def larger_forms(candidate: CandidateEffect, probe: int) -> list[int]:

@@ -429,12 +429,12 @@ def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: 
     single: dict[tuple[str, str], list[tuple[float, tuple[int, int]]]] = {}
     for k, n in answers:
         c = candidates[k]
-        single.setdefault((c.at[0], c.source), []).append((_distance(c, n), (k, n)))
+        single.setdefault((c.at[0], c.source), []).append((distance(c, n), (k, n)))
     for k, n in batch.columns:
         c = candidates[k]
         if len(c.at) == 1:
             continue
-        size, parts = _distance(c, n), []
+        size, parts = distance(c, n), []
         own = {s: single.get(s) for s in zip(c.at, c.sources or ("",) * len(c.at), strict=True)}
         # Where nothing moves the effect does nothing, and was not run.
         moving = [near for (place, _), near in own.items() if near or place not in setup.still]
@@ -451,7 +451,7 @@ def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: 
         found.scores.append(Score(k, n, chi2 - float(fell[0]), setup.point + steps[0], float(factors[0])))
 
 
-def _distance(candidate: CandidateEffect, probe: int) -> float:
+def distance(candidate: CandidateEffect, probe: int) -> float:
     """Return how far a probe is from doing nothing."""
     away = distance_from_neutral(effects()[candidate.effect], candidate.probes[probe].values)
     return max((abs(v) for v in away.values()), default=0.0)

@@ -13,12 +13,12 @@ from hvdc_ident import InputSignal, simulate
 from hvdc_ident.data import Array, Experiment
 from hvdc_ident.discrepancy import DiagnosisOptions
 from hvdc_ident.discrepancy.candidates import CandidateEffect, candidates
-from hvdc_ident.discrepancy.expansion import ExpansionModel
+from hvdc_ident.discrepancy.expansion import ExpansionModel, _few
 from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals, with_given_gains
 from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.screen import ANY_FACTOR, SKETCHED, UP_TO_ONE, Linearised, Sketch, _Runner, screened
-from hvdc_ident.effects import apply_effects, effects
+from hvdc_ident.effects import Probe, apply_effects, effects
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator, Tolerance
 from tests.discrepancy.cases import experiments, model
@@ -228,3 +228,12 @@ def test_what_is_said_to_be_in_proportion_to_a_size_is_so(effect: str) -> None:
         return bool(np.abs(twice - 2.0 * once).max() < 1e-6 * np.abs(once).max())
 
     assert is_proportional(Form(effect, tuple(sizes))) == any(is_so(n) for n in sizes)
+
+
+def test_a_first_look_takes_a_size_in_the_middle_and_the_one_nearest_to_nothing() -> None:
+    """A slow filter in a loop bends all of it, and hides how well a quick one does: the demo's is one of 343 rad/s."""
+    probes = tuple(
+        Probe("second-order", FrozenMap({"wn": wn, "zeta": 0.7}), FrozenMap({"wn": (1.0, 2000.0), "zeta": (0.1, 2.0)}))
+        for wn in (616.0, 20.0, 90.0, 300.0)
+    )
+    assert set(_few(CandidateEffect("second-order", ("wm",), probes))) == {0, 2}
