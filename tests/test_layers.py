@@ -21,7 +21,7 @@ fmu linearize sensitivity linear fit identifiability discrepancy summary report 
 INSIDE = {
     "discrepancy": """
 options result candidates movable nominal prediction hypothesis screen location residual_checks misfit score pushes expansion
-sentences stand_ins clocks stated remainder outside sizes effect_moves search classes findings conclusion unknown_noise diagnosis
+stated search moves remainder sentences rivals description conclusion unknown_noise diagnosis
 """,
     "linearize": """
 limits system delays sampling characteristic stability descriptor equilibrium plot derivatives point branches linear_model zeros

@@ -17,7 +17,7 @@ import pytest
 
 import hvdc_ident as hi
 from hvdc_ident.data import Trajectory
-from hvdc_ident.discrepancy.outside import DescribedForm
+from hvdc_ident.discrepancy.result import DescribedForm
 from hvdc_ident.fit import FitParameter, Problem
 from hvdc_ident.identifiability.pilot_fit import cramer_rao_bounds
 from hvdc_ident.immutable import FrozenMap

@@ -10,19 +10,18 @@ from typing import Any
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.classes import EffectClass, classes, formula_rivals, likely, rivals
-from hvdc_ident.discrepancy.expansion import FoundForm
-from hvdc_ident.discrepancy.findings import finding, finding_beside, in_words, values_by_place
+from hvdc_ident.discrepancy.description import finding, finding_beside, values_by_place
 from hvdc_ident.discrepancy.hypothesis import Refit, signal
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import CERTAIN, LISTED, REFUTED, TOLERANCE, SearchContext
-from hvdc_ident.discrepancy.outside import alternatives
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
 from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict
+from hvdc_ident.discrepancy.rivals import EffectClass, classes, likely, rivals
 from hvdc_ident.discrepancy.score import implied
 from hvdc_ident.discrepancy.search import SearchOutcome
+from hvdc_ident.discrepancy.sentences import in_words
 from hvdc_ident.effects import effects
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.text import figures, gap_text, listed, probability_text, value_by_place
@@ -30,8 +29,6 @@ from hvdc_ident.text import figures, gap_text, listed, probability_text, value_b
 LEAST_EXPLAINED = 0.5
 """Share of the gap that what is named has to explain."""
 ONLY_A_FORM = "what is found from the data alone explains more than any of it"
-OUTSIDE = ("term", "filter")
-"""Forms that no name of the catalogue stands for."""
 STRONG_SHARE = 0.1
 """Share of the rows' number that a score, or what bins hold beyond noise, has to reach before something is called missing
 that has no name: less is what a wrong idea of the noise makes."""
@@ -42,7 +39,7 @@ class Conclusion:
     """The verdict, why, and the tests of what is left.
 
     sets: by effect that was put in, it and what cannot be distinguished from it. experiment: what would show more where nothing was
-    excited, or what the doubt is about. instead: the refit of a formula outside the catalogue that explains more than what
+    excited, or what the doubt is about. instead: refits of forms outside the catalogue, the best first, that explain more than what
     would have been named. doubt: what shows that something else stands behind what was put in, though nothing else that
     was tried explains as much. caveat: what the records do not show of a form that is named.
     """
@@ -52,7 +49,7 @@ class Conclusion:
     tests: tuple[Binned, ...]
     sets: tuple[tuple[Rival, ...], ...] = ()
     experiment: Mapping[str, Any] = field(default_factory=dict)
-    instead: FoundForm | None = None
+    instead: tuple[Refit, ...] = ()
     doubt: str = ""
     caveat: str = ""
     remainder: Remainder | None = None
@@ -61,28 +58,42 @@ class Conclusion:
 def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclusion:
     """The verdict on a search that has ended."""
     options, last = search.options, outcome.refit
-    left = last.nominal()
     tests = tests_of(search, last)
-    if outcome.form is not None:
+    if outcome.forms:
         text = f"Something is missing, and nothing of the catalogue can be named: {ONLY_A_FORM}."
-        return Conclusion("unnameable", text, tests, instead=outcome.form)
-    if not outcome.kept:
+        return Conclusion("unnameable", text, tests, instead=tuple(h.refit for h in outcome.forms))
+    if not outcome.named:
         return _nothing(search, last, outcome, tests)
-    remainder = remainder_of(search, first, last, misfit_of(last).floor)
-    labels = ", ".join(k.term.label for k in outcome.kept)
+    remainder = _with_terms(remainder_of(search, first, last, misfit_of(last).floor), outcome)
+    labels = ", ".join(t.label for t in outcome.named)
     if remainder.share > 1.0 - LEAST_EXPLAINED:
         text = f"Something is missing; the best of what was tried ({labels}) explains only {gap_text(1.0 - remainder.share)} of the gap."
         return Conclusion("unnameable", text, tests, remainder=remainder)
-    sets = tuple(rivals(k, options, search.tries) for k in outcome.kept)
-    sets, better = _with_formulas(search, outcome, sets)
-    if better is not None:
-        text = f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
-        return Conclusion("unnameable", text, tests, instead=better, remainder=remainder)
-    explained = first.chi2 - last.chi2
+    sets = tuple(rivals(outcome, t, options, search.tries) for t in outcome.named)
+    for group in sets:
+        likeliest = classes(group)[0]
+        if likeliest.best.is_form and likeliest.probability >= CERTAIN:
+            text = (
+                f"Something is missing, and what the catalogue has for it ({labels}) explains less than a formula does."
+            )
+            forms = tuple(r.refit for r, _ in likeliest.members if r.refit is not None)
+            return Conclusion("unnameable", text, tests, instead=forms[:1], remainder=remainder)
     found = Conclusion("named", "", tests, sets, remainder=remainder)
     if not (outcome.exhausted or outcome.expansions):
         return _in_doubt(found, labels, NOT_LOOKED_AT)
-    return _weighed(outcome, left, explained, found, labels, options.significance)
+    return _weighed(outcome, last.nominal(), first.chi2 - last.chi2, found, labels, options.significance)
+
+
+def _with_terms(remainder: Remainder, outcome: SearchOutcome) -> Remainder:
+    """The remainder with what is left as a share of what each term explains beside the others."""
+    last, floor = outcome.refit, misfit_of(outcome.refit).floor
+    left = max(last.chi2 - floor * last.rows, 0.0)
+    each = []
+    for t in outcome.named:
+        less = outcome.hypotheses.get(outcome.best.without(t))
+        fall = 0.0 if less is None else max(less.refit.chi2 - last.chi2, 0.0)
+        each.append(left / (left + fall) if left > 0.0 else 0.0)
+    return replace(remainder, of_terms=tuple(each))
 
 
 def _weighed(
@@ -151,14 +162,13 @@ def findings_of(
     share = None if judgement.remainder is None else 1.0 - judgement.remainder.share
     found: list[Finding] = []
     values, depend = implied(outcome.refit), dict[str, tuple[ValueAt, ...]]()
-    effects_placed = iter(placed)
-    for kept, group in zip(outcome.kept, judgement.sets, strict=False):
-        own = next(effects_placed) if kept.term.is_effect else None
+    put_in = dict(zip(outcome.best.effects, placed, strict=False))
+    for term, group in zip(outcome.named, judgement.sets, strict=False):
         each = [
             replace(
-                finding(kept.expansion, one, own, values, with_intervals=with_intervals)
-                if one.best.in_catalogue
-                else finding_beside(one.best, one.probability, kept, outcome.refit, search),
+                finding(one, put_in.get(term), values, with_intervals=with_intervals)
+                if one.best.is_effect
+                else finding_beside(one.best, one.probability, search),
                 share=share,
             )
             for one in likely(classes(group))
@@ -191,11 +201,14 @@ def headline(
 def _remainder_text(remainder: Remainder, significance: float) -> str:
     """Return the remainder in words; empty where it may be noise, at this level."""
     parts = []
-    if remainder.p <= significance and remainder.share > TOLERANCE:
+    own = max(remainder.of_terms, default=0.0)
+    if remainder.p <= significance and max(remainder.share, own) > TOLERANCE:
         left = gap_text(remainder.share)
-        parts.append(
-            f"{left} of the gap is left, which is no noise and which an unknown input at {remainder.at} would explain"
-        )
+        explains = f" and which an unknown input at {remainder.at} would explain" if remainder.at else ""
+        said = f"{left} of the gap is left, which is no noise{explains}"
+        if len(remainder.of_terms) > 1 and own > REFUTED:
+            said += f"; one of them explains {_times((1.0 - own) / own)} as much as that"
+        parts.append(said)
     held = remainder.held_out or 0.0
     if held > TOLERANCE and remainder.held_out_p <= significance:
         record = f", most of it in '{remainder.record}' ({figures(remainder.record_units, 3)} times the noise)"
@@ -203,9 +216,14 @@ def _remainder_text(remainder: Remainder, significance: float) -> str:
     return "; ".join(parts)
 
 
+def _times(ratio: float) -> str:
+    """Return a ratio in words, as before `as much`."""
+    return f"{figures(ratio, 2)} times"
+
+
 def _prefix(found: Conclusion) -> str:
     """Return what a list of terms begins with: of effects, or of values and components too."""
-    return "Missing" if all(r.in_catalogue for g in found.sets for r in g) else "Wrong or missing"
+    return "Missing" if all(r.is_effect for g in found.sets for r in g) else "Wrong or missing"
 
 
 def _names(found: Conclusion) -> list[str]:
@@ -219,8 +237,8 @@ def _class_text(each: Sequence[EffectClass]) -> str:
         at = list(dict.fromkeys([c.best.at, *(r.at for r, _ in c.members)]))
         where = ", or at ".join(listed(places) for places in at[:LISTED])
         more = f", or at one of {len(at) - LISTED} more places" if len(at) > LISTED else ""
-        kinds = c.kinds if c.best.in_catalogue else [in_words(c.best)]
-        where = f" at {where}{more}" if c.best.in_catalogue else ""
+        kinds = c.kinds if c.best.is_effect else [in_words(c.best)]
+        where = f" at {where}{more}" if c.best.is_effect else ""
         texts.append(f"{' or '.join(kinds)} ({probability_text(c.probability)}){where}")
     return "; or ".join(texts)
 
@@ -228,33 +246,6 @@ def _class_text(each: Sequence[EffectClass]) -> str:
 def tests_of(search: SearchContext, last: Refit) -> tuple[Binned, ...]:
     """Tests of the residual against noise, over time and over the signals at the slots of the effects."""
     return residual_tests(last.nominal(), _signals(last), bootstraps=search.options.bootstraps, seed=search.seed)
-
-
-def _with_formulas(
-    search: SearchContext, outcome: SearchOutcome, sets: tuple[tuple[Rival, ...], ...]
-) -> tuple[tuple[tuple[Rival, ...], ...], FoundForm | None]:
-    """The sets with formulas from outside the catalogue that explain as much, and a formula that explains more than an effect does.
-
-    They are tried in the stead of an effect that would be named by the catalogue alone, unless no form outside it is asked for.
-    """
-    wider: list[tuple[Rival, ...]] = []
-    for kept, group in zip(outcome.kept, sets, strict=True):
-        found = kept.expansion
-        plain = found.winner is None or not search.options.fallback or search.spent
-        if plain or classes(group)[0].probability < CERTAIN or not group[0].in_catalogue:
-            wider.append(group)
-            continue
-        formulas = alternatives(search, found)
-        behind, near = formula_rivals(found, formulas, search.options)
-        best = max((t for t, _ in formulas), key=lambda t: t.total_gain, default=None)
-        if best is not None and np.isinf(behind):
-            return (), FoundForm(found.before, best.refit, best.gain)
-        wide = (*(replace(r, delta_bic=r.delta_bic + behind) for r in group), *near)
-        likeliest = classes(wide)[0]
-        if best is not None and likeliest.names[0] in OUTSIDE and likeliest.probability >= CERTAIN:
-            return (), FoundForm(found.before, best.refit, best.gain)
-        wider.append(wide)
-    return tuple(wider), None
 
 
 def _in_doubt(found: Conclusion, labels: str, against: Doubt) -> Conclusion:
@@ -273,15 +264,14 @@ def _one_kind(group: Sequence[Rival]) -> bool:
     """Return True where the members of a set are one effect at several places, or delays of one kind or another."""
     if len({r.kind for r in group}) == 1:
         return True
-    return all(r.in_catalogue and effects()[r.effect].equivalent_delay is not None for r in group)
+    return all(r.is_effect and effects()[r.effect].equivalent_delay is not None for r in group)
 
 
 def _nothing(search: SearchContext, last: Refit, outcome: SearchOutcome, tests: tuple[Binned, ...]) -> Conclusion:
     """The conclusion where no hypothesis is better than the model as it is, or something speaks against each that is."""
-    options = search.options
-    if not outcome.expansions:
+    options, found = search.options, outcome.opened
+    if found is None:
         return Conclusion("no-evidence", "The data give no sign of a missing effect.", tests)
-    found = outcome.expansions[0]
     if not any(found.screen.usable(column) for column in found.screen.size):
         still = list(dict.fromkeys(c.effect for c in found.candidates))
         text = "None of the effects looked for is excited by these experiments."

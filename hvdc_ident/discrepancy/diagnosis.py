@@ -12,8 +12,6 @@ import numpy as np
 from hvdc_ident.codec import plain
 from hvdc_ident.data import Experiment
 from hvdc_ident.discrepancy.candidates import CandidateEffect, entries
-from hvdc_ident.discrepancy.classes import compared
-from hvdc_ident.discrepancy.clocks import clock_sentence, clocks
 from hvdc_ident.discrepancy.conclusion import (
     Conclusion,
     findings_of,
@@ -22,23 +20,25 @@ from hvdc_ident.discrepancy.conclusion import (
     leaves_more_than_noise,
     tests_of,
 )
-from hvdc_ident.discrepancy.expansion import LEFT_BEHIND, Expansion
-from hvdc_ident.discrepancy.findings import separating
+from hvdc_ident.discrepancy.description import described
+from hvdc_ident.discrepancy.expansion import LEFT_BEHIND, Expansion, Trial
 from hvdc_ident.discrepancy.hypothesis import Refit, judged
 from hvdc_ident.discrepancy.location import localise
 from hvdc_ident.discrepancy.misfit import misfit_of
+from hvdc_ident.discrepancy.moves import MOVES
+from hvdc_ident.discrepancy.moves.clocks import clock_sentence, clocks
+from hvdc_ident.discrepancy.moves.outside import standing
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
-from hvdc_ident.discrepancy.outside import DescribedForm, best_form, described, disturbance_course, refitted_forms
-from hvdc_ident.discrepancy.remainder import share_left
+from hvdc_ident.discrepancy.remainder import disturbance_course, share_left
 from hvdc_ident.discrepancy.residual_checks import Binned
-from hvdc_ident.discrepancy.result import AUGMENTED, Diagnosis, FoundEffect, Line, StandIn
-from hvdc_ident.discrepancy.score import CandidateFit, Ruler, with_gain
+from hvdc_ident.discrepancy.result import AUGMENTED, DescribedForm, Diagnosis, FoundEffect, Line, StandIn
+from hvdc_ident.discrepancy.rivals import compared
+from hvdc_ident.discrepancy.score import Ruler
 from hvdc_ident.discrepancy.screen import NOT_TRIED as NOT_BEGUN
 from hvdc_ident.discrepancy.screen import Score
-from hvdc_ident.discrepancy.search import SearchOutcome, search_from
-from hvdc_ident.discrepancy.sentences import at_given, beside_stand_ins, found_of, gap, off_given
-from hvdc_ident.discrepancy.stand_ins import stand_ins
+from hvdc_ident.discrepancy.search import Search, SearchOutcome
+from hvdc_ident.discrepancy.sentences import at_given, beside_stand_ins, found_of, gap, off_given, separating, stand_ins
 from hvdc_ident.discrepancy.stated import stated
 from hvdc_ident.discrepancy.unknown_noise import noise_with, without_names
 from hvdc_ident.errors import StudyError, unknown_name
@@ -120,19 +120,19 @@ def diagnose(
         records=first.problem.experiments,
         components=components_of(model),
     )
-    outcome = search_from(search, first)
+    outcome = Search(search, first, MOVES).run()
     if not outcome.exhausted:
         notes = (*notes, UNTESTED)
-    if not outcome.exhausted and not outcome.kept:
+    if not outcome.exhausted and not outcome.named:
         judgement = unfinished(search, first, outcome)
     else:
         judgement = judge(search, first, outcome)
     inside = is_white_box(model)
     other = None
-    if judgement.instead is not None:
-        other = described(judgement.instead)
-    elif judgement.verdict == "unnameable" and chosen.fallback and inside:
-        other = _outside(search, outcome.expansions[0])
+    if judgement.instead:
+        other = described(first, judgement.instead[0], judgement.instead[1:])
+    elif judgement.verdict == "unnameable" and chosen.fallback and inside and outcome.opened is not None:
+        other = _outside(search, first, outcome)
     best = outcome.refit if other is None or other.refit is None else other.refit
     noise = noise_with(best)
     sure = without_names(search, first, best, noise, judgement)
@@ -142,9 +142,9 @@ def diagnose(
         notes = (*notes, CLOSED)
     if left := 0 if chosen.thorough else _left_out(search, first, outcome):
         notes = (*notes, UNTRIED.format(left))
-    if left := sum(why == NOT_BEGUN for r in outcome.expansions for why in r.screen.failures.values()):
+    if left := sum(why == NOT_BEGUN for r in outcome.expansions.values() for why in r.screen.failures.values()):
         notes = (*notes, f"The budget ended before {left} candidates were looked at: their status is {NOT_BEGUN!r}.")
-    if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.expansions for t in r.trials):
+    if left := sum(t.refit.failure == NOT_BEGUN for r in outcome.expansions.values() for t in r.trials):
         notes = (*notes, f"The budget ended before {left} refits of candidates: their status is {NOT_BEGUN!r}.")
     return _assembled(search, model, first, outcome, judgement, other, free, (*notes, *outcome.notes), noise)
 
@@ -154,8 +154,8 @@ def unfinished(search: SearchContext, first: Refit, outcome: SearchOutcome) -> C
 
     What comes nearest so far is told as that, without its place.
     """
-    every = sum(len(r.candidates) for r in outcome.expansions)
-    refitted = sum(not t.refit.failure for r in outcome.expansions for t in r.trials)
+    every = sum(len(r.candidates) for r in outcome.expansions.values())
+    refitted = sum(not t.refit.failure for r in outcome.expansions.values() for t in r.trials)
     tried = f"Of {every} candidates {refitted} were refitted to their ends"
     left = min((math.sqrt(h.refit.chi2 / h.refit.rows) for h, _ in outcome.pool if h.terms), default=math.inf)
     before = math.sqrt(first.chi2 / first.rows)
@@ -167,22 +167,23 @@ def unfinished(search: SearchContext, first: Refit, outcome: SearchOutcome) -> C
     return Conclusion("unfinished", f"{UNFINISHED} {tried}{best}.", tests_of(search, first))
 
 
-def _outside(search: SearchContext, opened: Expansion) -> DescribedForm:
+def _outside(search: SearchContext, first: Refit, outcome: SearchOutcome) -> DescribedForm:
     """Return the form outside the catalogue that explains most of the gap, or what is missing over time where none stands."""
-    forms = refitted_forms(search, opened) if opened.forms is None else opened.forms
-    form = best_form(search, opened, forms)
-    return disturbance_course(search, opened) if form is None else described(form)
+    assert outcome.opened is not None
+    alone = [h.refit for h, _ in outcome.pool if len(h.terms) == 1 and h.terms[0].is_form]
+    forms = standing(search, first, alone)
+    return described(first, forms[0]) if forms else disturbance_course(search, outcome.opened)
 
 
 def _left_out(search: SearchContext, first: Refit, outcome: SearchOutcome) -> int:
     """Return how many candidates of the first expansion were not refitted, where those that were leave more than anybody asks about."""
-    if not outcome.expansions or search.spent:
+    found = outcome.opened
+    if found is None or search.spent:
         return 0
-    found = outcome.expansions[0]
     before = misfit_of(first)
     if not all(misfit_of(h.refit).is_far_from_noise(before) for h, _ in outcome.pool):
         return 0
-    tried = {t.pick.candidate for t in found.trials}
+    tried = {t.score.candidate for t in found.trials}
     return len(set(found.screen.best()) - tried)
 
 
@@ -234,12 +235,14 @@ def _assembled(
     in_place = judgement.verdict in ("named", "ambiguous")
     tests = judgement.tests
     effects: tuple[FoundEffect, ...] = ()
-    last = outcome.refit if judgement.verdict == "no-evidence" and not outcome.kept else first
+    last = outcome.refit if judgement.verdict == "no-evidence" and not outcome.named else first
     done = judgement.verdict != "unfinished"
     if in_place:
         last = outcome.refit
-        of_effects = [k.expansion for k in outcome.kept if k.term.is_effect]
-        effects = tuple(found_of(last, p, len(r.trials)) for p, r in zip(last.placed, of_effects, strict=True))
+        effects = tuple(
+            found_of(last, p, len(outcome.in_stead_of(t)))
+            for p, t in zip(last.placed, outcome.best.effects, strict=True)
+        )
     elif other is not None and other.refit is not None:
         last = other.refit
         tests = tests_of(search, last)
@@ -264,11 +267,7 @@ def _assembled(
             known=not unknown,
         )
         if moved is not None:
-            others = (
-                ()
-                if unknown or not outcome.expansions
-                else stand_ins(search, last, outcome.expansions[0], tuple(moved.parameters))
-            )
+            others = () if unknown else stand_ins(outcome, search.options)
             moved = beside_stand_ins(moved, others)
             findings, text = (moved,), moved.text if not unknown else f"{text} {moved.text}"
         if outcome.explained_by_errors and moved is not None:
@@ -357,8 +356,8 @@ def remaining(first: Refit, last: Refit, tests: tuple[Binned, ...], search: Sear
 def lines(outcome: SearchOutcome) -> tuple[Line, ...]:
     """Every candidate of every round, those of the first round first, each round by what was found of them."""
     found: list[Line] = []
-    for number, r in enumerate(outcome.expansions, start=1):
-        refits = {t.pick.candidate: t for t in r.trials}
+    for number, r in enumerate(outcome.expansions.values(), start=1):
+        refits = {t.score.candidate: t for t in r.trials}
         best, absorbed = r.screen.best(), set(r.screen.absorbed())
         sound = [t.refit for t in r.trials if not t.refit.failure]
         ruler = Ruler.of(min(sound, key=lambda refit: refit.chi2, default=r.before))
@@ -376,7 +375,7 @@ def _line(
     k: int,
     c: CandidateEffect,
     score: Score | None,
-    trial: CandidateFit | None,
+    trial: Trial | None,
     number: int,
     *,
     absorbed: bool,
@@ -391,6 +390,6 @@ def _line(
     if trial is not None and trial.refit.failure != LEFT_BEHIND:
         status = f"failed: {trial.refit.failure}" if trial.refit.failure else "refitted"
         if not trial.refit.failure:
-            delta, hold = with_gain(trial, r.before, ruler).gain, trial.refit.unseen
+            delta, hold = ruler.between(r.before, trial.refit), trial.refit.unseen
             values = FrozenMap(trial.refit.sizes(trial.refit.placed[-1]))
     return Line(c.effect, c.at, fall, r.screen.p(fall), status, values, delta, hold, c.source, number)

@@ -9,18 +9,19 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
 from hvdc_ident.data import Array
-from hvdc_ident.discrepancy.candidates import CandidateEffect
+from hvdc_ident.discrepancy.candidates import CandidateEffect, source_signals
 from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, RefitResult, failed_at, refit_job, refit_result
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.movable import Form, Movable
 from hvdc_ident.discrepancy.nominal import thinned
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.pushes import Pushed, pushed
-from hvdc_ident.discrepancy.score import CandidateFit, Pick, Ruler
+from hvdc_ident.discrepancy.score import P_EFFECT, TIED, off_given
 from hvdc_ident.discrepancy.screen import NOT_TRIED, Score, Screen, ScreenSetup, distance, screened
 from hvdc_ident.effects import effects
 from hvdc_ident.executor import mapped
@@ -137,41 +138,79 @@ def _all(jobs: Sequence[RefitJob]) -> list[RefitResult]:
 
 
 @dataclass(frozen=True, eq=False)
-class FoundForm:
-    """A form outside the catalogue, refitted. before: the model without it; gain: delta BIC over that. others: refits of other
-    forms, or of the same elsewhere, that explain as much."""
+class Trial:
+    """A refit of a candidate, and the score that it began at."""
 
-    before: Refit
+    score: Score
     refit: Refit
-    gain: float
-    others: tuple[Refit, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """What was looked for beside a hypothesis, `before`. winner: the trial that was kept, where one was.
+    """What was looked for beside a hypothesis, `before`.
 
-    signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: every refit,
-    the best first. ruler: what BIC counts by. forms: the refits of forms outside the catalogue; None where none was looked for.
-    led: by candidate the cost of the refit
-    from whose gains others were looked for. promised: candidates that were run beside such gains because they promised most there.
+    signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: of each candidate
+    that was refitted the best refit, failed ones too. led: by candidate the cost of the refit from whose gains others were looked for.
+    promised: candidates that were run beside such gains because they promised most there.
     """
 
     before: Refit
     signals: Mapping[str, tuple[Array, ...]]
     candidates: tuple[CandidateEffect, ...]
     screen: Screen
-    trials: tuple[CandidateFit, ...] = ()
-    failed: tuple[CandidateFit, ...] = ()
-    winner: CandidateFit | None = None
-    ruler: Ruler | None = None
-    forms: tuple[CandidateFit, ...] | None = None
+    trials: tuple[Trial, ...] = ()
     led: Mapping[int, float] = field(default_factory=dict)
     promised: frozenset[int] = frozenset()
 
     def answers(self) -> Mapping[str, Pushed]:
         """Return the model's runs with their answers to pushes, by experiment; none of a model that is closed inside."""
         return pushed(self.before, self.signals) if is_white_box(self.before.model) else {}
+
+    @cached_property
+    def _sources(self) -> tuple[str, ...]:
+        return source_signals(self.before.model, self.signals)
+
+    @cached_property
+    def _counts(self) -> Counter[str]:
+        return Counter(c.effect for c in self.candidates)
+
+    def prior(self, effect: str) -> float:
+        """Return the probability of an effect at one of its places and sources, before any data: every effect is as likely as another, and
+        shares that with all its candidates; a form outside the catalogue with all places, and with all signals where it brings one in."""
+        many = self._counts
+        sources = len(self._sources) if effects()[effect].needs_source else 1
+        return P_EFFECT / max(len(many), 1) / (many[effect] or len(self.signals) * max(sources, 1))
+
+    def with_trials(self, more: Sequence[Trial]) -> Expansion:
+        """Return the expansion with further trials, of each candidate the best."""
+        return replace(self, trials=tuple(best_each([*self.trials, *more])))
+
+
+def best_each(trials: Sequence[Trial]) -> list[Trial]:
+    """Of the trials of each candidate the best, in their order; of those that are as good the one with the values nearest to the
+    given ones."""
+    kept: dict[int, Trial] = {}
+    for t in trials:
+        had = kept.get(t.score.candidate)
+        if had is None or had.refit.failure:
+            kept[t.score.candidate] = t
+        elif not t.refit.failure:
+            first, other = sorted((had, t), key=cost_of)
+            tied = cost_of(other) - cost_of(first) <= TIED and off_given(other.refit) < off_given(first.refit)
+            kept[t.score.candidate] = other if tied else first
+    return list(kept.values())
+
+
+def by_cost(trials: Sequence[Trial]) -> list[Trial]:
+    """Those that came to a result, the best first."""
+    return sorted((t for t in trials if not t.refit.failure), key=cost_of)
+
+
+def cost_of(trial: Trial) -> float:
+    """Chi2 of a refit on all data plus the price of its parameters, before the scale of BIC is known."""
+    refit, held = trial.refit, trial.refit.predicted
+    price = refit.count * math.log(max(refit.effective, 1.0))
+    return refit.chi2 + price + (held**2 * refit.unseen_rows if held is not None else 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,44 +281,43 @@ class ExpansionModel:
         return self.setup.movable(Form.of(model, candidate, candidate.probes[probe].values))
 
     def refitted(
-        self, found: Sequence[CandidateEffect], scores: Sequence[Score], text: str, earlier: Sequence[CandidateFit] = ()
-    ) -> list[CandidateFit]:
+        self, found: Sequence[CandidateEffect], scores: Sequence[Score], text: str, earlier: Sequence[Trial] = ()
+    ) -> list[Trial]:
         """Return the scores refitted, in a race with each other and with those refitted earlier; and their larger forms where none
         leaves noise: beside equations of one size that do, more sizes gain nothing but their price."""
         trials = self._raced(found, scores, text, earlier)
         if any(not t.refit.failure and not misfit_of(t.refit).is_loud for t in (*earlier, *trials)):
             return trials
         wider = {
-            (t.pick.candidate, n): t
+            (t.score.candidate, n): t
             for t in trials
             if t.refit.failure in ("", LEFT_BEHIND)
-            for n in larger_forms(found[t.pick.candidate], t.pick.probe)
+            for n in larger_forms(found[t.score.candidate], t.score.probe)
         }
-        more = [Score(k, n, t.pick.fall, gains_of(self.before, t.refit)) for (k, n), t in wider.items()]
+        more = [Score(k, n, t.score.fall, gains_of(self.before, t.refit)) for (k, n), t in wider.items()]
         return [*trials, *(self._raced(found, more, text, [*earlier, *trials]) if more else ())]
 
     def _raced(
-        self, found: Sequence[CandidateEffect], scores: Sequence[Score], text: str, earlier: Sequence[CandidateFit]
-    ) -> list[CandidateFit]:
+        self, found: Sequence[CandidateEffect], scores: Sequence[Score], text: str, earlier: Sequence[Trial]
+    ) -> list[Trial]:
         jobs: list[RefitJob] = []
-        of: list[Pick] = []
-        trials: list[CandidateFit] = []
+        of: list[Score] = []
+        trials: list[Trial] = []
         for s in sorted(scores, key=lambda s: (found[s.candidate].effect, s.candidate)):  # those of one model together
-            pick = Pick(s.candidate, s.probe, s.factor, s.fall)
             c = found[s.candidate]
             try:
                 jobs.append(refit_job(self.before, c, s.probe, s.factor, s.theta, self.movable(c, s.probe), s.ran))
-                of.append(pick)
+                of.append(s)
             except FAILURES as error:
                 why = str(error) or type(error).__name__
-                trials.append(CandidateFit(pick, failed_at(self.before, why), -np.inf))
-        texts = [f"{text}: {found[p.candidate].label}" for p in of]
+                trials.append(Trial(s, failed_at(self.before, why)))
+        texts = [f"{text}: {found[s.candidate].label}" for s in of]
         least = min((t.refit.chi2 for t in earlier if not t.refit.failure), default=np.inf)
         refits = Race().run(self.search, self.before, jobs, texts, least)
         if sound := [r for r in refits if not r.failure]:
             best = min(sound, key=lambda r: r.chi2)
             self.search.lead(" and ".join(p.candidate.label for p in best.placed), math.sqrt(best.chi2 / best.rows))
-        return [*trials, *(CandidateFit(p, refit, -np.inf) for p, refit in zip(of, refits, strict=True))]
+        return [*trials, *(Trial(s, refit) for s, refit in zip(of, refits, strict=True))]
 
 
 def first_of(order: Sequence[int], found: Sequence[CandidateEffect]) -> list[int]:
@@ -327,11 +365,3 @@ def gains_of(before: Refit, refit: Refit) -> Array:
     """Return the unknowns of the model before an effect was added, as the refit with it came to them."""
     k, whole = len(before.problem.free), len(refit.problem.free)
     return np.concatenate([refit.theta[:k], refit.theta[whole:]])
-
-
-def with_candidate(expansion: Expansion, candidate: CandidateEffect) -> tuple[Expansion, int]:
-    """Return the expansion with the candidate among its own, and where it stands there."""
-    for k, c in enumerate(expansion.candidates):
-        if c.label == candidate.label:
-            return expansion, k
-    return replace(expansion, candidates=(*expansion.candidates, candidate)), len(expansion.candidates)

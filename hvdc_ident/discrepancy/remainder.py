@@ -19,12 +19,15 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, fdtrc
 
 from hvdc_ident.data import Array
+from hvdc_ident.discrepancy.expansion import Expansion
 from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals
 from hvdc_ident.discrepancy.misfit import misfit_of
+from hvdc_ident.discrepancy.moves.outside import promising
 from hvdc_ident.discrepancy.nominal import Nominal, draws, of_held_out
 from hvdc_ident.discrepancy.options import REFUTED, SHORTLIST, TOLERANCE, SearchContext
 from hvdc_ident.discrepancy.prediction import root_mean_square_by_record
-from hvdc_ident.discrepancy.pushes import Inversion, Pushed, pushed
+from hvdc_ident.discrepancy.pushes import Inversion, Pushed, answered, hats, pushed
+from hvdc_ident.discrepancy.result import DescribedForm
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.executor import mapped
 from hvdc_ident.fit.noise import freedom_of
@@ -35,6 +38,8 @@ PROPORTIONAL = 1e-5
 """Of one less the cosine between two answers that are in proportion: runs give them to a few parts in a thousand."""
 NOISE_SHARE, RANGE_SHARE = 0.1, 0.01
 """Of an output's noise, and of its range: an error below the larger is of no interest where the study says nothing else."""
+TIME_KNOTS = 24
+"""Hats over time of which the course of a disturbance is made."""
 
 
 @dataclass(frozen=True)
@@ -46,8 +51,9 @@ class Remainder:
     a hundredth of the output's range, whichever is larger. noise_units: root mean square of the fitted residual, in standard
     deviations of the noise. held_out_p: the chance that noise is as loud as the held-out residual, with what is not known of it.
     record: the held-out experiment of which most is left, record_units: so much, in noise units. p: the chance that noise alone
-    makes a latent input as likely anywhere; at: where it is likeliest, empty where it was not looked for. log_evidence: of the
-    latent input there, in nats.
+    makes a latent input as likely anywhere, or, where that was not looked for, that it is as loud; at: where it is likeliest, empty where
+    it was not looked for. log_evidence: of the latent input there, in nats. of_terms: by term of the hypothesis, what is left as a share
+    of that and of what the term explains beside the others: of one term alone it is `share`.
     """
 
     share: float
@@ -60,11 +66,12 @@ class Remainder:
     record: str = ""
     record_units: float = 0.0
     beyond: FrozenMap[float] = field(default_factory=FrozenMap)
+    of_terms: tuple[float, ...] = ()
 
     @property
     def largest(self) -> float:
-        """The larger of the two shares."""
-        return max(self.share, self.held_out or 0.0)
+        """The largest of the shares."""
+        return max(self.share, self.held_out or 0.0, *self.of_terms)
 
     @property
     def below_tolerance(self) -> bool:
@@ -128,6 +135,13 @@ def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
     return float((1 + np.count_nonzero(squares / rows >= square)) / (1 + _least_draws(search)))
 
 
+def _loud_p(last: Refit) -> float:
+    """The chance that noise is as loud as the fitted residual, with what is not known of its level."""
+    freedom, square = freedom_of(last.noise, last.problem.outputs), last.chi2 / last.rows
+    rows = last.effective
+    return float(chdtrc(rows, square * rows) if np.isinf(freedom) else fdtrc(rows, freedom, square))
+
+
 def _least_draws(search: SearchContext) -> int:
     """Records of noise from which a chance as small as the significance can be measured."""
     return math.ceil(1.0 / search.options.significance)
@@ -152,7 +166,10 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     """The remainder with the test for a latent input; as it is where it is noise, for a model that is closed inside, or cannot be
     linearised. Once the budget is over no further place is looked at."""
     nominal = last.nominal()
-    if not is_white_box(last.model) or search.spent or misfit_of(last).is_noise:
+    if misfit_of(last).is_noise:
+        return found
+    found = replace(found, p=_loud_p(last))
+    if not is_white_box(last.model) or search.spent:
         return found
     try:
         signals = slot_signals(last)
@@ -209,3 +226,37 @@ def _log_evidence(latent: Inversion, noise: NDArray[np.float32]) -> Array:
     if not latent.strength.size:
         return np.zeros(1 + noise.shape[1])
     return latent.log_evidence(np.column_stack([latent.wanted, latent.against(noise)]))
+
+
+def disturbance_course(search: SearchContext, opened: Expansion) -> DescribedForm:
+    """Return what would have to be added at the place that explains most, over time and the same in every experiment.
+
+    Each of some hats over time is put on the place as the model runs; its answer at the outputs, whitened and freed of what the
+    parameters can make good, is a column of a regression of the residual.
+    """
+    paths, nominal = opened.answers(), opened.before.nominal()
+    experiments = nominal.problem.fitted_experiments
+    at = np.linspace(min(e.time[0] for e in experiments), max(e.time[-1] for e in experiments), TIME_KNOTS)
+    residual, best = nominal.projected(nominal.residual), None
+    for place in [p for p in promising(opened) if search.looks_at(p)]:
+        columns = nominal.projected(
+            np.vstack([answered(nominal, e, paths[e.name], place, hats(e.time, at)) for e in experiments])
+        )
+        columns = np.where(np.isfinite(columns), columns, 0.0)
+        norms = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+        values = np.linalg.lstsq(columns / norms, residual, rcond=1e-8)[0] / norms
+        worth = float(residual @ residual - np.sum((residual - columns @ values) ** 2)) - at.size * np.log(
+            residual.size
+        )
+        if worth > (0.0 if best is None else best[0]):
+            best = worth, place, values, columns
+    if best is None:
+        return DescribedForm("nothing", "", "No hidden input at any one place explains it.")
+    worth, place, values, columns = best
+    spread = np.sqrt(np.maximum(np.diag(np.linalg.pinv(columns.T @ columns, rcond=1e-10)), 0.0))
+    curve = {"over": "time", "at": at.tolist(), "value": values.tolist(), "std": spread.tolist()}
+    if len(experiments) > 1:
+        text = f"It acts at {place} at the same times in every experiment, whatever the state: a disturbance."
+        return DescribedForm("disturbance", place, text, delta_bic=worth, curve=curve)
+    text = f"It acts at {place}; with one experiment a disturbance cannot be distinguished from a form."
+    return DescribedForm("curve", place, text, delta_bic=worth, curve=curve)

@@ -18,6 +18,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import gap_text, interval_text, interval_words, value_by_place
 
 if TYPE_CHECKING:
+    from hvdc_ident.discrepancy.hypothesis import Refit
     from hvdc_ident.model import AnyModel
 
 
@@ -74,13 +75,14 @@ class FoundEffect:
 
 @dataclass(frozen=True)
 class Rival:
-    """A member of an ambiguity set. delta_bic: how far it is behind the best, 0 for the best itself.
+    """A member of an ambiguity set. delta_bic: how far its evidence is behind the best, 0 for the best itself.
 
     refitted: whether that comes from a refit. expression: of a formula outside the catalogue, with its coefficients' names.
     same_as: the member of the set that is the same equation at the same place; empty where none is. akin: the likeliest effect
     of the set that adds the same to the same signals in these records, within the tolerance; empty where none does. prior: its
-    probability given its effect, before any data: every place and source of an effect is as likely as another. values: of the
-    model's own free parameters with it, where it was refitted. off_given: how far these are from the given ones.
+    probability before any data: every effect is as likely as another, and so is each of its places and sources. values: of the
+    model's own free parameters with it, where it was refitted. off_given: how far these are from the given ones. refit: with it as the
+    last effect.
     """
 
     effect: str
@@ -95,7 +97,14 @@ class Rival:
     prior: float = field(default=1.0, metadata=NOT_STORED)
     values: FrozenMap[EffectSize] = field(default_factory=FrozenMap)
     off_given: float = field(default=0.0, metadata=NOT_STORED)
+    refit: Refit | None = field(default=None, metadata=NOT_STORED, compare=False, repr=False)
     stored_properties: ClassVar[tuple[str, ...]] = ("late",)
+
+    @property
+    def is_form(self) -> bool:
+        """Whether it is a form outside the catalogue."""
+        known = effects().get(self.effect) if self.is_effect else None
+        return known is not None and bool(known.outside or known.needs_expression)
 
     @property
     def name(self) -> str:
@@ -103,19 +112,20 @@ class Rival:
         return f"{self.effect} {self.expression}".rstrip()
 
     @property
-    def in_catalogue(self) -> bool:
+    def is_effect(self) -> bool:
         """Whether it is an effect, and no stated value or component."""
         return self.effect not in (VALUE, CARD)
 
     @property
     def kind(self) -> str:
         """What it is wherever it is: the effect; of a stated value or a component that itself."""
-        return self.effect if self.in_catalogue else f"{self.effect} {self.at[0]} {self.source}".rstrip()
+        return self.effect if self.is_effect else f"{self.effect} {self.at[0]} {self.source}".rstrip()
 
     @property
     def late(self) -> float | None:
         """By how long it delays a slow signal, s; None for what is no delay of any kind, or was not refitted."""
-        return effects()[self.effect].delay_with(self.parameters) if self.parameters and self.in_catalogue else None
+        known = effects()[self.effect] if self.parameters and self.is_effect and not self.is_form else None
+        return None if known is None else known.delay_with(self.parameters)
 
 
 @dataclass(frozen=True)
@@ -182,6 +192,24 @@ class StandIn:
     values: FrozenMap[float]
     text: str
     source: str = field(default="", metadata=stored_as("from", optional=True))
+
+
+@dataclass(frozen=True, eq=False)
+class DescribedForm(Coded):
+    """A form outside the catalogue, described. kind: term, filter, curve, disturbance or nothing.
+
+    at: the insertion point; expression and coefficients: of a term or a filter; curve: of the others, {over, at, value, std}.
+    refit: the model with the form; text: a sentence.
+    """
+
+    kind: str
+    at: str
+    text: str
+    expression: str = ""
+    coefficients: FrozenMap[Any] = field(default_factory=FrozenMap)
+    delta_bic: float | None = None
+    curve: Mapping[str, Any] | None = None
+    refit: Refit | None = field(default=None, metadata=NOT_STORED)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Refits of candidates compared: the scale of BIC, what each gains, and what speaks against naming its effect."""
+"""Refits compared: the priors of terms, the scale and prices of BIC, and what speaks against naming an effect."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from hvdc_ident.discrepancy.hypothesis import Refit
+from hvdc_ident.discrepancy.hypothesis import Refit, uncertainty_of
 from hvdc_ident.discrepancy.misfit import is_material_fall, misfit_of
 from hvdc_ident.discrepancy.options import TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.prediction import held_out, root_mean_square_by_record
@@ -19,6 +19,9 @@ from hvdc_ident.fit.noise import SURE
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.text import figures, percentage
 
+P_VALUE, P_EFFECT, P_CARD, P_CLOCKS = 0.45, 0.45, 0.1, 0.25
+"""Prior probability that a stated value is wrong, that an effect is missing, that a card is of another type, each in the stead of the
+others, and that the clocks are off, beside them."""
 TIED = 2.0
 """In BIC: evidence up to which one hypothesis is not to be preferred to another (Kass and Raftery, Bayes Factors, JASA 90, 1995)."""
 
@@ -47,6 +50,18 @@ def off_given(refit: Refit) -> float:
         largest = max(abs(given), abs(value))
         total += ((value - given) / largest) ** 2 if largest else 0.0
     return math.sqrt(total)
+
+
+def off_by_more_than_chance(refit: Refit) -> tuple[str, ...]:
+    """Return the model's own free parameters whose estimates are off the given values by more than chance; none on a bound."""
+    known = uncertainty_of(refit.problem, refit.problem.blocks(refit.theta))
+    found = []
+    for f, value in ((refit.problem.free[k], float(refit.theta[k])) for k in refit.gains):
+        std = known.std(f.name)
+        # A value on its bound is no estimate.
+        if not f.on_bound(value) and std is not None and abs(value - f.given) > SURE * std:
+            found.append(f.name)
+    return tuple(found)
 
 
 def apart(one: Mapping[str, EffectSize], other: Mapping[str, EffectSize]) -> tuple[str, ...]:
@@ -86,53 +101,6 @@ CLEAR_DEVIATIONS = 2.0
 
 
 @dataclass(frozen=True)
-class Pick:
-    """A candidate to refit: the probe it begins at, the size asked for in units of the probe's, and the fall of chi2 expected."""
-
-    candidate: int
-    probe: int
-    factor: float
-    fall: float
-
-
-@dataclass(frozen=True)
-class CandidateFit:
-    """A candidate that was refitted: its pick, the refit, and what it gains over the model before (BIC).
-
-    evidence: the same with what it brings on the held-out data, where that is known.
-    """
-
-    pick: Pick
-    refit: Refit
-    gain: float
-    evidence: float | None = None
-
-    @property
-    def total_gain(self) -> float:
-        """Evidence of all data for it, as far as that is known, in BIC."""
-        return self.gain if self.evidence is None else self.evidence
-
-
-def deficits(trials: Sequence[CandidateFit]) -> list[float]:
-    """By how much each is behind the best, in BIC: on all data together; or on the fitted ones, where that is less and the
-    held-out ones do not speak clearly against it, for a difference of a few units there is not known better than the noise.
-
-    On the fitted ones the best is the best of those that the held-out ones do not speak clearly against either.
-    """
-    best, gain = max((t.total_gain for t in trials), default=0.0), best_gain(trials)
-    return [
-        min(gain - t.gain, best - t.total_gain) if best - t.total_gain < CLEAR_CHI2 else best - t.total_gain
-        for t in trials
-    ]
-
-
-def best_gain(trials: Sequence[CandidateFit]) -> float:
-    """The largest gain of those that the held-out data do not speak clearly against."""
-    best = max((t.total_gain for t in trials), default=0.0)
-    return max((t.gain for t in trials if best - t.total_gain < CLEAR_CHI2), default=0.0)
-
-
-@dataclass(frozen=True)
 class Ruler:
     """Scale of BIC. effective: independent residuals; scale: how much larger than noise they are in the best model."""
 
@@ -162,6 +130,17 @@ class Ruler:
     def price(self) -> float:
         """Price of one more parameter, in BIC."""
         return float(np.log(self.effective))
+
+    def price_of(self, refit: Refit) -> float:
+        """Return the price of the unknowns of a refit, in BIC: `price` of each direction that its records determine, less of one that they
+        hardly do, and nothing of one that they do not.
+
+        Twice the logarithm of the share of a prior that is left after the records (Laplace), of a prior as wide as the bounds, or, where
+        that is narrower, as what one record says (Kass and Wasserman, JASA 90, 1995), which makes it BIC.
+        """
+        if not refit.information:
+            return self.price * len(refit.problem.names)
+        return float(np.sum(np.minimum(np.log1p(self.share * np.array(refit.information)), self.price)))
 
 
 def is_clear(refit: Refit, which: int) -> bool:
@@ -194,23 +173,24 @@ LEAST_STEP = 0.05
 
 def objections(
     before: Refit,
-    trial: CandidateFit,
+    refit: Refit,
+    gain: float,
     p: float,
     options: DiagnosisOptions,
     tolerance: Mapping[str, float],
     *,
     first: bool,
 ) -> str:
-    """Objection to naming a trial's effect, in words; empty where there is none.
+    """Objection to naming the last effect of a refit, in words; empty where there is none.
 
-    before: the model without it; p: the chance of its score under noise; tolerance: by output, what error is of interest.
+    before: the model without it; gain: in BIC, over that; p: the chance of its score under noise; tolerance: by output, what error is of
+    interest. first: whether no other term is there.
     """
-    refit = trial.refit
     last = len(refit.placed) - 1
     if p > options.significance:
         return f"its score is what noise gives somewhere (p = {p:.2g})"
-    if not trial.gain > options.named_bic:
-        return f"it gains {trial.gain:.3g} in BIC, {options.named_bic:g} would be needed"
+    if not gain > options.named_bic:
+        return f"it gains {gain:.3g} in BIC, {options.named_bic:g} would be needed"
     if at_edge(refit, last) or not is_clear(refit, last):
         return "its size cannot be distinguished from none"
     was, now = before.predicted, refit.predicted
@@ -251,13 +231,6 @@ def evidence_between(before: Refit, after: Refit, ruler: Ruler, more: int) -> fl
     return fitted + ruler.share * (was**2 - now**2) * after.unseen_rows
 
 
-def with_gain(trial: CandidateFit, before: Refit, ruler: Ruler) -> CandidateFit:
-    """Return the trial with what it gains in BIC over the model before, and what the held-out data add to that."""
-    more = len(trial.refit.problem.free) - len(before.problem.free)
-    gain = ruler.between(before, trial.refit)
-    return CandidateFit(trial.pick, trial.refit, gain, evidence_between(before, trial.refit, ruler, more))
-
-
 def same_answers(one: Refit, other: Refit, before: Refit) -> bool:
     """Return True for two hypotheses whose answers differ, in the fitted records, by less than the tolerance: that share of the
     square of what the effects do beside the model without them."""
@@ -284,33 +257,3 @@ def leaves_holdout_alone(before: Refit, after: Refit) -> bool:
     if not one or not two:
         return False
     return sum(float(np.sum((a.residual - b.residual) ** 2)) for a, b in zip(one, two, strict=True)) < CLEAR_CHI2
-
-
-PARAMETER_PRICE = 8.0
-"""Of a parameter, in units of chi2: the logarithm of a few thousand rows."""
-
-
-def best_each(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
-    """Of the trials of each candidate the best, in their order; of those that are as good the one with the values nearest to the
-    given ones."""
-    kept: dict[int, CandidateFit] = {}
-    for t in trials:
-        had = kept.get(t.pick.candidate)
-        if had is None or had.refit.failure:
-            kept[t.pick.candidate] = t
-        elif not t.refit.failure:
-            first, other = sorted((had, t), key=cost_of)
-            tied = cost_of(other) - cost_of(first) <= TIED and off_given(other.refit) < off_given(first.refit)
-            kept[t.pick.candidate] = other if tied else first
-    return list(kept.values())
-
-
-def by_cost(trials: Sequence[CandidateFit]) -> list[CandidateFit]:
-    """Those that came to a result, the best first."""
-    return sorted((t for t in trials if not t.refit.failure), key=cost_of)
-
-
-def cost_of(trial: CandidateFit) -> float:
-    """Chi2 of a refit on all data plus the price of its parameters, before the scale of BIC is known."""
-    refit, held = trial.refit, trial.refit.predicted
-    return refit.chi2 + PARAMETER_PRICE * refit.count + (held**2 * refit.unseen_rows if held is not None else 0.0)

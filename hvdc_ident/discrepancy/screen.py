@@ -204,6 +204,11 @@ class Sketch:
 
     rows: int
 
+    @property
+    def size(self) -> int:
+        """Number m of sums."""
+        return min(self.rows, SKETCHED)
+
     def __call__(self, column: Array) -> Array:
         """Return (m,) of a column (N,)."""
         if self.rows <= SKETCHED:

@@ -2,24 +2,44 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import permutations
+from typing import Any
 
 import numpy as np
+import sympy as sp
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.hypothesis import Placed, Refit, uncertainty_of
-from hvdc_ident.discrepancy.options import LISTED
+from hvdc_ident.discrepancy.hypothesis import Placed, Refit
+from hvdc_ident.discrepancy.movable import equations
+from hvdc_ident.discrepancy.options import LISTED, DiagnosisOptions
 from hvdc_ident.discrepancy.prediction import held_out
-from hvdc_ident.discrepancy.result import EffectSize, Finding, FoundEffect, Gap, Place, Rival, StandIn, Table
+from hvdc_ident.discrepancy.result import (
+    CARD,
+    VALUE,
+    EffectSize,
+    Finding,
+    FoundEffect,
+    Gap,
+    Place,
+    Rival,
+    StandIn,
+    Table,
+)
+from hvdc_ident.discrepancy.score import apart, implied, off_by_more_than_chance
+from hvdc_ident.discrepancy.search import GIVEN, SearchOutcome
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.errors import SimulationError
+from hvdc_ident.expression import parse, symbol, to_text
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.noise import SURE
 from hvdc_ident.immutable import FrozenMap
-from hvdc_ident.text import figures, gap_text, listed, quantity
+from hvdc_ident.model import AnyModel
+from hvdc_ident.text import figures, figures_of, gap_text, listed, quantity
 
 
 def found_of(refit: Refit, placed: Placed, chosen_from: int) -> FoundEffect:
@@ -157,7 +177,7 @@ def off_given(last: Refit, given: Refit, adequate: bool, matters: bool, *, known
         return None
     if before <= last.chi2 + SURE * np.sqrt(2.0 * last.rows):
         return None
-    found = moved_parameters(last, [f.name for f in last.problem.free])
+    found = moved_parameters(last)
     if found is None:
         return None
     noise = max(last.chi2, last.rows) if adequate else last.rows
@@ -179,6 +199,19 @@ def off_given(last: Refit, given: Refit, adequate: bool, matters: bool, *, known
     return replace(found, text=text, share=share)
 
 
+def stand_ins(outcome: SearchOutcome, options: DiagnosisOptions) -> tuple[StandIn, ...]:
+    """Return the effects that explain the records as well as other values of the parameters, with these as given, the best first."""
+    found = []
+    for h, score in outcome.pool:
+        given = [n for t in h.terms if t.kind == GIVEN for n in t.at]
+        behind = score - h.prior_cost
+        if given and behind <= options.set_bic:
+            c, sizes = h.refit.placed[-1].candidate, FrozenMap(h.refit.sizes(h.refit.placed[-1]))
+            values = FrozenMap({f.name: f.given for f in outcome.refit.problem.free if f.name in given})
+            found.append(StandIn(c.effect, c.at, max(behind, 0.0), sizes, values, sentence(c, sizes), c.source))
+    return tuple(sorted(found, key=lambda s: round(s.delta_bic, 1)))  # as good is as good: then as it was found
+
+
 def beside_stand_ins(moved: Finding, others: Sequence[StandIn]) -> Finding:
     """The finding on parameters that are off, beside the effects that explain the records as well with these as given."""
     if not others:
@@ -189,20 +222,165 @@ def beside_stand_ins(moved: Finding, others: Sequence[StandIn]) -> Finding:
     return replace(moved, text=f"{text} The records do not distinguish this from: {others_text}{more}.")
 
 
-def moved_parameters(last: Refit, names: Collection[str]) -> Finding | None:
-    """The parameters, of those named, whose estimates are clearly off the given values, as one finding; None where none is."""
-    problem = last.problem
-    known = uncertainty_of(problem, problem.blocks(last.theta))
-    sizes, texts = {}, []
-    for k in last.gains:
-        free, value, std = problem.free[k], float(last.theta[k]), known.std(problem.free[k].name)
-        # A value on its bound is no estimate.
-        if free.name not in names or free.on_bound(value) or std is None or abs(value - free.given) <= SURE * std:
-            continue
-        unit = last.model.parameters[free.name].unit
-        sizes[free.name] = EffectSize(value, (value - 1.96 * std, value + 1.96 * std), unit)
-        texts.append(f"{free.name} is {quantity(value, unit)}, not {quantity(free.given, unit)}")
+def moved_parameters(last: Refit) -> Finding | None:
+    """The parameters whose estimates are clearly off the given values, as one finding; None where none is."""
+    known = implied(last)
+    sizes = {n: known[n] for n in off_by_more_than_chance(last)}
     if not sizes:
         return None
+    given = {f.name: f.given for f in last.problem.free}
+    texts = [f"{n} is {quantity(v.value, v.unit)}, not {quantity(given[n], v.unit)}" for n, v in sizes.items()]
     places = tuple(Place((n,), 1.0) for n in sizes)
     return Finding("parameter", ("parameter",), 1.0, FrozenMap(sizes), places, f"{listed(texts)}.")
+
+
+def in_words(rival: Rival) -> str:
+    """Return what a stated value that is another, or a component of another type, is called beside effects."""
+    (name,) = rival.at
+    return f"another value of {name}" if rival.effect == VALUE else f"{rival.source} as {name}"
+
+
+def card_sentence(component: str, card: str, there: str | None, sizes: Mapping[str, EffectSize]) -> str:
+    """The sentence that a component is of another type, or missing. there: the card that the model has."""
+    each = listed([f"{n} {quantity(v.value, v.unit)}" for n, v in sizes.items()])
+    text = (
+        f"{component} answers like {card}, not like {there.upper()}" if there else f"{card} is missing as {component}"
+    )
+    return f"{text} ({each})." if each else f"{text}."
+
+
+def value_sentence(name: str, value: float, std: float | None, stated: float, unit: str, factor: str) -> str:
+    """The sentence that a stated value is another.
+
+    std: its standard deviation, None where it is not known; factor: what the ratio is (`base_factor`).
+    """
+    around = "" if std is None else f" ± {quantity(1.96 * std, unit, 2)}"
+    return f"{name} is {quantity(value, unit)}{around}, not {quantity(stated, unit)}{factor}."
+
+
+OF_UNITS = FrozenMap(
+    {
+        "2 pi": (2.0 * math.pi, ("rad/s", "Hz", "1/s")),
+        "sqrt 3": (math.sqrt(3.0), ("V", "kV", "A", "kA")),
+        "3": (3.0, ("V", "kV", "A", "kA", "Ohm", "ohm")),
+        "50 to 60 Hz": (1.2, ("Hz", "rad/s", "H", "mH", "F", "uF")),
+    }
+)
+"""Factors by which a value is off that was given in another unit or for another frequency, with the units of such values."""
+SURE_RATIO = 0.01
+"""Relative error of a ratio, at two deviations, from which it may be any of several factors: these are a fifth apart and more."""
+
+
+def base_factor(model: AnyModel, unit: str, ratio: float, error: float) -> str:
+    """Return in words the factor of a unit or base that a ratio is; empty where it is none, or known to no better than `SURE_RATIO`.
+
+    A value per unit may be on another of the model's own bases. unit: of the value; error: of the ratio, relative, two deviations.
+    """
+    if not 0.0 < error < SURE_RATIO:
+        return ""
+    factors = {n: f for n, (f, units) in OF_UNITS.items() if unit in units}
+    if unit in ("", "pu"):
+        bases = {n: p.value for n, p in model.parameters.items() if p.unit == "MVA" and p.value > 0.0}
+        pairs = ((n, m) for n, m in permutations(bases, 2) if bases[n] > 1.2 * bases[m])
+        factors |= {f"the bases {n} and {m}": bases[n] / bases[m] for n, m in pairs}
+    near = [n for n, f in factors.items() if min(abs(ratio / f - 1.0), abs(ratio * f - 1.0)) <= error]
+    return f" (the ratio is that of {near[0]})" if near else ""
+
+
+def labelled(refit: Refit) -> str:
+    """Return the form that a refit ends with, and where."""
+    c = refit.placed[-1].candidate
+    return f"{expression(refit, filled=True) or c.effect} at {listed(c.at)}"
+
+
+def expression(refit: Refit, *, filled: bool = False) -> str:
+    """Return what the form that a refit ends with adds, in the model's names, or its transfer function; empty for a curve.
+
+    filled: whether its coefficients stand there as numbers.
+    """
+    placed = refit.placed[-1]
+    c, sizes = placed.candidate, refit.sizes(placed)
+    entry = effects()[c.effect]
+    if entry.outside == "curve":
+        return ""
+    if entry.words is not None:
+        return entry.words(sizes)["transfer"]
+    alone = equations(c.effect, entry.present(sizes))
+    names = {"u": c.at[0].removeprefix("outputs."), "source": c.source.removeprefix("outputs.")}
+    known = {symbol(n): symbol(name) for n, name in names.items() if name}
+    text = to_text((alone.outputs["y"].value - symbol("u")).expand().xreplace(known))
+    return with_values(text, sizes) if filled else text
+
+
+def with_values(text: str, sizes: Mapping[str, float]) -> str:
+    """Return a formula with numbers for its coefficients, to four digits."""
+    return to_text(parse(text).xreplace({symbol(n): sp.Float(f"{v:.4g}") for n, v in sizes.items()})) if text else ""
+
+
+def interval_sentence(parameters: Mapping[str, EffectSize]) -> str:
+    """The intervals of the sizes, each with its name where there are several."""
+    known = {n: s for n, s in parameters.items() if s.ci95 is not None and None not in s.ci95}
+    each = []
+    for n, s in known.items():
+        low, high = (quantity(v, s.unit, figures_of(s.ci95, 4)) for v in s.ci95 or () if v is not None)
+        each.append(f"{n} {low} to {high}" if len(parameters) > 1 else f"{low} to {high}")
+    return f" (95 %: {', '.join(each)})" if each else ""
+
+
+def elsewhere(best: Rival, places: Sequence[Place]) -> str:
+    """The other places and sources, as the sentence goes on; with what each implies where that is another value of a parameter."""
+    own = places[0]
+    names = list(dict.fromkeys(n for p in places[1:] for n in apart(own.values, p.values)))
+    others = [p for p in places[1:] if apart(own.values, p.values)]
+    same = [p for p in places if p not in others]
+    places_too = list(dict.fromkeys(listed(p.at) for p in same if p.at != best.at))
+    sources_too = list(dict.fromkeys(_brought(p.source, p.at) for p in same if p.source and p.source != best.source))
+    from_others = [f"this place from {_some(places_too)}"] if places_too else []
+    from_others += (
+        [f"{_brought(best.source, best.at)} from {_some(sources_too)}"] if best.source and sources_too else []
+    )
+    from_others += [f"this place from {_with_values(p, names)}" for p in others[:LISTED]]
+    from_others += [f"from {len(others) - LISTED} more with other values"] if len(others) > LISTED else []
+    then = f", where {_values(own.values, names)}" if others else ""
+    return f"{then}; the records do not distinguish {', nor '.join(from_others)}" if from_others else ""
+
+
+def _with_values(place: Place, names: Sequence[str]) -> str:
+    """A place with the sizes of the effect there and the values that it implies."""
+    brought = f" with {_brought(place.source, place.at)}" if place.source else ""
+    return f"{listed(place.at)}{brought}, where {_values({**place.parameters, **place.values}, [*place.parameters, *names])}"
+
+
+def _values(sizes: Mapping[str, EffectSize], names: Sequence[str]) -> str:
+    return listed(f"{n} is {quantity(sizes[n].value, sizes[n].unit)}" for n in names if n in sizes)
+
+
+def _brought(source: str, at: Sequence[str]) -> str:
+    """The signals that an effect brings in at its places, in words."""
+    return listed(tuple(dict.fromkeys(split_sources(source, at))))
+
+
+def _some(names: Sequence[str]) -> str:
+    """Up to four names, and how many more there are."""
+    return listed(names[:4]) if len(names) <= 4 else f"{', '.join(names[:4])} or one of {len(names) - 4} more"
+
+
+def separating(groups: Sequence[Sequence[Rival]], recorded: Collection[str]) -> Mapping[str, Any]:
+    """For each set with more than one member what would distinguish them, in words; empty where there is none."""
+    texts = []
+    for group in groups:
+        values = [r.at[0] for r in group if r.effect == VALUE]
+        if values and len(group) > 1:
+            texts.append(f"a value of {listed(values)} from another source, or a record in which they act apart")
+        cards = [r.source for r in group if r.effect == CARD]
+        if cards and len(group) > 1:
+            texts.append(f"the type of the component ({listed(cards)}) from its vendor, or a larger step")
+        group = [r for r in group if r.is_effect]
+        if len(group) > 1:
+            first = group[0]
+            # No experiment distinguishes one equation from itself under another name.
+            others = [(r.effect, r.at) for r in group[1:] if not r.same_as]
+            how = advice(first.effect, others, first.at, recorded)
+            if how:
+                texts.append(how)
+    return {"text": ". ".join(t[:1].upper() + t[1:] for t in texts)} if texts else {}

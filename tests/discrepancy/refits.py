@@ -9,12 +9,12 @@ import numpy as np
 
 from hvdc_ident import Experiment, Model, simulate
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.expansion import Expansion
+from hvdc_ident.discrepancy.expansion import Expansion, by_cost
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, judged, refit_job
+from hvdc_ident.discrepancy.moves import MOVES
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.score import Ruler, by_cost, with_gain
-from hvdc_ident.discrepancy.search import MOVES, Search
+from hvdc_ident.discrepancy.search import Search, SearchOutcome
 from hvdc_ident.effects import Probe
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
@@ -51,14 +51,17 @@ def beside(
     return refit_job(before, candidate, 0, 1.0, before.theta)
 
 
+def search_from(context: SearchContext, first: Refit) -> SearchOutcome:
+    """Where a search with every move ends."""
+    return Search(context, first, MOVES).run()
+
+
 def expanded(context: SearchContext, first: Refit) -> Expansion:
-    """What every move that looks for effects of the catalogue finds beside a model: its trials, the best first and as its winner."""
-    search = Search(context, first)
+    """What every move that looks for effects of the catalogue finds beside a model: its trials, the best first, then those that failed."""
+    search = Search(context, first, MOVES)
     for move in MOVES:
-        if move.name not in ("values", "clocks", "cards", "outside"):
+        if move.name not in ("values", "clocks", "cards", "forms in the stead", "forms", "as given"):
             search.add(move.make(search, search.root))
     found = search.expansions[search.root.key]
-    ruler = Ruler.of(min((t.refit for t in by_cost(found.trials)), key=lambda r: r.chi2, default=first))
-    sound = sorted((with_gain(t, first, ruler) for t in by_cost(found.trials)), key=lambda t: -t.total_gain)
-    failed = tuple(t for t in found.trials if t.refit.failure)
-    return replace(found, trials=tuple(sound), failed=failed, winner=next(iter(sound), None), ruler=ruler)
+    failed = [t for t in found.trials if t.refit.failure]
+    return replace(found, trials=(*by_cost(found.trials), *failed))

@@ -12,9 +12,10 @@ import pytest
 
 from hvdc_ident import Experiment
 from hvdc_ident.budget import Budget
-from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, effect_moves, hypothesis
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose, hypothesis
 from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob
+from hvdc_ident.discrepancy.moves import effects as effect_moves
 from tests.discrepancy.cases import FREE, TRUE, experiments, model
 
 NAMES = ["lag", "gain", "limit", "deadband"]

@@ -8,14 +8,15 @@ from dataclasses import replace
 import pytest
 
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose, hypothesis
-from hvdc_ident.discrepancy.clocks import clocks, on_their_clocks
 from hvdc_ident.discrepancy.hypothesis import Refit
+from hvdc_ident.discrepancy.moves import MOVES
+from hvdc_ident.discrepancy.moves.clocks import clocks, on_their_clocks
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.search import CLOCKS, MOVES, Search, search_from
+from hvdc_ident.discrepancy.search import CLOCKS, Search
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from tests.discrepancy.cases import FREE, TRUE, experiments, model
-from tests.discrepancy.refits import plain
+from tests.discrepancy.refits import plain, search_from
 
 LATE = {"fit-1": 1.5e-3, "fit-2": -1.2e-3, "held": 1e-3}
 """Of rows every 4 ms."""
@@ -81,7 +82,7 @@ def test_records_whose_misfit_an_effect_explains_are_on_their_clocks() -> None:
 
 def test_each_clock_that_is_off_has_its_price() -> None:
     first = plain(experiments(late=LATE))
-    search = Search(search_of(first), first)
+    search = Search(search_of(first), first, MOVES)
     (timed,) = [h for m in MOVES if m.name == CLOCKS for h in m.make(search, search.root)]
     ruler, fewer = search.ruler, replace(timed, terms=(replace(timed.terms[0], at=("fit-1",)),))
     assert timed.terms[0].at == tuple(LATE)

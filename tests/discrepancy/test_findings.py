@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy import findings as told_as
-from hvdc_ident.discrepancy.classes import classes
+from hvdc_ident.discrepancy import findings as description
 from hvdc_ident.discrepancy.conclusion import Conclusion, headline, leaves_more_than_noise
 from hvdc_ident.discrepancy.hypothesis import refitted
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
 from hvdc_ident.discrepancy.result import EffectSize, FoundEffect, Place, Rival
-from hvdc_ident.discrepancy.sentences import at_given, off_given, sentence
+from hvdc_ident.discrepancy.rivals import classes
+from hvdc_ident.discrepancy.sentences import at_given, base_factor, elsewhere, off_given, sentence, separating
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.parameters import Parameter
 from tests.discrepancy.cases import FREE, SIGMA, TRUE, experiments, model
@@ -153,11 +153,9 @@ def test_the_interval_of_a_finding_leaves_out_places_where_the_size_is_another(m
     spans = {"wm": (-0.035, -0.025), "err": (0.025, 0.035), "torque": (-0.036, -0.026)}
     sizes = {"wm": -0.030, "err": 0.030, "torque": -0.031}
     members = [Rival("coupling", (at,), 0.1 * k, FrozenMap({"k": v})) for k, (at, v) in enumerate(sizes.items())]
-    monkeypatch.setattr(told_as, "_key_of", lambda rival: (rival.effect, rival.at, rival.source))
-    monkeypatch.setattr(told_as, "_span", lambda rival, _name: spans[rival.at[0]])
-    found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
+    monkeypatch.setattr(description, "_span", lambda rival, _name: spans[rival.at[0]])
     (one,) = classes(members)
-    assert told_as.finding(found, one).parameters["k"].ci95 == (-0.036, -0.025)
+    assert description.finding(one).parameters["k"].ci95 == (-0.036, -0.025)
 
 
 def test_what_was_put_in_is_told_where_it_is_as_likely(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -165,25 +163,21 @@ def test_what_was_put_in_is_told_where_it_is_as_likely(monkeypatch: pytest.Monke
     members = [
         Rival("lag", (at,), behind, FrozenMap({"T": 0.03})) for at, behind in (("wm", 0.0), ("err", 0.5), ("w", 9.0))
     ]
-    monkeypatch.setattr(told_as, "_key_of", lambda rival: (rival.effect, rival.at, rival.source))
-    monkeypatch.setattr(told_as, "_span", lambda _refit, _name: (0.029, 0.031))
-    found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
+    monkeypatch.setattr(description, "_span", lambda _rival, _name: (0.029, 0.031))
     (one,) = classes(members)
     size = FrozenMap({"T": EffectSize(0.04, (0.039, 0.041), "s")})
-    told = told_as.finding(found, one, FoundEffect("lag", ("err",), size, "err is late", 3))
+    told = description.finding(one, FoundEffect("lag", ("err",), size, "err is late", 3))
     assert told.text.startswith("err is late (95 %: 39 ms to 41 ms)") and told.parameters["T"].value == 0.04
-    told = told_as.finding(found, one, FoundEffect("lag", ("w",), size, "w is late", 3))
+    told = description.finding(one, FoundEffect("lag", ("w",), size, "w is late", 3))
     assert told.parameters["T"].value == 0.03 and "w is late" not in told.text
 
 
 def test_an_effect_that_may_be_anywhere_is_told_with_its_places(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of 40 places that are as likely none is likely, and 38 hold 95 %."""
     members = [Rival("delay", (f"s{k}",), 0.0, FrozenMap({"T": 0.02})) for k in range(40)]
-    monkeypatch.setattr(told_as, "_key_of", lambda rival: (rival.effect, rival.at, rival.source))
-    monkeypatch.setattr(told_as, "_span", lambda _refit, _name: (0.019, 0.021))
-    found: Any = SimpleNamespace(trials=[SimpleNamespace(refit=r) for r in members])
+    monkeypatch.setattr(description, "_span", lambda _rival, _name: (0.019, 0.021))
     (one,) = classes(members)
-    told = told_as.finding(found, one)
+    told = description.finding(one)
     assert len(told.places) == 38 and told.equivalent_delay is not None
     assert told.equivalent_delay.ci95 == pytest.approx((0.019, 0.021))
     assert "or one of 33 more" in told.text
@@ -194,8 +188,10 @@ def test_the_names_of_a_finding_are_those_of_its_likely_effects_its_own_first() 
     deadband = replace(Rival("deadband", ("wm",), 9.0, FrozenMap({"width": 0.1})), akin="gain")
     limit = Rival("limit", ("wm",), 1.0, FrozenMap(), refitted=False, same_as="gain")
     (one,) = classes([Rival("offset", ("wm",), 0.0, FrozenMap({"c": 0.1})), gain, limit, deadband])
-    assert told_as._names(one, "gain") == ("gain", "offset", "limit")
-    assert told_as._others(one, one.members[0][0]) == ", or another effect that does the same in these records (gain)"
+    assert description._names(one, "gain") == ("gain", "offset", "limit")
+    assert (
+        description._others(one, one.members[0][0]) == ", or another effect that does the same in these records (gain)"
+    )
 
 
 def test_many_that_do_the_same_do_not_crowd_out_another() -> None:
@@ -204,7 +200,7 @@ def test_many_that_do_the_same_do_not_crowd_out_another() -> None:
     mean = Rival("window-mean", ("s0",), 1.0, FrozenMap({"T": 0.04}), prior=0.01)
     delay = Rival("delay", ("s0",), 9.0, FrozenMap({"T": 0.02}), prior=0.1)
     (one,) = classes([*lags, mean, delay])
-    assert told_as._names(one, "lag") == ("lag", "window-mean")
+    assert description._names(one, "lag") == ("lag", "window-mean")
 
 
 @pytest.mark.parametrize(
@@ -232,19 +228,19 @@ def test_no_effect_is_missing_only_where_nothing_else_is_left(
 def test_a_size_that_later_effects_moved_is_told_with_its_interval_there() -> None:
     """The interval of the last model, wider by as much as the places make that of the effect's own round."""
     last, own = EffectSize(0.018, (0.017, 0.019), "s"), EffectSize(0.020, (0.0195, 0.0205), "s")
-    over = told_as._over_places(last, own, [(0.0195, 0.0205), (0.0190, 0.0210), (0.030, 0.031)])
+    over = description._over_places(last, own, [(0.0195, 0.0205), (0.0190, 0.0210), (0.030, 0.031)])
     assert over.value == 0.018 and over.ci95 == pytest.approx((0.0165, 0.0195))
-    assert told_as._over_places(last, own, []) is last
+    assert description._over_places(last, own, []) is last
 
 
 def test_the_interval_of_a_delay_is_that_of_the_one_size_that_makes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """A mean over T is T/2 late. Of two sizes that go together, as in a lead-lag, the intervals tell nothing of the difference."""
-    monkeypatch.setattr(told_as, "_span", lambda _refit, _name: (0.018, 0.022))
+    monkeypatch.setattr(description, "_span", lambda _rival, _name: (0.018, 0.022))
     mean = Rival("window-mean", ("wm",), 0.0, FrozenMap({"T": 0.02}))
-    assert told_as._delay_span(mean, None) == pytest.approx((0.009, 0.011))
+    assert description._delay_span(mean) == pytest.approx((0.009, 0.011))
     lead = Rival("lead-lag", ("wm",), 0.0, FrozenMap({"T1": 0.010, "T2": 0.013}))
-    assert told_as._delay_span(lead, None) is None
-    assert told_as._delay_span(Rival("gain", ("wm",), 0.0, FrozenMap({"k": 1.1})), None) is None
+    assert description._delay_span(lead) is None
+    assert description._delay_span(Rival("gain", ("wm",), 0.0, FrozenMap({"k": 1.1}))) is None
 
 
 @pytest.mark.parametrize(
@@ -276,19 +272,19 @@ def test_a_finding_tells_places_and_sources_apart() -> None:
         Place(("Uref1", "Uref2"), 0.3, "iq1, iq2"),
     ]
     assert sentence(best, best.parameters) == "Each of eq1 and eq2 takes 0.1 of the change of its own of Q1f and Q2f"
-    assert told_as._apart(best, places[:1]) == ""
+    assert elsewhere(best, places[:1]) == ""
     apart = "; the records do not distinguish this place from Uref1 and Uref2, nor Q1f and Q2f from iq1 and iq2"
-    assert told_as._apart(best, places) == apart
+    assert elsewhere(best, places) == apart
 
 
 def test_what_to_record_next_asks_for_signals_that_are_not_there_and_not_for_other_names_of_one_equation() -> None:
     lag = [Rival("lag", (at,), 0.0, FrozenMap({"T": 0.03})) for at in ("wm", "w")]
-    told = told_as.separating([lag], {"wm"})["text"]
+    told = separating([lag], {"wm"})["text"]
     assert told.startswith("Record w as well") and "wm" not in told
-    assert told_as.separating([lag], {"wm", "w"})["text"].startswith("Step an input that acts on some of wm and w")
+    assert separating([lag], {"wm", "w"})["text"].startswith("Step an input that acts on some of wm and w")
     alike = [Rival("coupling", ("e",), 0.0, FrozenMap({"k": 1.0}), source="w")]
     alike.append(Rival("droop", ("e",), 0.0, FrozenMap({"k": -1.0}), source="w", refitted=False, same_as="coupling"))
-    assert told_as.separating([alike], set()) == {}
+    assert separating([alike], set()) == {}
 
 
 def test_an_effect_with_many_places_is_no_likelier_for_that() -> None:
@@ -325,5 +321,5 @@ def test_a_ratio_that_is_of_a_unit_or_base_is_told_where_the_unit_lets_it(
 ) -> None:
     bases = {"Sn": Parameter(250.0, unit="MVA"), "Sb": Parameter(100.0, unit="MVA")}
     plant = replace(model(), parameters=model().parameters | bases)
-    text = told_as.base_factor(plant, unit, ratio, error)
+    text = base_factor(plant, unit, ratio, error)
     assert text == (f" (the ratio is that of {said})" if said else "")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
@@ -15,12 +13,12 @@ from scipy.integrate import solve_ivp
 from hvdc_ident import Experiment, InputSignal, Model, Trajectory, simulate
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.classes import formula_rivals
-from hvdc_ident.discrepancy.expansion import Expansion
+from hvdc_ident.discrepancy.candidates import source_signals
 from hvdc_ident.discrepancy.hypothesis import refitted
+from hvdc_ident.discrepancy.moves.outside import refitted_forms, standing
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.outside import alternatives, best_form, expression, refitted_forms, with_values
-from hvdc_ident.discrepancy.score import CandidateFit, Pick, Ruler, same_answers
+from hvdc_ident.discrepancy.score import P_EFFECT, same_answers
+from hvdc_ident.discrepancy.sentences import expression, with_values
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
@@ -182,11 +180,11 @@ def test_a_form_stands_only_where_it_beats_what_the_catalogue_has() -> None:
     first = plain(metered("w", drifting))
     search = SearchContext(("lag", "gain"), None, FrozenMap(), DiagnosisOptions(bootstraps=100, fallback=False), seed=0)
     found = expanded(search, first)
-    forms = refitted_forms(search, found)
-    alone = best_form(search, found, forms)
-    assert alone is not None and expression(alone.refit) == "g*time*w"
-    assert best_form(search, found, forms, best=found.trials[0].refit) is not None
-    assert best_form(search, found, forms, best=alone.refit) is None
+    forms = [t.refit for t in refitted_forms(search, found)]
+    alone = standing(search, first, forms)
+    assert expression(alone[0]) == "g*time*w"
+    assert standing(search, first, forms, best=found.trials[0].refit)
+    assert not standing(search, first, forms, best=alone[0])
 
 
 def polynomials(told: str) -> list[list[float]]:
@@ -303,27 +301,16 @@ def shown(changed: Model, still: str) -> tuple[Experiment, ...]:
     return answered(changed, moved, seed=3)
 
 
-def test_formulas_near_the_winner_are_rivals_with_their_priors() -> None:
-    before = plain(shown(model(), still="ref"))
-    refit = refitted(beside(before, "product", "outputs.w", {"g": 0.0, "k": 0.01}, {"k": (-1.0, 1.0)}, source="load"))
-    coupling = beside(before, "coupling", "outputs.w", {"k": 0.01}, {"k": (-1.0, 1.0)}, source="load")
-    winner = CandidateFit(Pick(0, 0, 1.0, 1.0), refitted(coupling), 100.0)
-    found = cast(Expansion, SimpleNamespace(winner=winner, ruler=Ruler(1800, 1800.0, 1.0)))
-    near, far, ahead = (CandidateFit(winner.pick, refit, gain) for gain in (97.0, 92.0, 107.0))
-    behind, rivals = formula_rivals(found, [(far, 0.5), (near, 0.25)], DiagnosisOptions())
-    assert behind == 0.0 and [(r.effect, r.delta_bic, r.prior) for r in rivals] == [("term", 3.0, 0.25)]
-    assert rivals[0].expression == "k*load*w"
-    behind, rivals = formula_rivals(found, [(ahead, 0.5)], DiagnosisOptions())
-    assert np.isinf(behind) and not rivals
-
-
 def test_a_form_outside_the_catalogue_is_as_likely_as_an_effect() -> None:
-    """A bend at one of two places has half of what a saturation has at both."""
+    """A bend at one of two places has half of what a saturation has at both, and one that brings a signal in shares that with them all."""
     there = apply_effects(model(), [{"effect": "saturation", "at": ["drag"], "parameters": {"level": 0.25}}])
     search = SearchContext(("saturation",), ("drag", "torque"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     found = expanded(search, plain(answered(there, experiments(), seed=0)))
-    priors = {t.refit.placed[-1].candidate.effect: prior for t, prior in alternatives(search, found)}
-    assert priors["polynomial"] == 0.5 and all(prior <= 0.5 for prior in priors.values())
+    assert [c.at for c in found.candidates] == [("torque",), ("drag",)]
+    slots, signals = len(found.signals), len(source_signals(model(), found.signals))
+    assert found.prior("saturation") == P_EFFECT / 2
+    assert found.prior("polynomial") == pytest.approx(P_EFFECT / slots)
+    assert found.prior("product") == pytest.approx(P_EFFECT / slots / signals)
 
 
 def test_what_bends_a_signal_that_never_moves_is_told_with_the_gain_there() -> None:

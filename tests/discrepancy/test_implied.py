@@ -15,7 +15,7 @@ from scipy.signal import lsim
 from hvdc_ident import Experiment, InputSignal, Trajectory
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Diagnosis, diagnose
-from hvdc_ident.discrepancy.classes import CERTAIN
+from hvdc_ident.discrepancy.options import CERTAIN
 from hvdc_ident.discrepancy.result import EffectSize
 from hvdc_ident.discrepancy.score import apart, nearest
 from hvdc_ident.fit import FitParameter

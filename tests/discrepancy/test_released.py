@@ -8,10 +8,11 @@ import pytest
 from hvdc_ident import Experiment
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.hypothesis import Refit, judged, refitted
+from hvdc_ident.discrepancy.moves import MOVES
 from hvdc_ident.discrepancy.nominal import nominal
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.result import VALUE, Finding
-from hvdc_ident.discrepancy.search import Hypothesis, Search, Term, search_from
+from hvdc_ident.discrepancy.search import Hypothesis, Search, Term
 from hvdc_ident.discrepancy.stated import FARTHEST, stated, with_free, with_held
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.identifiability import IdentifiabilityReport
@@ -19,7 +20,7 @@ from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import parse_card
 from hvdc_ident.simulate import ModelSimulator
 from tests.discrepancy.cases import CARD, FREE, TRUE, experiments, model
-from tests.discrepancy.refits import beside
+from tests.discrepancy.refits import beside, search_from
 
 FRICTION = 0.45
 CANDIDATES = (*FREE, FitParameter("b", 0.3, 0.01, 2.0))
@@ -157,7 +158,7 @@ def test_a_parameter_that_was_free_before_its_effect_was_found_is_held_beside_it
     wider = with_free(first, context.held[0])
     both = refitted(beside(wider, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
     assert both.values["b"] == pytest.approx(0.3, rel=0.05)
-    search, terms = Search(context, first), (Term(VALUE, ("b",), prior=0.45), Term("lag", ("wm",), prior=0.45))
+    search, terms = Search(context, first, MOVES), (Term(VALUE, ("b",), prior=0.45), Term("lag", ("wm",), prior=0.45))
     search.add([Hypothesis(both, wider, terms)])
     outcome = search.run()
     assert [t.label for t in outcome.best.terms] == ["lag at wm"]

@@ -10,36 +10,27 @@ import pytest
 
 from hvdc_ident import Experiment, InputSignal, simulate
 from hvdc_ident.discrepancy import DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy.classes import _akin, _equal, classes
 from hvdc_ident.discrepancy.conclusion import Conclusion, _weighed
-from hvdc_ident.discrepancy.effect_moves import opened
-from hvdc_ident.discrepancy.expansion import Expansion
 from hvdc_ident.discrepancy.hypothesis import Refit, refitted
 from hvdc_ident.discrepancy.misfit import misfit_of
+from hvdc_ident.discrepancy.moves import MOVES
+from hvdc_ident.discrepancy.moves.effects import opened
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.remainder import Remainder
 from hvdc_ident.discrepancy.result import Rival
-from hvdc_ident.discrepancy.score import CandidateFit, Pick, deficits, objections
-from hvdc_ident.discrepancy.search import Hypothesis, Search, SearchOutcome, search_from
+from hvdc_ident.discrepancy.rivals import _equal, akin_of, classes
+from hvdc_ident.discrepancy.score import Ruler, objections
+from hvdc_ident.discrepancy.search import Hypothesis, Search, SearchOutcome
 from hvdc_ident.discrepancy.stated import Errors
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.immutable import FrozenMap
 from tests.discrepancy.cases import FREE, SIGMA, TRUE, experiments, model
-from tests.discrepancy.refits import answered, beside, expanded, plain
+from tests.discrepancy.refits import answered, beside, expanded, plain, search_from
 
 
 @pytest.fixture(scope="module")
 def before() -> Refit:
     return plain(experiments())
-
-
-def test_what_held_out_data_refute_sets_no_mark_for_the_others(before: Refit) -> None:
-    def trial(gain: float, told: float) -> CandidateFit:
-        return CandidateFit(Pick(0, 0, 1.0, 1.0), before, gain, told)
-
-    # Best on all data; a little ahead on the fitted ones; far ahead there and refuted by the others.
-    assert deficits([trial(100.0, 200.0), trial(104.0, 190.0), trial(150.0, 20.0)]) == [0.0, 0.0, 180.0]
-    assert deficits([trial(100.0, 200.0), trial(92.0, 195.0)]) == [0.0, 5.0]
 
 
 @pytest.mark.parametrize(("lag", "loud", "expected"), [(0.0, 1.0, True), (0.0, 1.12, True), (0.03, 1.0, False)])
@@ -86,12 +77,7 @@ def test_held_out_records_that_an_effect_does_not_move_do_not_speak_against_it()
     refit = refitted(beside(before, "limit", "outputs.torque", {"level": 1.45}, {"level": (0.5, 3.0)}))
     assert before.predicted is not None
     worse = {by: replace(refit, predicted=before.predicted + by) for by in (0.002, 0.05)}
-    told = {
-        by: objections(
-            before, CandidateFit(Pick(0, 0, 1.0, 500.0), r, 500.0), 0.005, DiagnosisOptions(), {}, first=True
-        )
-        for by, r in worse.items()
-    }
+    told = {by: objections(before, r, 500.0, 0.005, DiagnosisOptions(), {}, first=True) for by, r in worse.items()}
     assert told[0.002] == ""
     assert "speak" in told[0.05] and "against it" in told[0.05]
 
@@ -115,8 +101,8 @@ def test_a_slow_gap_in_slow_noise_matters_as_it_is_recorded() -> None:
     )
     recorded = [misfit_of(r).as_recorded[role] for role in ("fit", "holdout") for r in (before, refit)]
     assert recorded[0] > 1.5 * recorded[1] and recorded[2] > 1.5 * recorded[3]
-    trial = CandidateFit(Pick(0, 0, 1.0, 500.0), refit, before.chi2 - refit.chi2)
-    assert objections(before, trial, 0.005, DiagnosisOptions(), {}, first=True) == ""
+    gain = before.chi2 - refit.chi2
+    assert objections(before, refit, gain, 0.005, DiagnosisOptions(), {}, first=True) == ""
 
 
 def test_where_the_model_does_not_run_at_a_size_it_begins_at_another_and_at_the_best(before: Refit) -> None:
@@ -171,7 +157,7 @@ def rated(groups: Sequence[Sequence[Rival]], **remainder: float) -> Conclusion:
     refit = plain(experiments())
     left = Remainder(**({"share": 0.0, "held_out": 0.0, "noise_units": 1.0} | remainder), at="wm")  # type: ignore[arg-type]
     found = Conclusion("named", "", (), tuple(tuple(g) for g in groups), remainder=left)
-    outcome = SearchOutcome(Hypothesis(refit, refit), (), (), (), Errors({}, {}, 0.0, 0.0))
+    outcome = SearchOutcome(Hypothesis(refit, refit), (), {}, Ruler.of(refit), Errors({}, {}, 0.0, 0.0))
     return _weighed(outcome, refit.nominal(), 1000.0, found, "lag at wm", 0.01)
 
 
@@ -243,18 +229,11 @@ def test_a_conductance_is_a_loss_too_while_its_source_keeps_its_sign() -> None:
     ]
 
 
-def tried(records: Sequence[Experiment], jobs: Sequence[tuple[str, str, dict[str, float], str]]) -> Expansion:
-    """An expansion in which these (effect, place, sizes to begin at, source) were refitted."""
-    first = plain(records)
-    places, names = tuple({at for _, at, _, _ in jobs}), tuple({effect for effect, _, _, _ in jobs})
-    search = SearchContext(names, places, FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    refits = [
-        refitted(beside(first, effect, at, sizes, dict.fromkeys(sizes, (-2.0, 2.0)), source))
-        for effect, at, sizes, source in jobs
-    ]
-    assert not any(r.failure for r in refits)
-    trials = tuple(CandidateFit(Pick(0, 0, 1.0, 1.0), r, 0.0) for r in refits)
-    return replace(opened(search, first, 1)[1], trials=trials)
+def fitted(first: Refit, effect: str, at: str, sizes: dict[str, float], source: str = "") -> Rival:
+    """The rival that the refit of an effect beside a model is, begun at these sizes."""
+    refit = refitted(beside(first, effect, at, sizes, dict.fromkeys(sizes, (-2.0, 2.0)), source))
+    assert not refit.failure
+    return replace(rival(effect, at, **sizes), source=source, refit=refit)
 
 
 def test_effects_that_add_the_same_to_a_signal_in_these_records_are_one_class() -> None:
@@ -263,12 +242,11 @@ def test_effects_that_add_the_same_to_a_signal_in_these_records_are_one_class() 
     there = apply_effects(model(), [{"effect": "deadband", "at": ["w"], "parameters": {"width": width}}])
     records = answered(there, experiments(), seed=0)
     assert min(float(np.min(e.measured["w"])) for e in records if e.measured is not None) > 2.0 * width
-    sizes = {"offset": {"c": -width}, "deadband": {"width": width}, "gain": {"k": 1.0 - width}}
-    found = tried(records, [(effect, "w", own, "") for effect, own in sizes.items()])
-    group = [replace(rival(n, "w", float(k)), parameters=FrozenMap(own)) for k, (n, own) in enumerate(sizes.items())]
-    assert _akin(found, group) == ["", "offset", ""]
-    assert _akin(found, [group[0], rival("deadband", "err", width=width)]) == ["", ""]
-    named = [replace(r, akin=akin) for r, akin in zip(group, _akin(found, group), strict=True)]
+    first, sizes = plain(records), {"offset": {"c": -width}, "deadband": {"width": width}, "gain": {"k": 1.0 - width}}
+    group = [replace(fitted(first, n, "w", own), delta_bic=float(k)) for k, (n, own) in enumerate(sizes.items())]
+    assert akin_of(first, group) == ["", "offset", ""]
+    assert akin_of(first, [group[0], replace(group[1], at=("err",))]) == ["", ""]
+    named = [replace(r, akin=akin) for r, akin in zip(group, akin_of(first, group), strict=True)]
     assert [set(c.names) for c in classes(named)] == [{"offset", "deadband"}, {"gain"}]
 
 
@@ -278,16 +256,18 @@ def test_what_differs_by_an_offset_that_no_record_shows_is_one_class(place: str,
     makes good for any offset; one of the measured speed is seen in the speed."""
     there = apply_effects(model(), [{"effect": "coupling", "at": [place], "parameters": {"k": 0.1}, "from": "load"}])
     loaded = {"ref": InputSignal.step(0.3, 1.0, 1.2), "load": InputSignal.step(0.6, 0.5, 1.0)}
-    records = answered(there, [replace(e, inputs=FrozenMap(loaded)) for e in experiments()], seed=0)
-    found = tried(records, [("coupling", place, {"k": 0.1}, "load"), ("conductance", place, {"g": -0.1}, "load")])
-    coupling = replace(rival("coupling", place, k=0.1), source="load")
-    assert _akin(found, [coupling, replace(rival("conductance", place, g=-0.1), source="load")]) == ["", akin]
+    first = plain(answered(there, [replace(e, inputs=FrozenMap(loaded)) for e in experiments()], seed=0))
+    leaks = [
+        fitted(first, "coupling", place, {"k": 0.1}, "load"),
+        fitted(first, "conductance", place, {"g": -0.1}, "load"),
+    ]
+    assert akin_of(first, leaks) == ["", akin]
 
 
 def test_a_refit_that_takes_away_what_noise_gives_is_no_evidence() -> None:
     """Whatever its pick promised: it is what the refit came to that is judged."""
     search = SearchContext(("lag",), ("wm",), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
-    at_work = Search(search, plain(experiments(lag=0.03)))
+    at_work = Search(search, plain(experiments(lag=0.03)), MOVES)
     at_work.run()
     (found,) = [h for h in at_work.pool.values() if [t.label for t in h.terms] == ["lag at wm"]]
     assert at_work._objection(found) == ""
@@ -306,7 +286,7 @@ def test_of_effects_that_explain_as_much_the_one_with_the_fewest_places_wins() -
     (offset,) = [t for t in scores if t.kind == "offset"]
     others = [t for t in scores if t.kind == "conductance"]
     assert others and offset.prior == pytest.approx(others[0].prior * kinds.count("conductance"))
-    at_work = Search(search, first)
+    at_work = Search(search, first, MOVES)
     as_good = [replace(scores[t][1], refit=scores[offset][1].refit) for t in (*others, offset)]
     for hypotheses in (as_good, as_good[::-1]):
         at_work.pool = {at_work.root.key: at_work.root} | {h.key: h for h in hypotheses}

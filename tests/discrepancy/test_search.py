@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hvdc_ident.discrepancy.classes import compared
 from hvdc_ident.discrepancy.hypothesis import Refit, refitted
+from hvdc_ident.discrepancy.moves import MOVES
 from hvdc_ident.discrepancy.options import DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.result import CARD, VALUE
+from hvdc_ident.discrepancy.rivals import compared
 from hvdc_ident.discrepancy.score import Ruler
-from hvdc_ident.discrepancy.search import CLOCKS, MOVES, Hypothesis, Search, Term
+from hvdc_ident.discrepancy.search import CLOCKS, Hypothesis, Search, Term
 from hvdc_ident.discrepancy.stated import Errors, with_free
 from hvdc_ident.fit import FitParameter
 from hvdc_ident.immutable import FrozenMap
@@ -44,7 +45,7 @@ def context() -> SearchContext:
 
 def searching(first: Refit, *, opened: bool = False) -> Search:
     """A search; opened: whether effects have been looked for beside the model."""
-    search = Search(context(), first)
+    search = Search(context(), first, MOVES)
     if opened:
         for move in (m for m in MOVES if m.name == "effects"):
             search.add(move.make(search, search.root))
@@ -124,7 +125,7 @@ def test_of_two_with_the_same_terms_the_one_that_leaves_least_stays(first: Refit
 
 def test_a_form_outside_the_catalogue_is_no_answer_and_is_told_as_what_it_is(first: Refit) -> None:
     search = searching(first, opened=True)
-    best, against = search._answer()
+    best, against = search.answer()
     assert [t.label for t in best.terms] == ["lag at wm"] and not against
     terms = (Term("polynomial", ("wm",), prior=best.terms[0].prior),)
     form = Hypothesis(replace(best.refit, chi2=best.refit.chi2 - 200.0), first, terms)
@@ -132,13 +133,13 @@ def test_a_form_outside_the_catalogue_is_no_answer_and_is_told_as_what_it_is(fir
     for h in (search.root, best, form):
         search.errors[h.key] = h.refit, NONE
     assert search.ranked()[0] is form
-    answer, against = search._answer()
+    answer, against = search.answer()
     assert answer.key == best.key and not against
-    outcome = search._outcome(exhausted=False)
-    assert outcome.best.key == best.key and outcome.form is not None and outcome.form.refit is form.refit
+    outcome = search.outcome(exhausted=False)
+    assert outcome.best.key == best.key and [h.refit for h in outcome.forms] == [form.refit]
     near = replace(form, refit=replace(best.refit, chi2=best.refit.chi2 - 1.0))
     search.pool[form.key], search.errors[form.key] = near, (near.refit, NONE)
-    assert search._outcome(exhausted=False).form is None, "no better than chance"
+    assert not search.outcome(exhausted=False).forms, "no better than chance"
 
 
 def test_of_hypotheses_that_are_as_likely_the_one_with_the_values_nearest_to_the_given_is_the_answer(
@@ -146,7 +147,7 @@ def test_of_hypotheses_that_are_as_likely_the_one_with_the_values_nearest_to_the
 ) -> None:
     """Free parameters that make up for an effect elsewhere are no estimates: one that leaves them as given is preferred."""
     search = searching(first, opened=True)
-    best, _ = search._answer()
+    best, _ = search.answer()
     given = np.array([*(f.given for f in FREE), *best.refit.theta[2:]])
     away = np.array([*(0.5 * f.given for f in FREE), *best.refit.theta[2:]])
 
@@ -170,7 +171,7 @@ def test_of_hypotheses_that_are_as_likely_the_one_with_the_values_nearest_to_the
 def test_the_probabilities_of_hypotheses_are_those_of_their_scores() -> None:
     """Half the difference of two scores is the logarithm of the ratio of their probabilities: of a lag and a delay as long, say."""
     both = replace(context(), effects=("lag", "delay"), places=("wm",))
-    outcome = Search(both, plain(experiments(lag=0.0015))).run()
+    outcome = Search(both, plain(experiments(lag=0.0015)), MOVES).run()
     (root,) = [score for h, score in outcome.pool if not h.terms]
     first, second = outcome.pool[:2]
     assert root == 0.0 and first[1] <= second[1] < 0.0

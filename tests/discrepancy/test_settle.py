@@ -7,20 +7,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hvdc_ident.discrepancy import search as searching
 from hvdc_ident.discrepancy.diagnosis import lines
-from hvdc_ident.discrepancy.effect_moves import opened
 from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel
 from hvdc_ident.discrepancy.hypothesis import Refit, joint_refit_job, last_placed, refitted, slot_signals
+from hvdc_ident.discrepancy.moves import MOVES
+from hvdc_ident.discrepancy.moves import effects as moves_of_effects
+from hvdc_ident.discrepancy.moves.effects import opened
 from hvdc_ident.discrepancy.options import DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.pushes import pushed
-from hvdc_ident.discrepancy.score import is_clear
-from hvdc_ident.discrepancy.search import MOVES, P_EFFECT, Hypothesis, Search, Term, search_from
+from hvdc_ident.discrepancy.score import P_EFFECT, is_clear
+from hvdc_ident.discrepancy.search import Hypothesis, Search, Term
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import insertion_point_of
 from tests.discrepancy.cases import experiments
-from tests.discrepancy.refits import beside, plain
+from tests.discrepancy.refits import beside, plain, search_from
 
 
 def looking_for(effects: tuple[str, ...], places: tuple[str, ...]) -> SearchContext:
@@ -69,14 +70,14 @@ def test_what_is_not_there_is_not_clear_and_what_is_told_last_takes_its_evidence
 def test_a_search_does_without_what_is_nothing_beside_the_others(first: Refit) -> None:
     one = refitted(beside(first, "gain", "ref", {"k": 1.001}, {"k": (0.9, 1.1)}))
     both = refitted(beside(one, "lag", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
-    search = Search(looking_for(("gain", "lag"), ("ref", "wm")), first)
+    search = Search(looking_for(("gain", "lag"), ("ref", "wm")), first, MOVES)
     pair = hypothesis(first, both)
     search.add([pair])
     outcome = search.run()
     assert pair.key in {h.key for h, _ in outcome.pool}
     assert [t.label for t in outcome.best.terms] == ["lag at wm"]
     assert [p.candidate.label for p in outcome.refit.placed] == ["lag at wm"]
-    assert [k.term.label for k in outcome.kept] == ["lag at wm"]
+    assert [t.label for t in outcome.named] == ["lag at wm"]
 
 
 def test_an_effect_that_another_explains_better_is_exchanged_for_it() -> None:
@@ -84,18 +85,18 @@ def test_an_effect_that_another_explains_better_is_exchanged_for_it() -> None:
     first = plain(experiments(lag=0.03, offset=0.3))
     late = refitted(beside(first, "delay", "wm", {"T": 0.02}, {"T": (1e-4, 0.3)}))
     both = refitted(beside(late, "offset", "drag", {"c": -0.3}, {"c": (-1.0, 1.0)}))
-    search = Search(looking_for(("lag", "delay", "offset"), ("wm", "drag")), first)
+    search = Search(looking_for(("lag", "delay", "offset"), ("wm", "drag")), first, MOVES)
     (looked,) = [m for m in MOVES if m.name == "effects"]
     search.add([*looked.make(search, search.root), hypothesis(first, both)])
-    assert {t.label for t in search._answer()[0].terms} == {"delay at wm", "offset at drag"}
+    assert {t.label for t in search.answer()[0].terms} == {"delay at wm", "offset at drag"}
     search._exchanged()
-    best, _ = search._answer()
+    best, _ = search.answer()
     assert {t.label for t in best.terms} == {"lag at wm", "offset at drag"}
     sizes = {p.candidate.effect: best.refit.sizes(p) for p in best.refit.placed}
     assert sizes["lag"]["T"] == pytest.approx(0.03, rel=0.02) and sizes["offset"]["c"] == pytest.approx(-0.3, rel=0.02)
 
 
-def test_a_card_is_exchanged_in_the_model_without_terms_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_card_is_exchanged_in_the_model_without_terms_alone() -> None:
     """Of a model with effects the one with another card would lose them."""
     asked: list[str] = []
 
@@ -104,22 +105,21 @@ def test_a_card_is_exchanged_in_the_model_without_terms_alone(monkeypatch: pytes
         return []
 
     moves = tuple(replace(m, make=cards) if m.name == "cards" else m for m in MOVES)
-    monkeypatch.setattr(searching, "MOVES", moves)
-    outcome = search_from(looking_for(("lag", "offset"), ("wm", "drag")), plain(experiments(lag=0.03, offset=0.3)))
+    first = plain(experiments(lag=0.03, offset=0.3))
+    outcome = Search(looking_for(("lag", "offset"), ("wm", "drag")), first, moves).run()
     assert len(outcome.best.terms) == 2
     assert asked == [""]
 
 
 def test_what_could_not_be_refitted_stays_told(first: Refit) -> None:
-    search = Search(looking_for(("gain", "lag"), ("ref", "wm")), first)
+    search = Search(looking_for(("gain", "lag"), ("ref", "wm")), first, MOVES)
     search.run()
     key = search.root.key
     *others, last = search.expansions[key].trials
     lost = replace(last, refit=replace(last.refit, failure="it does not run"))
     search.expansions[key] = replace(search.expansions[key], trials=(*others, lost))
-    outcome = search._outcome(exhausted=True)
-    assert [k.term.label for k in outcome.kept] == ["lag at wm"]
-    assert outcome.kept[0].expansion.failed == (lost,)
+    outcome = search.outcome(exhausted=True)
+    assert [t.label for t in outcome.named] == ["lag at wm"]
     assert [line.status for line in lines(outcome) if line.status.startswith("failed")] == ["failed: it does not run"]
 
 
@@ -131,7 +131,7 @@ def test_what_could_not_be_looked_for_beside_an_effect_is_told_and_the_effect_st
             raise SimulationError("the simulation stopped", got="step-limit")
         return opened(context, here, number)
 
-    monkeypatch.setattr(searching, "opened", stopped)
+    monkeypatch.setattr(moves_of_effects, "opened", stopped)
     outcome = search_from(looking_for(("lag", "offset"), ("wm", "drag")), plain(experiments(lag=0.03, offset=0.3)))
     (term,) = outcome.best.terms
     assert term.label in ("lag at wm", "offset at drag")
@@ -145,7 +145,7 @@ def test_a_model_beside_which_nothing_can_be_looked_for_ends_the_search(
     def stopped(*_: object) -> tuple[ExpansionModel, Expansion]:
         raise SimulationError("the simulation stopped", got="step-limit")
 
-    monkeypatch.setattr(searching, "opened", stopped)
+    monkeypatch.setattr(moves_of_effects, "opened", stopped)
     with pytest.raises(SimulationError, match="stopped"):
         search_from(looking_for(("lag",), ("wm",)), first)
 
@@ -185,8 +185,8 @@ def test_nothing_is_looked_for_inside_an_effect_that_is_there_already(first: Ref
 def test_expansions_that_are_over_have_the_answers_of_their_model() -> None:
     first = plain(experiments(lag=0.03, offset=0.3))
     outcome = search_from(looking_for(("lag", "offset"), ("wm", "drag")), first)
-    assert len(outcome.kept) == 2
-    again, anew = outcome.expansions[0].answers(), pushed(first, slot_signals(first))
+    assert len(outcome.named) == 2
+    again, anew = outcome.opened.answers(), pushed(first, slot_signals(first))
     assert again.keys() == anew.keys() == {"fit-1", "fit-2"}
     for name, path in anew.items():
         np.testing.assert_array_equal(again[name].values["wm"], path.values["wm"])

@@ -412,8 +412,7 @@ def test_a_bend_is_met_from_one_of_the_sizes_where_others_lead_nowhere(large):
     before, options = refitted_plain(case), DiagnosisOptions()
     search = SearchContext(("rate-limit", "lag"), None, FrozenMap(), options, 0)
     found = expanded(search, before)
-    assert found.winner is not None
-    best = found.winner.refit
+    best = found.trials[0].refit
     assert (best.placed[0].candidate.effect, best.placed[0].candidate.at) == ("rate-limit", ("xi",))
     assert best.sizes(best.placed[0])["rate"] == pytest.approx(1.4, rel=0.01)
 

@@ -16,7 +16,8 @@ from hvdc_ident.data import Experiment, Trajectory
 from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, refit_again, refitted
 from hvdc_ident.discrepancy.nominal import of_held_out
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.score import Ruler, evidence_between
+from hvdc_ident.discrepancy.score import P_CLOCKS, Ruler, evidence_between
+from hvdc_ident.discrepancy.search import CLOCKS, Hypothesis, Move, Search, Term
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.simulator import TIME_SHIFT, unknown_of
 from hvdc_ident.text import listed, quantity
@@ -127,3 +128,19 @@ def _refitted(base: Refit, here: Refit, records: tuple[Experiment, ...]) -> tupl
     same = replace(here, problem=replace(here.problem, experiments=records))
     found = refit_again(other, same, same.placed)
     return None if found.failure else (other, found)
+
+
+def clocked(search: Search, h: Hypothesis) -> list[Hypothesis]:
+    """The hypothesis on records whose clocks are off, where they are."""
+    if any(t.kind == CLOCKS for t in h.terms) or search.is_noise(h):
+        return []
+    h = search.ready(h)
+    if h.refit.failure:
+        return []
+    base, refit = on_their_clocks(search.context, h.base, h.refit)
+    if refit is h.refit:
+        return []
+    return [Hypothesis(refit, base, (*h.terms, Term(CLOCKS, tuple(clocks(search.context, refit)), prior=P_CLOCKS)))]
+
+
+MOVE = Move("clocks", 0, clocked, in_stead=True)

@@ -15,12 +15,11 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel, Race, gains_of
+from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel, Race, Trial, by_cost, gains_of
 from hvdc_ident.discrepancy.hypothesis import Refit, with_given_gains
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import BEAM, SHORTLIST
-from hvdc_ident.discrepancy.score import CandidateFit, best_each, by_cost
 from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.effects import SignalScales, effects, size_grid
 
@@ -38,56 +37,49 @@ SIMILAR_DELAY = 0.3
 """Difference of the logarithms of two delays within which one may stand for the other."""
 
 
-def with_searched_sizes(
-    expansion_model: ExpansionModel, opened: Expansion, trials: list[CandidateFit], text: str, *, far: bool
-) -> tuple[Expansion, list[CandidateFit]]:
-    """Return the round and its trials with effects whose size has to be met. far: whether nothing explains the records so far.
+def with_searched_sizes(model: ExpansionModel, opened: Expansion, text: str, *, far: bool = True) -> Expansion:
+    """Return the expansion with effects whose size has to be met. far: whether nothing explains the records so far.
 
     A quantiser is looked for at the places that promise most, where nothing else explains the records. A sampler is a delay to first
     order: it is looked for in periods that delay as long as what was refitted, or as a quantiser is where no other delay is tried.
     """
-    grids = _grids(opened, trials, far=far)
+    grids = _grids(opened, far=far)
     if not grids:
-        return opened, trials
-    opened, trials = _with_best_of_all_sizes(expansion_model, opened, trials, grids, text)
-    return _refined(
-        expansion_model, opened, trials, text, lambda ranked: [t for t in ranked if t.pick.candidate in grids], grids
-    )
+        return opened
+    opened = _with_best_of_all_sizes(model, opened, grids, text)
+    return _refined(model, opened, text, lambda ranked: [t for t in ranked if t.score.candidate in grids], grids)
 
 
-def with_closer_sizes(
-    expansion_model: ExpansionModel, opened: Expansion, trials: list[CandidateFit], text: str
-) -> tuple[Expansion, list[CandidateFit]]:
-    """Return the round and its trials with those of the best effects that have one size and bend their signal refined, while the best
-    of all leaves more than noise."""
+def with_closer_sizes(model: ExpansionModel, opened: Expansion, text: str) -> Expansion:
+    """Return the expansion with those of the best effects that have one size and bend their signal refined, while the best of all leaves
+    more than noise."""
 
-    def bent(ranked: Sequence[CandidateFit]) -> list[CandidateFit]:
+    def bent(ranked: Sequence[Trial]) -> list[Trial]:
         rough = ranked[:BEAM] if ranked and misfit_of(ranked[0].refit).is_loud else ()
         return [t for t in rough if _bends(t.refit.placed[-1].candidate)]
 
-    return _refined(expansion_model, opened, trials, text, bent)
+    return _refined(model, opened, text, bent)
 
 
 def _refined(
-    expansion_model: ExpansionModel,
+    model: ExpansionModel,
     opened: Expansion,
-    trials: list[CandidateFit],
     text: str,
-    which: Callable[[Sequence[CandidateFit]], list[CandidateFit]],
+    which: Callable[[Sequence[Trial]], list[Trial]],
     grids: Mapping[int, Array] | None = None,
-) -> tuple[Expansion, list[CandidateFit]]:
-    """Return the round and its trials with refits from ever closer beside the sizes that some refits came to, by their rank."""
+) -> Expansion:
+    """Return the expansion with refits from ever closer beside the sizes that some refits came to, by their rank."""
     known = grids or {}
     for turn in range(1, N_REFINEMENTS + 1):
-        for t in which(by_cost(trials))[:BEAM]:
-            if expansion_model.search.spent:
+        for t in which(by_cost(opened.trials))[:BEAM]:
+            if model.search.spent:
                 break
-            k, size = t.pick.candidate, _size(t.refit)
+            k, size = t.score.candidate, _size(t.refit)
             away = np.delete(np.arange(-REFINEMENT, REFINEMENT + 1), REFINEMENT) / REFINEMENT**turn
             sizes = size + away * (_spacing(known[k], size) if k in known else BESIDE * size)
-            near = _best_sizes(expansion_model, opened, {k: sizes}, text, [gains_of(opened.before, t.refit)])
-            opened, trials = _refitted(expansion_model, opened, trials, near, text)
-    return opened, trials
+            near = _best_sizes(model, opened, {k: sizes}, text, [gains_of(opened.before, t.refit)])
+            opened = _refitted(model, opened, near, text)
+    return opened
 
 
 def _bends(candidate: CandidateEffect) -> bool:
@@ -95,35 +87,29 @@ def _bends(candidate: CandidateEffect) -> bool:
 
 
 def _with_best_of_all_sizes(
-    expansion_model: ExpansionModel,
-    opened: Expansion,
-    trials: list[CandidateFit],
-    grids: Mapping[int, Array],
-    text: str,
-) -> tuple[Expansion, list[CandidateFit]]:
-    """Return the round and its trials with the best of all sizes refitted."""
+    model: ExpansionModel, opened: Expansion, grids: Mapping[int, Array], text: str
+) -> Expansion:
+    """Return the expansion with the best of all sizes refitted."""
     # Beside the gains of what explains most of the misfit; where nothing does, beside those without an effect.
-    best_of_all = [t.refit for t in by_cost(trials)[:1] if t.refit.chi2 < 0.5 * opened.before.chi2]
+    best_of_all = [t.refit for t in by_cost(opened.trials)[:1] if t.refit.chi2 < 0.5 * opened.before.chi2]
     points: list[Array | None] = [*(gains_of(opened.before, r) for r in best_of_all)] or [None]
     given = with_given_gains(opened.before)
     late = {k: g for k, g in grids.items() if effects()[opened.candidates[k].effect].equivalent_delay is not None}
     levels = {k: g for k, g in grids.items() if k not in late}
     # A sampler that is missing biases the gains as a delay does; levels hardly do.
-    best = _best_sizes(
-        expansion_model, opened, late, text, [*points, *([] if given is None else [given])], most=SHORTLIST
-    )
+    best = _best_sizes(model, opened, late, text, [*points, *([] if given is None else [given])], most=SHORTLIST)
     coarse = {k: g[::COARSE_STRIDE] for k, g in levels.items()}
-    rough = _best_sizes(expansion_model, opened, coarse, text, points, most=SHORTLIST)
+    rough = _best_sizes(model, opened, coarse, text, points, most=SHORTLIST)
     beside = {k: _beside(grids[k], [size for size, _ in own]) for k, own in rough.items()}
-    best |= _best_sizes(expansion_model, opened, beside, text, points)
-    return _refitted(expansion_model, opened, trials, best, text)
+    best |= _best_sizes(model, opened, beside, text, points)
+    return _refitted(model, opened, best, text)
 
 
-def _grids(opened: Expansion, trials: Sequence[CandidateFit], *, far: bool) -> dict[int, Array]:
+def _grids(opened: Expansion, *, far: bool) -> dict[int, Array]:
     """Return by candidate the sizes to be looked at, (m,), rising."""
     found, entries = opened.candidates, effects()
-    better = [t for t in by_cost(trials) if t.refit.chi2 < opened.before.chi2][: None if far else BEAM]
-    late = {found[t.pick.candidate].at: d for t in reversed(better) if (d := _late(t.refit)) is not None}
+    better = [t for t in by_cost(opened.trials) if t.refit.chi2 < opened.before.chi2][: None if far else BEAM]
+    late = {found[t.score.candidate].at: d for t in reversed(better) if (d := _late(t.refit)) is not None}
     delays = any(entries[c.effect].equivalent_delay is not None and not entries[c.effect].needs_grid for c in found)
     times = [e.time for e in opened.before.problem.fitted_experiments]
     count: Counter[str] = Counter()
@@ -142,7 +128,7 @@ def _grids(opened: Expansion, trials: Sequence[CandidateFit], *, far: bool) -> d
         elif not (far and count[c.effect] <= QUANTISER_PLACES):
             continue
         else:
-            sizes = sizes[sizes * _answer_per_size(opened, k) >= _least_answer(opened, trials)]
+            sizes = sizes[sizes * _answer_per_size(opened, k) >= _least_answer(opened)]
         if sizes.size:
             grids[k] = sizes
     return grids
@@ -158,13 +144,13 @@ def _answer_per_size(opened: Expansion, candidate: int) -> float:
     )
 
 
-def _least_answer(opened: Expansion, trials: Sequence[CandidateFit]) -> float:
+def _least_answer(opened: Expansion) -> float:
     """Return the least answer, in noise units, with which an effect may come within reach of the best fall of chi2.
 
     With an answer a beside a residual r, chi2 = |r + a|^2 falls by no more than 2 |r| |a|.
     """
     chi2 = opened.before.chi2
-    best = min((t.refit.chi2 for t in trials if not t.refit.failure), default=chi2)
+    best = min((t.refit.chi2 for t in opened.trials if not t.refit.failure), default=chi2)
     return Race().reach * (chi2 - best) / (2.0 * math.sqrt(chi2))
 
 
@@ -216,7 +202,7 @@ def _at(candidate: CandidateEffect, sizes: Sequence[float]) -> CandidateEffect:
 
 
 def _best_sizes(
-    expansion_model: ExpansionModel,
+    model: ExpansionModel,
     opened: Expansion,
     sizes: Mapping[int, Array],
     text: str,
@@ -227,7 +213,7 @@ def _best_sizes(
     if not sizes:
         return {}
     found = [_at(c, sizes[k].tolist()) if k in sizes else c for k, c in enumerate(opened.candidates)]
-    scores = [s for point in points for s in expansion_model.screen(found, text, list(sizes), point, held=True).scores]
+    scores = [s for point in points for s in model.screen(found, text, list(sizes), point, held=True).scores]
     best: dict[int, list[Score]] = {}
     for s in sorted(scores, key=lambda s: -s.fall):
         own = best.setdefault(s.candidate, [])
@@ -237,17 +223,13 @@ def _best_sizes(
 
 
 def _refitted(
-    expansion_model: ExpansionModel,
-    opened: Expansion,
-    trials: Sequence[CandidateFit],
-    best: Mapping[int, Sequence[tuple[float, Score]]],
-    text: str,
-) -> tuple[Expansion, list[CandidateFit]]:
-    """Return the round, whose candidates have these sizes too, and the trials with the refits begun there."""
+    model: ExpansionModel, opened: Expansion, best: Mapping[int, Sequence[tuple[float, Score]]], text: str
+) -> Expansion:
+    """Return the expansion, whose candidates have these sizes too, with the refits begun there."""
     found, scores = list(opened.candidates), []
     for k, own in best.items():
         more = _at(found[k], [size for size, _ in own]).probes
         scores += [replace(s, probe=len(found[k].probes) + n, factor=1.0) for n, (_, s) in enumerate(own)]
         found[k] = replace(found[k], probes=(*found[k].probes, *more))
     opened = replace(opened, candidates=tuple(found))
-    return opened, best_each([*trials, *expansion_model.refitted(found, scores, text, trials)])
+    return opened.with_trials(model.refitted(found, scores, text, opened.trials))

@@ -1,4 +1,4 @@
-"""Effects that values of the parameters stand for: with the given values they explain the records as well.
+"""Effects in the stead of other values of the parameters: with the given values they explain the records as well.
 
 A signal that is 0.8 times what the record says, and a gain of the model that is 0.8 of its given value, may be one model. The
 fitted parameters take up all of such an effect, so no score shows it: it is refitted with the parameters as they were given.
@@ -13,44 +13,41 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.discrepancy.candidates import CandidateEffect
-from hvdc_ident.discrepancy.expansion import Expansion, refits_of
+from hvdc_ident.discrepancy.expansion import refits_of
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, refit_job
-from hvdc_ident.discrepancy.options import SHORTLIST, SearchContext
-from hvdc_ident.discrepancy.result import StandIn
-from hvdc_ident.discrepancy.score import Ruler, at_edge, evidence_between, is_clear
-from hvdc_ident.discrepancy.sentences import sentence
+from hvdc_ident.discrepancy.options import SHORTLIST
+from hvdc_ident.discrepancy.score import at_edge, is_clear, off_by_more_than_chance
+from hvdc_ident.discrepancy.search import GIVEN, Hypothesis, Move, Search, Term
 from hvdc_ident.errors import HvdcIdentError
 from hvdc_ident.immutable import FrozenMap
 
 
-def stand_ins(search: SearchContext, last: Refit, opened: Expansion, moved: Sequence[str]) -> tuple[StandIn, ...]:
-    """Return the effects that explain the records as well as other values of the parameters, with these as given, the best first.
+def as_given(search: Search, h: Hypothesis) -> list[Hypothesis]:
+    """Hypotheses with one effect beside the given values of the parameters that are off in the model without terms, which leaves noise.
 
     Only one in place of all of them: beside values that are off, an effect in place of another such value explains nothing more.
-    last: the model without effects, refitted; opened: the first round of the search, whose screen shows which effects the
-    parameters take up; moved: the parameters whose values are off the given ones.
     """
-    found = opened.candidates
-    taken_up = opened.screen.absorbed()
-    if not taken_up or search.spent:
-        return ()
+    expansion = search.expansions.get(h.key)
+    moved = off_by_more_than_chance(h.refit)
+    if expansion is None or not moved or not search.is_noise(h):
+        return []
+    found, last = expansion.candidates, expansion.before
     # One that brings another signal in has many likes: those that do not are asked first.
-    first = sorted(taken_up, key=lambda k: (bool(found[k].source), len(found[k].at), k))[:SHORTLIST]
+    first = sorted(expansion.screen.absorbed(), key=lambda k: (bool(found[k].source), len(found[k].at), k))[:SHORTLIST]
     jobs = []
     for k in first:
         with suppress(HvdcIdentError):  # it cannot sit there
             jobs.append(_with_given(_job(last, found[k]), moved))
-    found_ones: list[StandIn] = []
-    ruler = Ruler.of(last)
-    values = FrozenMap({f.name: f.given for f in last.problem.free if f.name in moved})
-    for refit in refits_of(search, jobs, [f"with the given values: {j.placed[-1].candidate.label}" for j in jobs]):
-        if refit.failure or at_edge(refit, 0) or not is_clear(refit, 0):
+    labels = [f"with the given values: {j.placed[-1].candidate.label}" for j in jobs]
+    given = Term(GIVEN, moved)
+    children = []
+    for refit in refits_of(search.context, jobs, labels):
+        if refit.failure or not refit.rows or at_edge(refit, 0) or not is_clear(refit, 0):
             continue
-        evidence = evidence_between(last, refit, ruler, refit.count - len(moved))
-        if evidence >= -search.options.set_bic:
-            c, sizes = refit.placed[-1].candidate, FrozenMap(refit.sizes(refit.placed[-1]))
-            found_ones.append(StandIn(c.effect, c.at, max(-evidence, 0.0), sizes, values, sentence(c, sizes), c.source))
-    return tuple(sorted(found_ones, key=lambda s: round(s.delta_bic, 1)))  # as good is as good: then as asked
+        c = refit.placed[-1].candidate
+        terms = (*h.terms, given, Term(c.effect, c.at, c.source, expansion.prior(c.effect)))
+        children.append(Hypothesis(refit, h.base, terms))
+    return children
 
 
 def _job(last: Refit, candidate: CandidateEffect) -> RefitJob:
@@ -74,3 +71,6 @@ def _with_given(begun: RefitJob, names: Sequence[str]) -> RefitJob:
         held=FrozenMap({**problem.held, **own}),
     )
     return replace(begun, problem=held, begins=tuple(np.delete(b, at) for b in begun.begins))
+
+
+MOVE = Move("as given", 1, as_given, of_root=True)

@@ -1,9 +1,8 @@
-"""Which candidates explain the data as well as the one that was put in, and what would distinguish them."""
+"""Which terms explain the data as well as one of the answer's in its stead, and which of them are one effect."""
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -11,186 +10,138 @@ from typing import TypeVar
 
 import numpy as np
 
-from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.expansion import Expansion
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import CERTAIN, TOLERANCE, DiagnosisOptions
-from hvdc_ident.discrepancy.outside import expression
 from hvdc_ident.discrepancy.result import VALUE, Hypothesis, Rival
-from hvdc_ident.discrepancy.score import (
-    TIED,
-    CandidateFit,
-    apart,
-    at_edge,
-    best_gain,
-    deficits,
-    implied,
-    nearest,
-    off_given,
-    same_answers,
-)
-from hvdc_ident.discrepancy.search import P_EFFECT, Kept, SearchOutcome, Term
+from hvdc_ident.discrepancy.score import TIED, apart, at_edge, implied, nearest, off_given, same_answers
+from hvdc_ident.discrepancy.search import SearchOutcome, Term
+from hvdc_ident.discrepancy.sentences import expression
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 
-SLIGHT_SHARE = 1e-3
-"""Share of what a form explains by which a formula may explain more and not refute it: of so much the noise is not known."""
-UNNOTICED_SHARE = 0.15
-"""Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
 
-
-def rivals(kept: Kept, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True) -> tuple[Rival, ...]:
-    """The term that was kept and everything that explains the records as well in its stead, the best first.
+def rivals(
+    outcome: SearchOutcome, term: Term, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True
+) -> tuple[Rival, ...]:
+    """A term of the best hypothesis and everything that explains the records as well in its stead beside the others, the best first.
 
     What does the same within the tolerance, with no parameter more, is listed however far behind it is: no model is right to
     the last unit of evidence. So are effects that are the same equation. tries: whether an effect is one of those that are looked for.
     """
-    found = kept.expansion
-    assert found.ruler is not None
-    others = [t for _, t in kept.others]
-    own = found.winner or next(t for term, t in kept.others if term == kept.term)
-    behind_by = deficits([*found.trials, *others])
+    less = outcome.best.without(term)
+    members = outcome.in_stead_of(term)
+    base = outcome.hypotheses.get(less)
+    found = outcome.expansions.get(less)
     # One that explains as much is no nothing, even where gains make good any size of it; one at its edge is another's work.
-    sound = [t is own or not at_edge(t.refit, len(t.refit.placed) - 1) for t in found.trials]
-    # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
-    alone = sum(s and b <= options.set_bic for s, b in zip(sound, behind_by, strict=False)) < 2
-    count = Counter(c.effect for c in found.candidates)
-    group: list[Rival] = []
-    further: list[Rival] = []
-    for trial, behind, good in zip(found.trials, behind_by, sound, strict=False):
-        c = found.candidates[trial.pick.candidate]
-        more = len(trial.refit.problem.free) - len(own.refit.problem.free)
-        spared = more == 1 and found.winner is not None and (not alone or _as_likely(found, c, options))
-        sizes = FrozenMap(trial.refit.sizes(trial.refit.placed[-1]))
-        rival = Rival(
-            c.effect, c.at, behind, sizes, c.source, values=implied(trial.refit), off_given=off_given(trial.refit)
-        )
-        if good and behind <= options.set_bic + (found.ruler.price if spared else 0.0):
-            group.append(rival)
-        elif good and more <= 0 and trial.total_gain >= (1.0 - TOLERANCE) * own.total_gain:
-            further.append(rival)
-    group += _unfitted(found, best_gain([*found.trials, *others]), options)
-    group += _at_rest(found, group)
-    group += _equal(found, group, tries)
-    each: dict[tuple[str, tuple[str, ...], str], Rival] = {}
-    same: dict[tuple[str, tuple[str, ...], str], str] = {}
-    for r in sorted(group, key=lambda r: (r.delta_bic, not r.refitted)):
-        each.setdefault((r.effect, r.at, r.source), r)
-        if r.same_as:
-            same[r.effect, r.at, r.source] = r.same_as
-    within = [replace(r, same_as=same.get(key, "")) for key, r in each.items()]
-    further = [r for r in further if (r.effect, r.at, r.source) not in each]
-    akin = _akin(found, within, further)
-    whole = [replace(r, akin=a) for r, a in zip([*within, *further], akin, strict=True)]
-    whole = [replace(r, prior=1.0 / max(count[r.effect], 1)) for k, r in enumerate(whole) if k < len(within) or r.akin]
-    beside = zip(kept.others, behind_by[len(found.trials) :], strict=True)
-    kinds = max(len(count), 1)
-    whole += [
-        _other_rival(term, t.refit, behind, term.prior / P_EFFECT * kinds)
-        for (term, t), behind in beside
-        if behind <= options.set_bic
+    refits = {t: h.refit_of(t) for t, h, _ in members}
+    members = [
+        (t, h, s)
+        for t, h, s in members
+        if t == term or not t.is_effect or not at_edge(refits[t], len(refits[t].placed) - 1)
     ]
-    return tuple(sorted(whole, key=lambda r: r.delta_bic))
+    best = min(s for _, _, s in members)
+    each = [_rival(t, refits[t], s - best) for t, _, s in members]
+    own = next(r for r, (t, _, _) in zip(each, members, strict=True) if t == term)
+    within = [r for r in each if r is own or r.delta_bic <= options.set_bic]
+    further: list[Rival] = []
+    if found is not None and base is not None:
+        none = next(s - h.prior_cost for h, s in outcome.pool if h.key == less)
+        most = (1.0 - TOLERANCE) * (none - own.delta_bic - best)
+        further = [
+            r
+            for r in each
+            if r not in within and r.is_effect and none - best - r.delta_bic >= most and _is_as_small(r, own)
+        ]
+        within += _unfitted(outcome, found, less, best, options)
+        within += _at_rest(found, within)
+        within += _equal(found, within, tries)
+    once: dict[tuple[str, tuple[str, ...], str, str], Rival] = {}
+    same: dict[tuple[str, tuple[str, ...], str, str], str] = {}
+    for r in sorted(within, key=lambda r: (r.is_form, r.delta_bic, not r.refitted)):
+        once.setdefault(_key(r), r)
+        if r.same_as:
+            same[_key(r)] = r.same_as
+    within = [replace(r, same_as=same.get(key, "")) for key, r in once.items()]
+    further = [r for r in further if _key(r) not in once]
+    akin = [] if base is None else akin_of(base.refit, within, further)
+    whole = [replace(r, akin=a) for r, a in zip([*within, *further], akin, strict=True)] if akin else within
+    kept = [r for k, r in enumerate(whole) if k < len(within) or r.akin]
+    # A form that does the same as an effect of the catalogue in these records is its own tangent, and nothing else.
+    return tuple(sorted((r for r in kept if not (r.akin and r.is_form)), key=lambda r: r.delta_bic))
 
 
-def _other_rival(term: Term, refit: Refit, behind: float, prior: float) -> Rival:
-    """The member of a set that says that a stated value is another, or a component of another type."""
-    known = implied(refit)
-    sizes = FrozenMap({n: refit.values[n] for n in term.at} if term.kind == VALUE else {})
-    values = FrozenMap({n: v for n, v in known.items() if n not in sizes})
-    return Rival(term.kind, term.at, behind, sizes, term.source, prior=prior, values=values)
+def _key(r: Rival) -> tuple[str, tuple[str, ...], str, str]:
+    return r.effect, r.at, r.source, r.expression
 
 
-def _akin(found: Expansion, group: Sequence[Rival], further: Sequence[Rival] = ()) -> list[str]:
+def _is_as_small(one: Rival, other: Rival) -> bool:
+    """Return True where a rival has no parameter more than another."""
+    assert one.refit is not None and other.refit is not None
+    return len(one.refit.problem.free) <= len(other.refit.problem.free)
+
+
+def _rival(term: Term, refit: Refit, behind: float) -> Rival:
+    """The member of a set that a hypothesis is, by its term. refit: with the term's effect last; behind: the best, in evidence."""
+    values, formula, name = implied(refit), "", term.kind
+    if term.is_effect:
+        sizes = FrozenMap(refit.sizes(refit.placed[-1]))
+        if term.is_form:
+            name = effects()[term.kind].outside
+            formula = expression(refit) if name == "term" else ""
+    else:
+        sizes = FrozenMap({n: refit.values[n] for n in term.at} if term.kind == VALUE else {})
+        values = FrozenMap({n: v for n, v in values.items() if n not in sizes})
+    return Rival(
+        name, term.at, behind, sizes, term.source, expression=formula, prior=term.prior, values=values,
+        off_given=off_given(refit), refit=refit,
+    )  # fmt: skip
+
+
+def akin_of(before: Refit, group: Sequence[Rival], further: Sequence[Rival] = ()) -> list[str]:
     """For each of both the first effect of the group before it that does the same at its place in these records, within the
-    tolerance; empty where none does.
+    tolerance; empty where none does. before: the model without them.
 
     A dead band whose signal stays beyond its edge is an offset; so are, where a signal hardly moves, its gain error and
     what is lost in proportion to it.
     """
     both = [*group, *further]
-    refits = {
-        (
-            t.refit.placed[-1].candidate.effect,
-            t.refit.placed[-1].candidate.at,
-            t.refit.placed[-1].candidate.source,
-        ): t.refit
-        for t in found.trials
-    }
-    own = [refits.get((r.effect, r.at, r.source)) if r.refitted else None for r in both]
     akin = []
     for k, r in enumerate(both):
         earlier = (
             q.effect
-            for q, other in zip(group[:k], own, strict=False)
-            if (one := own[k]) is not None
-            and other is not None
+            for q in group[:k]
+            if r.refit is not None
+            and q.refit is not None
+            and (r.refitted and q.refitted and r.is_effect and q.is_effect)
             and q.at == r.at
-            and q.effect != r.effect
-            and same_answers(one, other, found.before)
+            and q.kind != r.kind
+            and same_answers(r.refit, q.refit, before)
         )
         akin.append(next(earlier, ""))
     return akin
 
 
-def _as_likely(found: Expansion, other: CandidateEffect, options: DiagnosisOptions) -> bool:
-    """Return True where a form with one more parameter stays possible though the winner is alone: at the same place, where the
-    data would not show what the parameter does, or where both are kinds of delay and the winner is no case of the other.
-    """
-    assert found.winner is not None and found.ruler is not None
-    best = found.candidates[found.winner.pick.candidate]
-    one, two = effects()[best.effect], effects()[other.effect]
-    weak = found.winner.gain * UNNOTICED_SHARE**2 < options.set_bic + found.ruler.price
-    delays = one.equivalent_delay is not None and two.equivalent_delay is not None and one.name not in two.generalises
-    return other.at == best.at and (weak or delays)
-
-
-def formula_rivals(
-    found: Expansion, formulas: Sequence[tuple[CandidateFit, float]], options: DiagnosisOptions
-) -> tuple[float, tuple[Rival, ...]]:
-    """By how much the winner is behind the best formula outside the catalogue, in BIC, and the formulas that are near it; infinite
-    where one is further ahead than they can be distinguished.
-
-    formulas: refitted in the winner's stead, each with its prior; none is near of which that is 0.
-    """
-    assert found.winner is not None
-    own, *behind = deficits([found.winner, *(t for t, _ in formulas)])
-    within = max(options.set_bic, SLIGHT_SHARE * found.winner.total_gain)
-    if own > within:
-        return np.inf, ()
-    near = [
-        replace(_rival(t, b), prior=prior)
-        for b, (t, prior) in zip(behind, formulas, strict=True)
-        if b <= within and prior > 0.0
-    ]
-    return own, tuple(sorted(near, key=lambda r: r.delta_bic))
-
-
-def _rival(trial: CandidateFit, behind: float) -> Rival:
-    placed = trial.refit.placed[-1]
-    c, sizes = placed.candidate, FrozenMap(trial.refit.sizes(placed))
-    values, off = implied(trial.refit), off_given(trial.refit)
-    kind = effects()[c.effect].outside
-    formula = expression(trial.refit) if kind == "term" else ""
-    return Rival(kind, c.at, behind, sizes, c.source, expression=formula, values=values, off_given=off)
-
-
-def _unfitted(found: Expansion, best: float, options: DiagnosisOptions) -> list[Rival]:
+def _unfitted(
+    outcome: SearchOutcome, found: Expansion, less: frozenset[Term], best: float, options: DiagnosisOptions
+) -> list[Rival]:
     """Candidates that were not refitted but, being linear in their size, gain what their screen says."""
-    assert found.ruler is not None
-    done = {t.pick.candidate for t in (*found.trials, *found.failed)}
+    ruler = outcome.ruler
+    none = next(s - h.prior_cost for h, s in outcome.pool if h.key == less)
+    done = {t.score.candidate for t in found.trials}
     group = []
     for k, score in found.screen.best().items():
         c = found.candidates[k]
         if k in done or score.probe >= len(c.probes) or not in_proportion(c, score.probe):
             continue
         probe = c.probes[score.probe]
-        behind = best - found.ruler.gain(score.fall, 0.0, len(probe.free))
+        behind = none - ruler.gain(score.fall, 0.0, len(probe.free)) - best
         if behind <= options.set_bic:
             only = dict(probe.values) if len(probe.free) == 1 else {}
             sizes = FrozenMap({n: score.factor * v if n in probe.free else v for n, v in only.items()})
-            group.append(Rival(c.effect, c.at, max(behind, 0.0), sizes, c.source, refitted=False))
+            prior = found.prior(c.effect)
+            group.append(Rival(c.effect, c.at, max(behind, 0.0), sizes, c.source, refitted=False, prior=prior))
     return group
 
 
@@ -205,7 +156,7 @@ def _at_rest(found: Expansion, group: Sequence[Rival]) -> list[Rival]:
         entry, gain = effects()[c.effect], gains.get(c.at)
         bends = c.still and entry.equivalent_delay is None and entry.states == "none" and not entry.needs_source
         if gain is not None and bends and (entry.needs_grid or gain.parameters.get("k", 0.0) < 1.0):
-            like = Rival(c.effect, c.at, gain.delta_bic, FrozenMap(), refitted=False, same_as="gain")
+            like = Rival(c.effect, c.at, gain.delta_bic, FrozenMap(), refitted=False, same_as="gain", prior=gain.prior)
             likes.append(replace(like, values=gain.values, off_given=gain.off_given))
     return likes
 
@@ -213,7 +164,11 @@ def _at_rest(found: Expansion, group: Sequence[Rival]) -> list[Rival]:
 def _equal(found: Expansion, group: Sequence[Rival], tries: Callable[[str], bool]) -> list[Rival]:
     """The effects that are the same equation as one of the group at its place, under their own names."""
     known = [
-        (r, other, equality) for r in group for other, equality in effects()[r.effect].equals.items() if tries(other)
+        (r, other, equality)
+        for r in group
+        if r.is_effect and not r.is_form
+        for other, equality in effects()[r.effect].equals.items()
+        if tries(other)
     ]
     equal = []
     for r, other, equality in known:
@@ -222,7 +177,9 @@ def _equal(found: Expansion, group: Sequence[Rival], tries: Callable[[str], bool
         equal_sizes = [equality(r.parameters, signal) if r.parameters or not r.refitted else None for signal in brought]
         if all(t is not None for t in equal_sizes):
             sizes = FrozenMap(equal_sizes[0] or {})
-            equal.append(replace(r, effect=other, parameters=sizes, refitted=False, same_as=r.effect, akin=""))
+            equal.append(
+                replace(r, effect=other, parameters=sizes, refitted=False, same_as=r.effect, akin="", refit=None)
+            )
     return equal
 
 
