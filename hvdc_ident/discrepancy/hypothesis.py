@@ -156,9 +156,7 @@ class Refit:
     holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. predicted: root
     mean score of their prediction, or without them of parts of the fitted ones predicted from the rest (`prediction`); unseen_rows: of
     what it is the score of. std: standard deviation of each free parameter, of the effects and of the model, by its name in the model.
-    apart: of each effect, by how many standard deviations its parameters together are off doing nothing. information: (p,) of each
-    direction of the unknowns, the squared answer of the residuals to a step by one standard deviation of a uniform prior over the
-    bounds. ended: whether it came to its end, and was not only left where its evaluations were used up.
+    apart: of each effect, by how many standard deviations its parameters together are off doing nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
     """
 
     model: AnyModel
@@ -174,7 +172,6 @@ class Refit:
     unseen_rows: int = 0
     std: FrozenMap[float | None] = field(default_factory=FrozenMap)
     apart: tuple[float, ...] = ()
-    information: tuple[float, ...] = ()
     failure: str = ""
     ended: bool = True
 
@@ -268,7 +265,6 @@ class RefitResult:
     unseen_rows: int
     std: FrozenMap[float | None]
     apart: tuple[float, ...]
-    information: tuple[float, ...]
     failure: str
     ended: bool
 
@@ -370,15 +366,7 @@ def judged(refit: Refit) -> Refit:
         refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=root_mean_square(others),
         predicted=predictive_score(blocks, others),
         unseen_rows=rows if others is None else sum(b.residual.size for b in others), std=FrozenMap(std), apart=apart,
-        information=_information(refit.problem, blocks),
     )  # fmt: skip
-
-
-def _information(problem: Problem, blocks: Sequence[ResidualBlock]) -> tuple[float, ...]:
-    """Return (p,) the squared answers of the residuals along the principal directions of a uniform prior over the bounds."""
-    deviations = np.array([u.span for u in problem.unknowns]) / math.sqrt(12.0)
-    slopes = np.vstack([b.jacobian for b in blocks]) * deviations
-    return tuple(np.maximum(np.linalg.eigvalsh(slopes.T @ slopes), 0.0).tolist())
 
 
 def uncertainty_of(problem: Problem, blocks: Sequence[ResidualBlock]) -> Uncertainty:

@@ -21,6 +21,9 @@ from hvdc_ident.discrepancy.sentences import expression
 from hvdc_ident.effects import effects, split_sources
 from hvdc_ident.immutable import FrozenMap
 
+UNNOTICED_SHARE = 0.15
+"""Share of an effect's answer that a parameter more may change and not be missed where the evidence is weak."""
+
 
 def rivals(
     outcome: SearchOutcome, term: Term, options: DiagnosisOptions, tries: Callable[[str], bool] = lambda _: True
@@ -44,7 +47,18 @@ def rivals(
     best = min(s for _, _, s in members)
     each = [_rival(t, refits[t], s - best) for t, _, s in members]
     own = next(r for r, (t, _, _) in zip(each, members, strict=True) if t == term)
-    within = [r for r in each if r is own or r.delta_bic <= options.set_bic]
+    # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
+    alone = sum(r.delta_bic <= options.set_bic for r in each if r.is_effect) < 2
+    price = outcome.ruler.price
+    fall = 0.0 if base is None else outcome.ruler.between(base.refit, refits[term])
+    weak = fall * UNNOTICED_SHARE**2 < options.set_bic + price
+    within = [
+        r
+        for r in each
+        if r is own
+        or r.delta_bic
+        <= options.set_bic + (price if _more(r, own) == 1 and (not alone or _as_likely(own, r, weak)) else 0.0)
+    ]
     further: list[Rival] = []
     if found is not None and base is not None:
         none = next(s - h.prior_cost for h, s in outcome.pool if h.key == less)
@@ -52,7 +66,7 @@ def rivals(
         further = [
             r
             for r in each
-            if r not in within and r.is_effect and none - best - r.delta_bic >= most and _is_as_small(r, own)
+            if r not in within and r.is_effect and none - best - r.delta_bic >= most and _more(r, own) <= 0
         ]
         within += _unfitted(outcome, found, less, best, options)
         within += _at_rest(found, within)
@@ -68,7 +82,6 @@ def rivals(
     akin = [] if base is None else akin_of(base.refit, within, further)
     whole = [replace(r, akin=a) for r, a in zip([*within, *further], akin, strict=True)] if akin else within
     kept = [r for k, r in enumerate(whole) if k < len(within) or r.akin]
-    # A form that does the same as an effect of the catalogue in these records is its own tangent, and nothing else.
     return tuple(sorted((r for r in kept if not (r.akin and r.is_form)), key=lambda r: r.delta_bic))
 
 
@@ -76,10 +89,20 @@ def _key(r: Rival) -> tuple[str, tuple[str, ...], str, str]:
     return r.effect, r.at, r.source, r.expression
 
 
-def _is_as_small(one: Rival, other: Rival) -> bool:
-    """Return True where a rival has no parameter more than another."""
+def _more(one: Rival, other: Rival) -> int:
+    """Return how many parameters more a rival has than another."""
     assert one.refit is not None and other.refit is not None
-    return len(one.refit.problem.free) <= len(other.refit.problem.free)
+    return len(one.refit.problem.free) - len(other.refit.problem.free)
+
+
+def _as_likely(own: Rival, other: Rival, weak: bool) -> bool:
+    """Return True where a form with one more parameter stays possible though no other explains as much: at the same place, where the data
+    would not show what the parameter does (`weak`), or where both are kinds of delay and the one is no case of the other."""
+    if not (own.is_effect and other.is_effect) or own.is_form or other.is_form or own.at != other.at:
+        return False
+    one, two = effects()[own.effect], effects()[other.effect]
+    delays = one.equivalent_delay is not None and two.equivalent_delay is not None and one.name not in two.generalises
+    return weak or delays
 
 
 def _rival(term: Term, refit: Refit, behind: float) -> Rival:
@@ -117,6 +140,9 @@ def akin_of(before: Refit, group: Sequence[Rival], further: Sequence[Rival] = ()
             and (r.refitted and q.refitted and r.is_effect and q.is_effect)
             and q.at == r.at
             and q.kind != r.kind
+            and not q.is_form
+            # A form that does the same as what is linear is its own tangent; it is another hypothesis than a bend that is known.
+            and not (r.is_form and not in_proportion(q.refit.placed[-1].candidate, 0))
             and same_answers(r.refit, q.refit, before)
         )
         akin.append(next(earlier, ""))

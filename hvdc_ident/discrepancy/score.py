@@ -131,17 +131,6 @@ class Ruler:
         """Price of one more parameter, in BIC."""
         return float(np.log(self.effective))
 
-    def price_of(self, refit: Refit) -> float:
-        """Return the price of the unknowns of a refit, in BIC: `price` of each direction that its records determine, less of one that they
-        hardly do, and nothing of one that they do not.
-
-        Twice the logarithm of the share of a prior that is left after the records (Laplace), of a prior as wide as the bounds, or, where
-        that is narrower, as what one record says (Kass and Wasserman, JASA 90, 1995), which makes it BIC.
-        """
-        if not refit.information:
-            return self.price * len(refit.problem.names)
-        return float(np.sum(np.minimum(np.log1p(self.share * np.array(refit.information)), self.price)))
-
 
 def is_clear(refit: Refit, which: int) -> bool:
     """Return True where the parameters of an effect together are clearly off neutral."""

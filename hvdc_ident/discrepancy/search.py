@@ -7,7 +7,7 @@ The best hypothesis so far is the answer at every instant. The search ends when 
 or when the budget is over.
 
 The score is minus twice the log evidence, up to a constant: chi2 of the fitted and of the held-out records in units of what the best
-hypothesis leaves, the price of its unknowns (`score.Ruler.price_of`), and minus twice the log prior of the terms. Slight errors of what is
+hypothesis leaves, the logarithm of the independent rows for each unknown, and minus twice the log prior of the terms. Slight errors of what is
 stated go with every hypothesis (`stated`).
 """
 
@@ -273,8 +273,8 @@ class Search:
             chi2 += r.predicted**2 * r.unseen_rows * known / r.chi2
         # The row that leaves a record with a late clock takes its share of the noise along.
         chi2 += r.chi2 * (self.root.refit.rows / r.rows - 1.0)
-        clocks = ruler.price * sum(len(t.at) for t in h.terms if t.kind == CLOCKS)
-        return ruler.share * chi2 + ruler.price_of(r) + clocks + h.prior_cost
+        count = len(r.problem.names) + sum(len(t.at) for t in h.terms if t.kind == CLOCKS)
+        return ruler.share * chi2 + ruler.price * count + h.prior_cost
 
     def ranked(self) -> list[Hypothesis]:
         """Every hypothesis, the best first; of those far behind without slight errors."""

@@ -306,7 +306,7 @@ def test_a_form_outside_the_catalogue_is_as_likely_as_an_effect() -> None:
     there = apply_effects(model(), [{"effect": "saturation", "at": ["drag"], "parameters": {"level": 0.25}}])
     search = SearchContext(("saturation",), ("drag", "torque"), FrozenMap(), DiagnosisOptions(bootstraps=100), seed=0)
     found = expanded(search, plain(answered(there, experiments(), seed=0)))
-    assert [c.at for c in found.candidates] == [("torque",), ("drag",)]
+    assert [c.at for c in found.candidates] == [("drag",), ("torque",)]
     slots, signals = len(found.signals), len(source_signals(model(), found.signals))
     assert found.prior("saturation") == P_EFFECT / 2
     assert found.prior("polynomial") == pytest.approx(P_EFFECT / slots)

@@ -107,7 +107,7 @@ def opened(
     """Return what candidates are compared on beside a hypothesis, and their screen. Raises SimulationError where it cannot be run.
 
     number: of the expansion, for its noise. Each candidate is run in two sizes at first, and in the others where these promise much.
-    known: what was looked for beside the model without terms; candidates that promise little by the answers that they had there are not run.
+    known: what was looked for beside the model without terms; what promises little by the answers that it had there is not run.
     """
     search.tell(0, 1, f"round {number}: the signals")
     signals = slot_signals(here)
