@@ -152,6 +152,10 @@ class SimulationError(ComputationError):
     """A trajectory that did not reach its end."""
 
 
+class SteadyStartError(SimulationError):
+    """A trajectory that has no steady state to begin at, or none that was found."""
+
+
 class FitError(ComputationError):
     """An estimation that did not reach an optimum."""
 

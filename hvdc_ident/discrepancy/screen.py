@@ -22,6 +22,7 @@ from hvdc_ident.discrepancy.hypothesis import FAILURES
 from hvdc_ident.discrepancy.movable import Form, Movable, in_proportion, is_proportional, movable, on_loop
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.effects import apply_effects, distance_from_neutral, effects
+from hvdc_ident.errors import SteadyStartError
 from hvdc_ident.executor import Executor, mapped
 from hvdc_ident.fit import Problem
 from hvdc_ident.fit.problem import stacked
@@ -509,7 +510,7 @@ class _Runner:
             return self._from_rest[loop].misfits(theta, values)
         try:
             return self._problems[loop].misfits(theta, values)
-        except FAILURES:  # it leaves no steady state, as levels in a loop do not, or none near
+        except SteadyStartError:  # it leaves no steady state, as levels in a loop do not, or none near
             return self._from_rest[loop].misfits(theta, values)
 
 

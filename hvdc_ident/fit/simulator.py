@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hvdc_ident.data import Array, Experiment, Trajectory
-from hvdc_ident.errors import SimulationError, SteadyStateError, StudyError
+from hvdc_ident.errors import SimulationError, SteadyStartError, SteadyStateError, StudyError
 from hvdc_ident.fit.fit_parameter import FitParameter
 from hvdc_ident.parameters import Input, Parameter
 from hvdc_ident.sensitivity import SENSITIVITY_ERROR
@@ -190,7 +190,7 @@ def observe(
     nuisance: value of each nuisance by its name in the experiment; "time-shift" tau in s: the recorder's clock is late
     by tau, so a row at t shows y(t - tau); before the first row the outputs stand still. derivatives: whether they are
     wanted; without them the gradient has no column.
-    Raises SimulationError where the run fails, has no steady start or returns a value that is not finite.
+    Raises SimulationError where the run fails, has no steady start (SteadyStartError) or returns a value that is not finite.
     """
     nuisance = dict(nuisance or {})
     simulated, own, rows = _with_nuisances(simulator, experiment, nuisance) if nuisance else (experiment, {}, None)
@@ -198,7 +198,7 @@ def observe(
     try:
         run = simulator.simulate(simulated, {**values, **own}, wanted)
     except SteadyStateError as error:
-        raise SimulationError(f"no steady start: {error}") from error
+        raise SteadyStartError(f"no steady start: {error}") from error
     outputs = {o: np.asarray(run.trajectory[o], dtype=float) for o in experiment.outputs}
     none = np.empty((simulated.time.size, 0))
     gradients = {o: np.asarray(run.gradient(o), dtype=float) if wanted else none for o in experiment.outputs}

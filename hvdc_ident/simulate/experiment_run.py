@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, InputSignal, Trajectory
-from hvdc_ident.errors import ModelError, SimulationError, SteadyStateError, TimingError, require_known
+from hvdc_ident.errors import (
+    ModelError,
+    SimulationError,
+    SteadyStartError,
+    SteadyStateError,
+    TimingError,
+    require_known,
+)
 from hvdc_ident.expression import symbol
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, Model, ModelOrigin, State, fresh, is_white_box, rewritten
@@ -114,7 +121,7 @@ class ModelSimulator:
     ) -> Simulation:
         """Return a run of the experiment.
 
-        Raises SimulationError; values without a steady state, or with a negative delay, are a run that failed.
+        Raises SimulationError; values without a steady state (SteadyStartError), or with a negative delay, are a run that failed.
         """
         try:
             return simulate(
@@ -122,7 +129,8 @@ class ModelSimulator:
                 outputs=experiment.outputs or None, tolerance=self.tolerance, method=self.method,
             )  # fmt: skip
         except (SteadyStateError, TimingError) as e:
-            raise SimulationError(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None
+            kind = SteadyStartError if isinstance(e, SteadyStateError) else SimulationError
+            raise kind(e.what, where=e.where, expected=e.expected, got=e.got, hint=e.hint) from None
 
 
 @lru_cache(maxsize=256)

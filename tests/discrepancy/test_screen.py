@@ -19,6 +19,7 @@ from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.screen import ANY_FACTOR, SKETCHED, UP_TO_ONE, Linearised, Sketch, _Runner, screened
 from hvdc_ident.effects import Probe, apply_effects, effects
+from hvdc_ident.fit import Problem
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator, Tolerance
 from tests.discrepancy.cases import experiments, model
@@ -138,6 +139,26 @@ def test_a_sine_that_begins_at_its_peak_is_no_state_to_begin_from(lagged: Refit)
     sine = replace(sine, probes=()).with_sizes([wave | {"phase": p} for p in (0.0, np.pi / 2)], like=sine.probes)
     screen = expansion_model(lagged, (sine,)).screen((sine,), "both phases")
     assert screen.size[0, 1] == pytest.approx(screen.size[0, 0], rel=0.05)
+
+
+def test_a_run_that_stops_on_its_way_is_not_begun_elsewhere(lagged: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside levels of the error the integrator rests nowhere: that run begins where the drive rests without them. One that has taken
+    all its steps would take them again."""
+    (levels,) = listed(lagged, ("quantisation",), ("err",))
+    (fine,) = listed(lagged, ("quantisation",), ("outputs.w",))
+    fine = replace(fine, probes=()).with_sizes([{"step": 1e-6}], like=fine.probes)
+    begun: list[dict[str, float]] = []
+    plain_run = Problem.misfits
+
+    def counted(problem: Problem, theta: Array, also: dict[str, float]) -> Array:
+        begun.append(also)
+        return plain_run(problem, theta, also)
+
+    monkeypatch.setattr(Problem, "misfits", counted)
+    found = (replace(levels, probes=levels.probes[:1]), fine)
+    screen = expansion_model(lagged, found).screen(found, "two")
+    assert "step-limit" in screen.failures[1] and {s.candidate for s in screen.scores} == {0}
+    assert len(begun) == 3
 
 
 def test_sizes_that_were_run_are_not_run_again(lagged: Refit, monkeypatch: pytest.MonkeyPatch) -> None:
