@@ -67,6 +67,20 @@ def own(plant, values=None, hidden=(), rows=ROWS, **more):
     return simulate(plant, [run], hidden, rows=rows, **more)[:, 0]
 
 
+@pytest.mark.parametrize(("name", "value"), [("xq", 1.55), ("xq", 3.57), ("xdp", 0.13)])
+def test_a_machine_whose_regulator_is_at_its_limit_on_the_way_begins_at_rest(name, value):
+    """Newton's method goes in circles there: with the regulator at its limit nothing holds the voltage."""
+    mine, theirs = own(MACHINE, {name: value}), packages(MACHINE, model_of("machine"), {name: value})
+    quiet = np.arange(ROWS) * MACHINE.interval < 0.0402 * MACHINE.pace
+    np.testing.assert_allclose(mine[quiet], np.broadcast_to(mine[0], mine[quiet].shape), rtol=0, atol=1e-9)
+    assert (np.abs(mine - theirs) < 3e-4 * np.ptp(theirs, axis=0)).all()
+
+
+def test_a_run_that_cannot_rest_has_diverged_from_the_start():
+    found = simulate(PLANTS["station"], [Run(), Run(values={"Z": 1.0})], rows=3)
+    assert np.isfinite(found[:, 0]).all() and np.isnan(found[:, 1]).all()
+
+
 def test_the_machine_has_the_published_constants_by_card_and_by_simulator():
     model = model_of("machine")
     found = linearize(model, inputs="Vref", outputs="Vt")

@@ -20,6 +20,10 @@ from hidden.plant import INTERVAL, STEP, Plant
 Array = NDArray[np.floating]
 CORRECTIONS = 2
 """Of the trapezoidal rule in a step: with the fastest root times half a step at 0.03 the last one changes 1e-5 of the step."""
+AT_REST = 1e-9
+"""Change of a state from row to row, of 1 and its size, below which it rests: over a record no noise of the study hides more."""
+SETTLING, LONGER = 1e7, 1.2
+"""Steps of the integration that the longest step has by which a plant is followed to its rest, and times the one before that each has."""
 __all__ = ["INTERVAL", "STEP", "Hidden", "Run", "Signal", "simulate"]
 
 
@@ -188,26 +192,55 @@ class _Batch:
         return x[self.states[source]] if source in self.states else self.seen[source]
 
     def _rest(self) -> list[Array]:
-        """Return the steady state by Newton's method with differences, and initialise the operators there."""
+        """Return the steady state, and initialise the operators there; NaN of a run that has none and does not wait for it.
+
+        By Newton's method; where a limit of the plant lets that go in circles, the plant is followed in time until it rests.
+        """
         inputs = {n: v[0, 0] for n, v in self.inputs.items()}
         m = len(self.plant.states)
-        x = [np.full(self.n, g) for g in self.plant.states.values()]
+        guess = [np.full(self.n, g) for g in self.plant.states.values()]
+        x, lost = self._newton(guess, inputs)
+        if lost.any():
+            settled, lost_still = self._newton(self._settled(guess, inputs), inputs)
+            x = [np.where(lost & ~lost_still, b, a) for a, b in zip(x, settled, strict=True)]
+            if not self.lead:
+                x = [np.where(lost & lost_still, np.nan, a) for a in x]
+        x = x + [np.zeros(self.n) for _ in range(self.count - m)]
+        self._flow("begin", x, inputs, 0.0, 0.0)
+        return x
+
+    def _newton(self, x: list[Array], inputs: Mapping[str, Array]) -> tuple[list[Array], Array]:
+        """Return where Newton's method ends, and (runs,) whether that is no steady state."""
         for _ in range(60):
-            f = self._unrest(x, inputs)
-            jac = np.empty((self.n, m, m))
-            for j in range(m):
-                d = 1e-6 * (1.0 + np.abs(x[j]))
-                moved = [*x[:j], x[j] + d, *x[j + 1 :]]
-                jac[:, :, j] = ((self._unrest(moved, inputs) - f) / d).T
+            f, jac = self._slopes(x, inputs)
             bad = np.abs(np.linalg.det(jac)) < 1e-12
-            jac[bad] += 1e-6 * np.eye(m)
+            jac[bad] += 1e-6 * np.eye(len(x))
             change = np.linalg.solve(jac, f.T[:, :, None])[:, :, 0].T
             x = [a - np.clip(c, -0.5, 0.5) for a, c in zip(x, change, strict=True)]
             if np.abs(change).max() < 1e-12:
                 break
-        x = x + [np.zeros(self.n) for _ in range(self.count - m)]
-        self._flow("begin", x, inputs, 0.0, 0.0)
+        drift = np.abs(self._unrest(x, inputs)) * self.plant.interval / (1.0 + np.abs(np.array(x)))
+        return x, ~(drift.max(axis=0) < AT_REST)
+
+    def _settled(self, x: list[Array], inputs: Mapping[str, Array]) -> list[Array]:
+        """Return where the plant comes to by implicit Euler steps, each longer than the one before: it ends at rest, if it does."""
+        h = self.h
+        while h < SETTLING * self.h:
+            f, jac = self._slopes(x, inputs)
+            change = np.linalg.solve(np.eye(len(x)) / h - jac, f.T[:, :, None])[:, :, 0].T
+            x = [a + c for a, c in zip(x, change, strict=True)]
+            h *= LONGER
         return x
+
+    def _slopes(self, x: list[Array], inputs: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Return the derivatives, (states, runs), and by differences their own by the states, (runs, states, states)."""
+        f = self._unrest(x, inputs)
+        jac = np.empty((self.n, len(x), len(x)))
+        for j in range(len(x)):
+            d = 1e-6 * (1.0 + np.abs(x[j]))
+            moved = [*x[:j], x[j] + d, *x[j + 1 :]]
+            jac[:, :, j] = ((self._unrest(moved, inputs) - f) / d).T
+        return f, jac
 
     def _unrest(self, x: list[Array], inputs: Mapping[str, Array]) -> Array:
         """Return (states, runs), by which the derivatives of the plant's states are not those of a steady state."""
