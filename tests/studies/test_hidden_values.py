@@ -101,7 +101,15 @@ def test_the_mess_is_that_of_a_plant_with_the_true_value():
 
 @pytest.mark.parametrize(
     ("plant", "moved", "expected"),
-    [*((n, {}, True) for n in PLANTS), ("machine", {"xe": 1.45}, False), ("machine", {"xdp": 1.17}, False)],
+    [
+        *((n, {}, True) for n in PLANTS),
+        ("machine", {"xe": 1.45}, False),
+        ("machine", {"xdp": 1.17}, False),
+        # Of these a root finder from the same guess finds a steady state with the field reversed, beyond the pull-out.
+        ("machine", {"xq": 3.9}, False),
+        ("machine", {"xq": 1.37}, True),
+        ("machine", {"xdp": 0.173}, True),
+    ],
 )
 def test_a_plant_is_stable_where_the_package_finds_its_eigenvalues_to_be(plant, moved, expected):
     model = model_of(plant).with_values(moved)

@@ -104,7 +104,7 @@ class Integration:
             rates[k] = motion.unrest(x[k], rates[k])
         return np.stack(np.broadcast_arrays(*rates))
 
-    def _at_rest(self) -> Array:
+    def at_rest(self) -> Array:
         """Return all states at rest, (states, runs), and begin what is hidden there.
 
         Newton's method, with the plant beside its state moved by a little in each of its states at once.
@@ -178,7 +178,7 @@ class Integration:
             return self._rows()
 
     def _rows(self) -> Array:
-        x = self._at_rest()
+        x = self.at_rest()
         found = np.full((self.rows, x.shape[1], len(self.watch)), np.nan)
         for step in range(self.steps):
             row, rest = divmod(step - self.ahead, self.per_row)

@@ -24,7 +24,7 @@ AT_REST = 1e-9
 """Change of a state from row to row, of 1 and its size, below which it rests: over a record no noise of the study hides more."""
 SETTLING, LONGER = 1e7, 1.2
 """Steps of the integration that the longest step has by which a plant is followed to its rest, and times the one before that each has."""
-__all__ = ["INTERVAL", "STEP", "Hidden", "Run", "Signal", "simulate"]
+__all__ = ["INTERVAL", "STEP", "Hidden", "Run", "Signal", "at_rest", "simulate"]
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,20 @@ def simulate(
     step = plant.step if step is None else step
     lead = plant.lead if lead is None else lead
     watch = tuple(watch) or tuple(f"outputs.{o}" for o in plant.outputs)
-    kind = {"runge-kutta": _RungeKutta, "trapezoidal": _Trapezoidal, "kutta": Integration}[plant.scheme]
-    return kind(plant, runs, hidden, rows, interval, watch, step, lead, coarse).result()
+    return _kind(plant)(plant, runs, hidden, rows, interval, watch, step, lead, coarse).result()
+
+
+def at_rest(plant: Plant, runs: Sequence[Run]) -> Array:
+    """Return (states, runs): where the runs begin. NaN of one that has no steady state, or anything in a plant of `kutta`."""
+    watch = tuple(f"outputs.{o}" for o in plant.outputs)
+    batch = _kind(plant)(plant, runs, (), 1, plant.interval, watch, plant.step, plant.lead, False)
+    with np.errstate(all="ignore"):
+        return np.array(batch.at_rest())[: len(plant.states)]
+
+
+def _kind(plant: Plant) -> type[_Batch | Integration]:
+    """Return the integrator of a plant."""
+    return {"runge-kutta": _RungeKutta, "trapezoidal": _Trapezoidal, "kutta": Integration}[plant.scheme]
 
 
 class _Batch:
@@ -191,7 +203,7 @@ class _Batch:
             return inputs[source]
         return x[self.states[source]] if source in self.states else self.seen[source]
 
-    def _rest(self) -> list[Array]:
+    def at_rest(self) -> list[Array]:
         """Return the steady state, and initialise the operators there; NaN of a run that has none and does not wait for it.
 
         By Newton's method; where a limit of the plant lets that go in circles, the plant is followed in time until it rests.
@@ -255,7 +267,7 @@ class _Batch:
             return self._result()
 
     def _result(self) -> Array:
-        x = np.array(self._rest())
+        x = np.array(self.at_rest())
         out = np.full((self.rows, self.n, len(self.watch)), np.nan)
         for step in range(self.steps):
             row = step >= self.lead and (step - self.lead) % self.every == 0

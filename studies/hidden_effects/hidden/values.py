@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import root
 
 from hidden.plant import Plant
-from hidden.simulator import Run, simulate
+from hidden.simulator import Run, at_rest, simulate
 from hidden.sizes import FARTHEST, Nominal, ranges, units
 
 Array = NDArray[np.floating]
@@ -76,7 +76,8 @@ def misstated(
 def stable(plant: Plant, values: Mapping[str, float]) -> bool:
     """Return True if the plant comes to rest at its inputs and goes back there: all eigenvalues have negative real parts.
 
-    Where its steady states turn, they and the eigenvalues are those in the frame that turns with them.
+    A plant may have other steady states, as a machine beyond its pull-out: it is asked where its runs begin. Where its steady states
+    turn, they and the eigenvalues are those in the frame that turns with them.
     """
     inputs = {n: np.array([v]) for n, v in {**plant.inputs, "time": 0.0}.items()}
     parameters = {n: np.array([values.get(n, v)]) for n, v in plant.parameters.items()}
@@ -87,8 +88,9 @@ def stable(plant: Plant, values: Mapping[str, float]) -> bool:
         return np.asarray(moving if plant.turning is None else moving - np.array(plant.turning(states)))[:, 0]
 
     with np.errstate(all="ignore"):
-        rest = root(rates, list(plant.states.values()))
-        if not rest.success:
+        begin = at_rest(plant, [Run(values=values)])[:, 0]
+        rest = root(rates, begin) if np.isfinite(begin).all() else None
+        if rest is None or not rest.success:
             return False
         little = 1e-6 * np.diag(1.0 + np.abs(rest.x))
         slopes = [(rates(rest.x + d) - rates(rest.x - d)) / (2.0 * d.sum()) for d in little]
