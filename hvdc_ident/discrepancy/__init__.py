@@ -8,13 +8,13 @@ free parameters are refitted with them. The way of one diagnosis through the mod
     prediction, score       how likely records that it has not seen are under a refit; refits compared, and what speaks against one
     candidates, movable     every effect at every place in a few sizes; an effect compiled once whose place is chosen at run time
     screen, expansion       all of them simulated, with the parameters' answer; the best refitted in a race
-    effect_moves            what is looked for beside a hypothesis: sizes that no slope leads to (sizes), forms outside the
-                            catalogue (outside)
-    stated, clocks          stated values, slightly or plainly wrong; records moved to where their clocks are right
+    stated                  stated values, slightly or plainly wrong
     search                  one queue of hypotheses and moves, the best first by one score
-    classes                 terms that the records do not distinguish, and the values of the parameters that they imply
+    moves                   what makes of a hypothesis others, one kind of term a module: a new one is a module more
+    rivals                  terms that the records do not distinguish, and the values of the parameters that they imply
     pushes, remainder       what any effect at an insertion point could explain, and what of it is left
-    conclusion, findings    what is said, in sentences (sentences, stand_ins), of what is where (location, residual_checks)
+    conclusion              the verdict; description, sentences: what is said of each thing found, of what is where (location,
+                            residual_checks)
     diagnosis, result       the verb and its result
 """
 

@@ -64,9 +64,10 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
         return Conclusion("unnameable", text, tests, instead=tuple(h.refit for h in outcome.forms))
     if not outcome.named:
         return _nothing(search, last, outcome, tests)
-    remainder = _with_terms(remainder_of(search, first, last, misfit_of(last).floor), outcome)
     labels = ", ".join(t.label for t in outcome.named)
-    if remainder.share > 1.0 - LEAST_EXPLAINED:
+    looked = outcome.exhausted or bool(outcome.expansions)
+    remainder = _with_terms(remainder_of(search, first, last, misfit_of(last).floor), outcome)
+    if looked and remainder.share > 1.0 - LEAST_EXPLAINED:
         text = f"Something is missing; the best of what was tried ({labels}) explains only {gap_text(1.0 - remainder.share)} of the gap."
         return Conclusion("unnameable", text, tests, remainder=remainder)
     sets = tuple(rivals(outcome, t, options, search.tries) for t in outcome.named)
@@ -79,7 +80,7 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
             forms = tuple(r.refit for r, _ in likeliest.members if r.refit is not None)
             return Conclusion("unnameable", text, tests, instead=forms[:1], remainder=remainder)
     found = Conclusion("named", "", tests, sets, remainder=remainder)
-    if not (outcome.exhausted or outcome.expansions):
+    if not looked:
         return _in_doubt(found, labels, NOT_LOOKED_AT)
     return _weighed(outcome, last.nominal(), first.chi2 - last.chi2, found, labels, options.significance)
 

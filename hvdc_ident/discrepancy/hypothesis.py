@@ -156,7 +156,8 @@ class Refit:
     holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. predicted: root
     mean score of their prediction, or without them of parts of the fitted ones predicted from the rest (`prediction`); unseen_rows: of
     what it is the score of. std: standard deviation of each free parameter, of the effects and of the model, by its name in the model.
-    apart: of each effect, by how many standard deviations its parameters together are off doing nothing. ended: whether it came to its end, and was not only left where its evaluations were used up.
+    apart: of each effect, by how many standard deviations its parameters together are off doing nothing. ended: whether
+    it came to its end, and was not only left where its evaluations were used up.
     """
 
     model: AnyModel

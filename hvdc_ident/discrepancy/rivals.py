@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import CERTAIN, TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.result import VALUE, Hypothesis, Rival
-from hvdc_ident.discrepancy.score import TIED, apart, at_edge, implied, nearest, off_given, same_answers
+from hvdc_ident.discrepancy.score import TIED, Ruler, apart, at_edge, implied, nearest, off_given, same_answers
 from hvdc_ident.discrepancy.search import SearchOutcome, Term
 from hvdc_ident.discrepancy.sentences import expression
 from hvdc_ident.effects import effects, split_sources
@@ -68,7 +68,8 @@ def rivals(
             for r in each
             if r not in within and r.is_effect and none - best - r.delta_bic >= most and _more(r, own) <= 0
         ]
-        within += _unfitted(outcome, found, less, best, options)
+        gain = max(outcome.ruler.between(base.refit, r.refit) for r in within if r.refit is not None)
+        within += _unfitted(found, gain, outcome.ruler, options)
         within += _at_rest(found, within)
         within += _equal(found, within, tries)
     once: dict[tuple[str, tuple[str, ...], str, str], Rival] = {}
@@ -149,12 +150,11 @@ def akin_of(before: Refit, group: Sequence[Rival], further: Sequence[Rival] = ()
     return akin
 
 
-def _unfitted(
-    outcome: SearchOutcome, found: Expansion, less: frozenset[Term], best: float, options: DiagnosisOptions
-) -> list[Rival]:
-    """Candidates that were not refitted but, being linear in their size, gain what their screen says."""
-    ruler = outcome.ruler
-    none = next(s - h.prior_cost for h, s in outcome.pool if h.key == less)
+def _unfitted(found: Expansion, best: float, ruler: Ruler, options: DiagnosisOptions) -> list[Rival]:
+    """Candidates that were not refitted but, being linear in their size, gain what their screen says.
+
+    best: what the best of those refitted gains on the fitted records.
+    """
     done = {t.score.candidate for t in found.trials}
     group = []
     for k, score in found.screen.best().items():
@@ -162,7 +162,7 @@ def _unfitted(
         if k in done or score.probe >= len(c.probes) or not in_proportion(c, score.probe):
             continue
         probe = c.probes[score.probe]
-        behind = none - ruler.gain(score.fall, 0.0, len(probe.free)) - best
+        behind = best - ruler.gain(score.fall, 0.0, len(probe.free))
         if behind <= options.set_bic:
             only = dict(probe.values) if len(probe.free) == 1 else {}
             sizes = FrozenMap({n: score.factor * v if n in probe.free else v for n, v in only.items()})
@@ -241,8 +241,9 @@ class EffectClass:
 
     @property
     def differs(self) -> bool:
-        """True where likely members imply different values of the model's parameters: what these are is not known then."""
-        likely_ones = [r.values for r, _ in credible(self.members) if r.refitted]
+        """True where its likely places imply different values of the model's parameters: what these are is not known then."""
+        kind = self.best.effect
+        likely_ones = [r.values for r, _ in credible(self.members) if r.refitted and r.effect == kind]
         return any(apart(one, other) for one, other in combinations(likely_ones, 2))
 
     @property

@@ -7,8 +7,8 @@ The best hypothesis so far is the answer at every instant. The search ends when 
 or when the budget is over.
 
 The score is minus twice the log evidence, up to a constant: chi2 of the fitted and of the held-out records in units of what the best
-hypothesis leaves, the logarithm of the independent rows for each unknown, and minus twice the log prior of the terms. Slight errors of what is
-stated go with every hypothesis (`stated`).
+hypothesis leaves, the logarithm of the independent rows for each unknown, and minus twice the log prior of the terms. Slight errors of
+what is stated go with every hypothesis (`stated`).
 """
 
 from __future__ import annotations
@@ -287,7 +287,9 @@ class Search:
         limit = min(self.cost(h, ruler) for h in rough[:3]) + most + self.near
         close = [h for h in rough if self.cost(h, ruler, rough=True) <= limit]
         scored = sorted(((h, self.cost(h, ruler)) for h in close), key=lambda one: one[1])
-        return [*scored, *((h, self.cost(h, ruler, rough=True)) for h in rough[len(close) :])]
+        # Of the model without terms the errors are known anyway.
+        far = ((h, self.cost(h, ruler, rough=h is not self.root)) for h in rough[len(close) :])
+        return [*scored, *far]
 
     @property
     def near(self) -> float:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
-from hvdc_ident.discrepancy import findings as description
+from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, description, diagnose
 from hvdc_ident.discrepancy.conclusion import Conclusion, headline, leaves_more_than_noise
 from hvdc_ident.discrepancy.hypothesis import refitted
 from hvdc_ident.discrepancy.misfit import misfit_of

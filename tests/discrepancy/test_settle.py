@@ -126,10 +126,12 @@ def test_what_could_not_be_refitted_stays_told(first: Refit) -> None:
 def test_what_could_not_be_looked_for_beside_an_effect_is_told_and_the_effect_stays(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def stopped(context: SearchContext, here: Refit, number: int) -> tuple[ExpansionModel, Expansion]:
+    def stopped(
+        context: SearchContext, here: Refit, number: int, known: Expansion | None = None
+    ) -> tuple[ExpansionModel, Expansion]:
         if here.placed:
             raise SimulationError("the simulation stopped", got="step-limit")
-        return opened(context, here, number)
+        return opened(context, here, number, known)
 
     monkeypatch.setattr(moves_of_effects, "opened", stopped)
     outcome = search_from(looking_for(("lag", "offset"), ("wm", "drag")), plain(experiments(lag=0.03, offset=0.3)))
