@@ -12,8 +12,9 @@ import numpy as np
 
 from hvdc_ident.discrepancy.expansion import Expansion
 from hvdc_ident.discrepancy.hypothesis import Refit
+from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.movable import in_proportion
-from hvdc_ident.discrepancy.options import CERTAIN, TOLERANCE, DiagnosisOptions
+from hvdc_ident.discrepancy.options import CERTAIN, REFUTED, TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.result import VALUE, Hypothesis, Rival
 from hvdc_ident.discrepancy.score import TIED, Ruler, apart, at_edge, implied, nearest, off_given, same_answers
 from hvdc_ident.discrepancy.search import SearchOutcome, Term
@@ -42,7 +43,12 @@ def rivals(
     members = [
         (t, h, s)
         for t, h, s in members
-        if t == term or not t.is_effect or not at_edge(refits[t], len(refits[t].placed) - 1)
+        if t == term
+        or not t.is_effect
+        or (
+            not at_edge(refits[t], len(refits[t].placed) - 1)
+            and _is_law(t, refits[t], None if base is None else base.refit)
+        )
     ]
     best = min(s for _, _, s in members)
     each = [_rival(t, refits[t], s - best) for t, _, s in members]
@@ -84,6 +90,18 @@ def rivals(
     whole = [replace(r, akin=a) for r, a in zip([*within, *further], akin, strict=True)] if akin else within
     kept = [r for k, r in enumerate(whole) if k < len(within) or r.akin]
     return tuple(sorted((r for r in kept if not (r.akin and r.is_form)), key=lambda r: r.delta_bic))
+
+
+def _is_law(term: Term, refit: Refit, before: Refit | None) -> bool:
+    """Return True for an effect of the catalogue, and for a formula or filter that what it leaves does not refute.
+
+    A curve of free values bends to what other values of the parameters would make good: it is told where nothing else explains anything.
+    """
+    if not term.is_form or before is None:
+        return not term.is_form
+    return effects()[term.kind].outside != "curve" and not misfit_of(refit).is_far_from_noise(
+        misfit_of(before), REFUTED
+    )
 
 
 def _key(r: Rival) -> tuple[str, tuple[str, ...], str, str]:

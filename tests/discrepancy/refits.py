@@ -57,11 +57,10 @@ def search_from(context: SearchContext, first: Refit) -> SearchOutcome:
 
 
 def expanded(context: SearchContext, first: Refit) -> Expansion:
-    """What every move that looks for effects of the catalogue finds beside a model: its trials, the best first, then those that failed."""
+    """What every move that looks for effects of the catalogue finds beside a model, with the trials that came to an end, the best first."""
     search = Search(context, first, MOVES)
     for move in MOVES:
         if move.name not in ("values", "clocks", "cards", "forms in the stead", "forms", "as given"):
             search.add(move.make(search, search.root))
     found = search.expansions[search.root.key]
-    failed = [t for t in found.trials if t.refit.failure]
-    return replace(found, trials=(*by_cost(found.trials), *failed))
+    return replace(found, trials=tuple(by_cost(found.trials)))

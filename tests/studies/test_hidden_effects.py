@@ -422,7 +422,7 @@ def test_the_sensitivity_study_sets_a_number_wherever_it_is_used_and_sets_it_bac
 
     study = load("hidden_effects", "sensitivity")
     by_label = {n.label: n for n in study.numbers()}
-    assert {"options.TOLERANCE", "score.PARAMETER_PRICE", "options.set_bic"} <= set(by_label)
+    assert {"options.TOLERANCE", "score.TIED", "options.set_bic"} <= set(by_label)
     with study.changed(by_label["options.TOLERANCE"], 0.3) as changed:
         assert options.TOLERANCE == remainder.TOLERANCE == conclusion.TOLERANCE == 0.3 and changed == DiagnosisOptions()
     assert options.TOLERANCE == remainder.TOLERANCE == conclusion.TOLERANCE == by_label["options.TOLERANCE"].value
