@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit, signal
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.nominal import Nominal
 from hvdc_ident.discrepancy.options import CERTAIN, LISTED, REFUTED, TOLERANCE, SearchContext
-from hvdc_ident.discrepancy.remainder import Remainder, remainder_of
+from hvdc_ident.discrepancy.remainder import Remainder, remainder_of, share_left
 from hvdc_ident.discrepancy.residual_checks import Binned, constancy, residual_tests
 from hvdc_ident.discrepancy.result import Finding, FoundEffect, Rival, ValueAt, Verdict
 from hvdc_ident.discrepancy.rivals import EffectClass, classes, likely, rivals
@@ -88,13 +88,11 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
 def _with_terms(remainder: Remainder, outcome: SearchOutcome) -> Remainder:
     """The remainder with what is left as a share of what each term explains beside the others."""
     last, floor = outcome.refit, misfit_of(outcome.refit).floor
-    left = max(last.chi2 - floor * last.rows, 0.0)
-    each = []
-    for t in outcome.named:
-        less = outcome.hypotheses.get(outcome.best.without(t))
-        fall = 0.0 if less is None else max(less.refit.chi2 - last.chi2, 0.0)
-        each.append(left / (left + fall) if left > 0.0 else 0.0)
-    return replace(remainder, of_terms=tuple(each))
+    without = [outcome.hypotheses.get(outcome.best.without(t)) for t in outcome.named]
+    shares = [None if less is None else share_left(less.refit, last, floor) for less in without]
+    # Without a gap, or a model to compare with, a term explains none of what is left.
+    none = float(last.chi2 > floor * last.rows)
+    return replace(remainder, of_terms=tuple(none if share is None else share for share in shares))
 
 
 def _weighed(
@@ -208,18 +206,13 @@ def _remainder_text(remainder: Remainder, significance: float) -> str:
         explains = f" and which an unknown input at {remainder.at} would explain" if remainder.at else ""
         said = f"{left} of the gap is left, which is no noise{explains}"
         if len(remainder.of_terms) > 1 and own > REFUTED:
-            said += f"; one of them explains {_times((1.0 - own) / own)} as much as that"
+            said += f"; one of them explains {figures((1.0 - own) / own, 2)} times as much as that"
         parts.append(said)
     held = remainder.held_out or 0.0
     if held > TOLERANCE and remainder.held_out_p <= significance:
         record = f", most of it in '{remainder.record}' ({figures(remainder.record_units, 3)} times the noise)"
         parts.append(f"{gap_text(held)} of the held-out gap is left{record if remainder.record else ''}")
     return "; ".join(parts)
-
-
-def _times(ratio: float) -> str:
-    """Return a ratio in words, as before `as much`."""
-    return f"{figures(ratio, 2)} times"
 
 
 def _prefix(found: Conclusion) -> str:

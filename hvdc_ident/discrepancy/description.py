@@ -1,4 +1,4 @@
-"""What is said of each thing that was found: the finding of an effect, a value or a component, and the description of a form."""
+"""Findings of effects, values and components, with their sentences, and descriptions of forms outside the catalogue."""
 
 from __future__ import annotations
 

@@ -147,7 +147,7 @@ class Trial:
 
 @dataclass(frozen=True, eq=False)
 class Expansion:
-    """What was looked for beside a hypothesis, `before`.
+    """Candidates beside a hypothesis, `before`: their screen, and the refits of some.
 
     signals: at the model's slots, those of measured outputs included, one array an experiment, at its rows. trials: of each candidate
     that was refitted the best refit, failed ones too. led: by candidate the cost of the refit from whose gains others were looked for.

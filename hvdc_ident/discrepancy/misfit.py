@@ -11,7 +11,7 @@ import numpy as np
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.nominal import Nominal, noise_left, of_held_out
-from hvdc_ident.discrepancy.options import DiagnosisOptions
+from hvdc_ident.discrepancy.options import REFUTED, DiagnosisOptions
 from hvdc_ident.discrepancy.residual_checks import is_louder_after_breaks, residual_tests
 from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.fit.noise import SURE, freedom_of
@@ -98,6 +98,10 @@ class Misfit:
             return True
         held = of_held_out(r.problem)
         return held is not None and _is_unstructured(Nominal(held, r.theta[: len(held.free)], r.noise))
+
+    def is_small_beside(self, before: Misfit) -> bool:
+        """Return True where it is so small a share of the misfit before that it does not refute what was added."""
+        return self.beyond <= REFUTED * before.beyond
 
     def is_far_from_noise(self, before: Misfit, near: float = SMALL_REMAINDER) -> bool:
         """Return True where it comes near neither the noise nor a small share of the misfit before."""

@@ -125,9 +125,7 @@ def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
     if not np.isfinite(square):
         return 0.0
     if others is None:  # parts of the fitted records, whose noise is known from before the event
-        rows = last.unseen_rows * last.effective / last.rows
-        freedom = freedom_of(last.noise, last.problem.outputs)
-        return float(chdtrc(rows, square * rows) if np.isinf(freedom) else fdtrc(rows, freedom, square))
+        return _loud_p(last, square, last.unseen_rows * last.effective / last.rows)
     held = Nominal(others, last.theta[: len(last.problem.free)], last.noise)
     drawn = draws(others, held.blocks, held.noise, held.fitted(), _least_draws(search), search.seed + 6)
     rows = sum(b.residual.size for b in held.blocks)
@@ -135,10 +133,9 @@ def _held_out_p(search: SearchContext, last: Refit, square: float) -> float:
     return float((1 + np.count_nonzero(squares / rows >= square)) / (1 + _least_draws(search)))
 
 
-def _loud_p(last: Refit) -> float:
-    """The chance that noise is as loud as the fitted residual, with what is not known of its level."""
-    freedom, square = freedom_of(last.noise, last.problem.outputs), last.chi2 / last.rows
-    rows = last.effective
+def _loud_p(last: Refit, square: float, rows: float) -> float:
+    """The chance that the mean square of noise in so many independent rows reaches this one, with what is not known of its level."""
+    freedom = freedom_of(last.noise, last.problem.outputs)
     return float(chdtrc(rows, square * rows) if np.isinf(freedom) else fdtrc(rows, freedom, square))
 
 
@@ -168,7 +165,7 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     nominal = last.nominal()
     if misfit_of(last).is_noise:
         return found
-    found = replace(found, p=_loud_p(last))
+    found = replace(found, p=_loud_p(last, last.chi2 / last.rows, last.effective))
     if not is_white_box(last.model) or search.spent:
         return found
     try:

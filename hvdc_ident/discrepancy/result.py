@@ -102,7 +102,7 @@ class Rival:
 
     @property
     def is_form(self) -> bool:
-        """Whether it is a form outside the catalogue."""
+        """True for a form outside the catalogue."""
         known = effects().get(self.effect) if self.is_effect else None
         return known is not None and bool(known.outside or known.needs_expression)
 

@@ -35,28 +35,17 @@ def rivals(
     the last unit of evidence. So are effects that are the same equation. tries: whether an effect is one of those that are looked for.
     """
     less = outcome.best.without(term)
-    members = outcome.in_stead_of(term)
-    base = outcome.hypotheses.get(less)
-    found = outcome.expansions.get(less)
-    # One that explains as much is no nothing, even where gains make good any size of it; one at its edge is another's work.
-    refits = {t: h.refit_of(t) for t, h, _ in members}
-    members = [
-        (t, h, s)
-        for t, h, s in members
-        if t == term
-        or not t.is_effect
-        or (
-            not at_edge(refits[t], len(refits[t].placed) - 1)
-            and _is_law(t, refits[t], None if base is None else base.refit)
-        )
-    ]
-    best = min(s for _, _, s in members)
-    each = [_rival(t, refits[t], s - best) for t, _, s in members]
+    base, found = outcome.hypotheses.get(less), outcome.expansions.get(less)
+    before = None if base is None else base.refit
+    every = [(t, h.refit_of(t), score) for t, h, score in outcome.in_stead_of(term)]
+    members = [(t, refit, score) for t, refit, score in every if t == term or _stands(t, refit, before)]
+    best = min(score for _, _, score in members)
+    each = [_rival(t, refit, score - best) for t, refit, score in members]
     own = next(r for r, (t, _, _) in zip(each, members, strict=True) if t == term)
     # Where several explain the data anyway, one with a parameter more that explains as much is not refuted by its price.
     alone = sum(r.delta_bic <= options.set_bic for r in each if r.is_effect) < 2
     price = outcome.ruler.price
-    fall = 0.0 if base is None else outcome.ruler.between(base.refit, refits[term])
+    fall = 0.0 if before is None or own.refit is None else outcome.ruler.between(before, own.refit)
     weak = fall * UNNOTICED_SHARE**2 < options.set_bic + price
     within = [
         r
@@ -66,7 +55,7 @@ def rivals(
         <= options.set_bic + (price if _more(r, own) == 1 and (not alone or _as_likely(own, r, weak)) else 0.0)
     ]
     further: list[Rival] = []
-    if found is not None and base is not None:
+    if found is not None and before is not None:
         none = next(s - h.prior_cost for h, s in outcome.pool if h.key == less)
         most = (1.0 - TOLERANCE) * (none - own.delta_bic - best)
         further = [
@@ -74,7 +63,7 @@ def rivals(
             for r in each
             if r not in within and r.is_effect and none - best - r.delta_bic >= most and _more(r, own) <= 0
         ]
-        gain = max(outcome.ruler.between(base.refit, r.refit) for r in within if r.refit is not None)
+        gain = max(outcome.ruler.between(before, r.refit) for r in within if r.refit is not None)
         within += _unfitted(found, gain, outcome.ruler, options)
         within += _at_rest(found, within)
         within += _equal(found, within, tries)
@@ -86,17 +75,20 @@ def rivals(
             same[_key(r)] = r.same_as
     within = [replace(r, same_as=same.get(key, "")) for key, r in once.items()]
     further = [r for r in further if _key(r) not in once]
-    akin = [] if base is None else akin_of(base.refit, within, further)
+    akin = [] if before is None else akin_of(before, within, further)
     whole = [replace(r, akin=a) for r, a in zip([*within, *further], akin, strict=True)] if akin else within
     kept = [r for k, r in enumerate(whole) if k < len(within) or r.akin]
     return tuple(sorted((r for r in kept if not (r.akin and r.is_form)), key=lambda r: r.delta_bic))
 
 
-def _is_law(term: Term, refit: Refit, before: Refit | None) -> bool:
-    """Return True for an effect of the catalogue, and for a formula or filter that what it leaves does not refute.
+def _stands(term: Term, refit: Refit, before: Refit | None) -> bool:
+    """Return True for a term that something may be called by: no effect at its edge, which is another's work, and of forms a formula or
+    filter that what it leaves does not refute.
 
     A curve of free values bends to what other values of the parameters would make good: it is told where nothing else explains anything.
     """
+    if term.is_effect and at_edge(refit, len(refit.placed) - 1):
+        return False
     if not term.is_form or before is None:
         return not term.is_form
     return effects()[term.kind].outside != "curve" and not misfit_of(refit).is_far_from_noise(

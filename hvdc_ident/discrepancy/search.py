@@ -31,7 +31,7 @@ from hvdc_ident.discrepancy.hypothesis import (
 )
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.nominal import noise_left
-from hvdc_ident.discrepancy.options import REFUTED, SearchContext
+from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.result import CARD, VALUE
 from hvdc_ident.discrepancy.score import (
     P_VALUE,
@@ -118,6 +118,11 @@ class Hypothesis:
         return -2.0 * sum(math.log(t.prior) for t in self.terms)
 
     @property
+    def may_be_named(self) -> bool:
+        """True where every term has a name: a form is told as what it is, and an effect beside given values is told beside others."""
+        return not any(t.is_form or t.kind == GIVEN for t in self.terms)
+
+    @property
     def effects(self) -> tuple[Term, ...]:
         """The terms that are effects, in the order in which they stand in the model."""
         return tuple(t for t in self.terms if t.is_effect)
@@ -170,7 +175,7 @@ class SearchOutcome:
 
     @property
     def opened(self) -> Expansion | None:
-        """What was looked for beside the model without terms; None where the search did not come to effects."""
+        """The expansion of the model without terms; None where the search did not come to effects."""
         return next(iter(self.expansions.values()), None)
 
     @cached_property
@@ -179,8 +184,8 @@ class SearchOutcome:
         return {h.key: h for h, _ in self.pool}
 
     def in_stead_of(self, term: Term) -> list[tuple[Term, Hypothesis, float]]:
-        """What was looked for in the stead of a term of the best hypothesis beside its others, and that term: each with the hypothesis
-        and its score less that of the prior of its terms, the best first."""
+        """Return the terms that were looked for in the stead of one of the best hypothesis beside its others, and that one: each with its
+        hypothesis and the score of that less the prior of its terms, the best first."""
         less = self.best.without(term)
         found = []
         for h, score in self.pool:
@@ -372,7 +377,7 @@ class Search:
         satisfied = self.is_noise(best)
         order: list[tuple[int, int, Hypothesis, Move]] = []
         # Beside a form that explains the records nothing is looked for in pairs.
-        ends = bool(ranked[0].terms) and ranked[0].terms[-1].is_form and bool(self._standing_forms())
+        ends = bool(best.terms) and best.terms[-1].is_form and bool(self._standing_forms())
         for n, h in enumerate(self._beam(ranked)):
             more = len(h.terms) + 1
             if more > (1 if ends else self.context.options.most) or not self._may_win(h, best, ruler):
@@ -397,7 +402,7 @@ class Search:
         count: Counter[object] = Counter()
         for h in ranked:
             size = len(h.terms)
-            if any(t.is_form or t.kind == GIVEN for t in h.terms):
+            if not h.may_be_named:
                 continue
             if count[size] < BEAM and count[h.kind, size] < 1:
                 count[size] += 1
@@ -422,7 +427,7 @@ class Search:
     def answer(self) -> tuple[Hypothesis, str]:
         """The best hypothesis to whose terms nothing objects, ready, and what spoke against the best of those before it.
 
-        What is refitted for an objection may be better than what was asked: then the best is asked for anew.
+        A refit that was made for an objection may be better than the hypothesis in question: then the best is asked for anew.
         """
         before = -1
         while before != self.bettered:
@@ -435,8 +440,7 @@ class Search:
         for h in self.ranked():
             if h.key == self.root.key:
                 break
-            # A form has no name and is told as what it is; what goes with given values is told beside others.
-            if any(t.is_form or t.kind == GIVEN for t in h.terms):
+            if not h.may_be_named:
                 continue
             why = self._objection(h)
             if not why:
@@ -462,7 +466,7 @@ class Search:
             and len(h.key - best.key) == 1
             and abs(self.cost(h, ruler, rough=True) - self.cost(best, ruler, rough=True)) <= ruler.effective
             and abs(self.cost(h, ruler) - own) <= TIED
-            and not any(t.is_form or t.kind == GIVEN for t in h.terms)
+            and h.may_be_named
             and not self._objection(h)
         ]
         best = nearest(best, tied, lambda h: implied(h.refit), lambda h: off_given(h.refit))
@@ -556,9 +560,9 @@ class Search:
 
     def _standing_forms(self) -> list[Hypothesis]:
         """Forms outside the catalogue that what they leave does not refute, the best first."""
-        most = REFUTED * misfit_of(self.root.refit).beyond
+        before = misfit_of(self.root.refit)
         alone = [h for h in self.ranked() if len(h.terms) == 1 and h.terms[0].is_form]
-        return [h for h in alone if misfit_of(h.refit).beyond <= most]
+        return [h for h in alone if misfit_of(h.refit).is_small_beside(before)]
 
 
 def _chi2(refit: Refit) -> float:

@@ -28,8 +28,10 @@ def as_given(search: Search, h: Hypothesis) -> list[Hypothesis]:
     Only one in place of all of them: beside values that are off, an effect in place of another such value explains nothing more.
     """
     expansion = search.expansions.get(h.key)
+    if expansion is None or not search.is_noise(h):
+        return []
     moved = off_by_more_than_chance(h.refit)
-    if expansion is None or not moved or not search.is_noise(h):
+    if not moved:
         return []
     found, last = expansion.candidates, expansion.before
     # One that brings another signal in has many likes: those that do not are asked first.

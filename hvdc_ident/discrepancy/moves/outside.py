@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel, Trial, b
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.moves.effects import extended, kept, leaders_of
-from hvdc_ident.discrepancy.options import FIELD, REFUTED, SearchContext
+from hvdc_ident.discrepancy.options import FIELD, SearchContext
 from hvdc_ident.discrepancy.score import Ruler
 from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.discrepancy.search import Hypothesis, Move, Search
@@ -92,7 +92,7 @@ def _stands(search: SearchContext, before: Refit, refit: Refit, best: Refit | No
         return False
     then, since = misfit_of(before), misfit_of(refit)
     if best is None:
-        return since.beyond <= REFUTED * then.beyond
+        return since.is_small_beside(then)
     return ruler.between(best, refit) > options.named_bic and not since.is_far_from_noise(then)
 
 
