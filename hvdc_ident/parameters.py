@@ -16,6 +16,7 @@ class Parameter:
 
     value: start value in `unit`. min, max: bounds that the physics sets, in `unit` (infinite: none).
     scale: a typical size in `unit`, used to compare parameters; 0 means: take |value|, or 1 where that is 0.
+    usual: lowest and highest of the values that plants have, in `unit`; empty: not known.
     """
 
     value: float
@@ -24,12 +25,18 @@ class Parameter:
     max: float = math.inf
     scale: float = 0.0
     description: str = ""
+    usual: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("value", "min", "max", "scale"):
             object.__setattr__(self, name, float(getattr(self, name)))
+        object.__setattr__(self, "usual", tuple(float(v) for v in self.usual))
         if math.isnan(self.value):
             raise ModelError("a parameter's value is not a number")
+        if self.usual and not (len(self.usual) == 2 and self.usual[0] <= self.usual[1]):
+            raise ModelError(
+                "a parameter's usual values are no range", expected="[low, high]", got=f"{list(self.usual)}"
+            )
         if not self.min <= self.max:
             raise ModelError(
                 "a parameter's bounds are in the wrong order",
@@ -50,6 +57,12 @@ class Parameter:
     def size(self) -> float:
         """A typical size in the parameter's unit, never 0."""
         return self.scale or abs(self.value) or 1.0
+
+    @property
+    def about(self) -> str:
+        """What the parameter is, with its usual values."""
+        usual = " to ".join(f"{v:g}" for v in self.usual)
+        return "; ".join(filter(None, (self.description, usual)))
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,8 @@ def finding_beside(one: Rival, probability: float, search: SearchContext) -> Fin
         stated = next(f.given for f in (*search.held, *search.stated) if f.name == name)
         value, std, unit = refit.values[name], refit.std.get(name), refit.model.parameters[name].unit
         sizes = {name: EffectSize(value, None if std is None else (value - 1.96 * std, value + 1.96 * std), unit)}
-        known = base_factor(refit.model, unit, value / stated, 0.0 if std is None else 2.0 * std / abs(value))
+        error = 0.0 if std is None else 2.0 * std / abs(value)
+        known = base_factor(refit.model, unit, value / stated, error) if stated else ""
         text = value_sentence(name, value, std, stated, unit, known)
     place = Place(one.at, 1.0, one.source, one.effect, FrozenMap(sizes))
     return Finding(one.effect, (one.effect,), probability, FrozenMap(sizes), (place,), text)

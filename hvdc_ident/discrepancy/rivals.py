@@ -78,7 +78,7 @@ def rivals(
     akin = [] if before is None else akin_of(before, within, further)
     whole = [replace(r, akin=a) for r, a in zip([*within, *further], akin, strict=True)] if akin else within
     kept = [r for k, r in enumerate(whole) if k < len(within) or r.akin]
-    return tuple(sorted((r for r in kept if not (r.akin and r.is_form)), key=lambda r: r.delta_bic))
+    return tuple(sorted(kept, key=lambda r: r.delta_bic))
 
 
 def _stands(term: Term, refit: Refit, before: Refit | None) -> bool:
@@ -151,9 +151,8 @@ def akin_of(before: Refit, group: Sequence[Rival], further: Sequence[Rival] = ()
             and (r.refitted and q.refitted and r.is_effect and q.is_effect)
             and q.at == r.at
             and q.kind != r.kind
-            and not q.is_form
-            # A form that does the same as what is linear is its own tangent; it is another hypothesis than a bend that is known.
-            and not (r.is_form and not in_proportion(q.refit.placed[-1].candidate, 0))
+            # Records in which a form does the same as an effect of the catalogue do not tell which of both laws it is.
+            and not (q.is_form or r.is_form)
             and same_answers(r.refit, q.refit, before)
         )
         akin.append(next(earlier, ""))

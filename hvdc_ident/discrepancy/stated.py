@@ -80,14 +80,15 @@ class SlightErrors:
     def of(cls, first: Refit, stated: Sequence[FitParameter]) -> SlightErrors:
         """Return those of a model. stated: its parameters that are not fitted."""
         levels = {o: LEVEL_ERROR / COVERED * _range(first, o) for o in first.problem.outputs}
-        values = {f.name: f.given for f in stated}
+        # Of a value that is 0 a share is nothing.
+        values = tuple(f for f in stated if f.given)
         problems = [first.problem, of_held_out(first.problem)]
         parts = [_answers(p, first.theta, values, levels) for p in problems if p is not None]
         held = parts[1] if len(parts) > 1 else np.zeros((0, parts[0].shape[1]))
         sizes = (*(STATED_ERROR / COVERED for _ in values), *levels.values())
         known = first.model.outputs
         units = {o: known[o].unit if o in known else "" for o in levels}
-        return cls((*values, *levels), parts[0], held, sizes, units)
+        return cls((*(f.name for f in values), *levels), parts[0], held, sizes, units)
 
     def without(self, component: str) -> SlightErrors:
         """Return those of a model in which a component is another: what that one stated is none of its values."""
@@ -144,27 +145,27 @@ def _weight(strength: Array, asked: Array, most: float) -> float:
     return float(10.0**high)
 
 
-def _answers(problem: Problem, theta: Array, values: Mapping[str, float], levels: Mapping[str, float]) -> Array:
+def _answers(problem: Problem, theta: Array, values: Sequence[FitParameter], levels: Mapping[str, float]) -> Array:
     """Return (N, m) changes of the whitened residual by one standard deviation of each error; 0 where the model does not run with it."""
     theta = theta[: len(problem.names)]
-    spreads = np.array([STATED_ERROR / COVERED * abs(v) for v in values.values()])
-    of_values = differences(problem, theta, values) * spreads
+    spreads = np.array([STATED_ERROR / COVERED * abs(f.given) for f in values])
+    of_values = differences(problem, theta, values, [f.given for f in values]) * spreads
     residual = np.concatenate([b.residual for b in problem.blocks(theta, derivatives=False)])
     of_levels = [_of_level(problem, theta, o, d, residual) for o, d in levels.items()]
     return np.column_stack([of_values, *of_levels])
 
 
-def differences(problem: Problem, theta: Array, values: Mapping[str, float]) -> Array:
+def differences(problem: Problem, theta: Array, held: Sequence[FitParameter], at: Sequence[float]) -> Array:
     """Return (N, m) the derivatives of the whitened residual by held parameters, by differences; 0 where the model does not run.
 
-    values: the parameters', by name.
+    at: their values.
     """
     here = problem.misfits(theta, {})
     runs, steps = [here], [1.0]
-    for name, value in values.items():
-        step = DIFFERENCE_STEP * abs(value)
+    for f, value in zip(held, at, strict=True):
+        step = DIFFERENCE_STEP * (abs(value) or f.size)
         try:
-            runs.append(problem.misfits(theta, {name: value + step}))
+            runs.append(problem.misfits(theta, {f.name: value + step}))
         except SimulationError:
             runs.append(here)
         steps.append(step)
@@ -203,7 +204,8 @@ FARTHEST = 10.0
 def stated(model: AnyModel, candidates: Sequence[FitParameter]) -> tuple[FitParameter, ...]:
     """Return the parameters of a model that are no candidates, with bounds as near as they are known.
 
-    None of a model that is closed inside: each derivative would be a run.
+    One that is 0, as a lead that a plant may have, has a range where its card knows its usual values. None of a model that is closed
+    inside: each derivative would be a run.
     """
     if not is_white_box(model):
         return ()
@@ -211,8 +213,10 @@ def stated(model: AnyModel, candidates: Sequence[FitParameter]) -> tuple[FitPara
     for n, p in model.parameters.items():
         low, high = sorted((p.value / FARTHEST, p.value * FARTHEST))
         low, high = max(low, p.min), min(high, p.max)
-        if n not in fitted and low < p.value < high:
-            found.append(FitParameter(n, p.value, low, high))
+        if p.value == 0.0 and p.usual and p.min < p.max:
+            low, high = min(p.usual[0], 0.0), max(p.usual[1], 0.0)
+        if n not in fitted and (low < p.value < high or (p.value == 0.0 and low < high)):
+            found.append(FitParameter(n, p.value, low, high, scale=0.0 if p.value else high - low))
     return tuple(found)
 
 
@@ -225,13 +229,8 @@ def with_held(refit: Refit, parameter: FitParameter) -> Refit:
 
 
 def with_free(refit: Refit, parameter: FitParameter) -> Refit:
-    """Return the nominal model with one parameter more among the free ones, at the value that it was held at."""
-    count, value = len(refit.problem.free), _value(refit, parameter)
+    """Return the nominal model with one parameter more among the free ones, at its start."""
+    count = len(refit.problem.free)
     held = {n: v for n, v in refit.problem.held.items() if n != parameter.name}
-    free = replace(parameter, start=float(np.clip(value, parameter.min, parameter.max)))
-    problem = replace(refit.problem, free=(*refit.problem.free, free), held=FrozenMap(held))
-    return replace(refit, problem=problem, theta=np.insert(refit.theta, count, free.start))
-
-
-def _value(refit: Refit, parameter: FitParameter) -> float:
-    return refit.problem.held.get(parameter.name, parameter.given)
+    problem = replace(refit.problem, free=(*refit.problem.free, parameter), held=FrozenMap(held))
+    return replace(refit, problem=problem, theta=np.insert(refit.theta, count, parameter.start))

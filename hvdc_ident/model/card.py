@@ -193,6 +193,8 @@ def _value(value: Any, place: str) -> str:
         return "true" if value else "false"
     if isinstance(value, float):
         return _float(value)
+    if isinstance(value, tuple):
+        return f"[{', '.join(_float(v) for v in value)}]"
     if isinstance(value, sp.Expr):
         try:
             return toml_string(to_text(value))

@@ -60,6 +60,8 @@ class ParameterEntry(TomlTable):
     max: Number | None = optional("Upper bound that the physics sets.", "J = {value = 0.01, min = 0.001, max = 0.1}", "that of `unit`")
     scale: Number = optional("A typical size, by which parameters are compared. 0: the value's modulus, or 1 where that is 0.",
         "bias = {value = 0.0, scale = 0.1}", "that of `unit`", default=0.0)
+    usual: Annotated[list[Number], Field(min_length=2, max_length=2)] | None = optional(
+        "Lowest and highest of the values that plants have.", "R = {value = 0.05, usual = [0.02, 0.08]}", "that of `unit`")
     description: str = optional("What the parameter is.", 'b = {value = 0.1, description = "viscous friction"}', default="")
 
 

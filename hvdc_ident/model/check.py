@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, fields, replace
 from functools import cache, lru_cache
 from typing import TYPE_CHECKING, Any, cast
@@ -131,6 +131,11 @@ def _field(kind: type[Any], key: str, value: object, place: str) -> Any:
                 f"its {key} is neither true nor false", where=place, expected="true or false", got=_shown(value)
             )
         return value
+    if key == "usual":
+        if not isinstance(value, Sequence) or isinstance(value, str):
+            raise ModelError("its usual values are no range", where=place, expected="[low, high]", got=_shown(value))
+        own = tuple(_number(v, key, place) for v in value)
+        return value if own == value else own  # the object itself where it is one: what is unchanged is not made anew
     if key in EXPRESSIONS or (key == "value" and kind not in (Parameter, Input)):
         return expression(value, place if key in ("value", "derivative", "equation", "of") else f"{place}, {key}")
     if kind is State and key in ("guess", "rest", "vanishes") and value is None:

@@ -210,7 +210,7 @@ class Model(Shown):
         yield self.description
         inputs = [(n, q.value, q.unit, q.description) for n, q in self.inputs.items()]
         yield Table(("input", "value", "unit", ""), tuple(inputs)) if inputs else ""
-        rows = [(n, q.value, q.unit, q.min, q.max, q.description) for n, q in self.parameters.items()]
+        rows = [(n, q.value, q.unit, q.min, q.max, q.about) for n, q in self.parameters.items()]
         yield Table(("parameter", "value", "unit", "min", "max", ""), tuple(rows)) if rows else ""
         outputs = [(n, o.unit, o.description) for n, o in self.outputs.items()]
         yield Table(("output", "unit", ""), tuple(outputs)) if outputs else ""

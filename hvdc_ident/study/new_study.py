@@ -457,11 +457,11 @@ def _study_text(
     asked, offered = ({}, {}) if dyr is None else (dyr.candidates, dyr.offered)
     yield from (f"{toml_key(n)} = {{min = {low:g}, max = {high:g}}}" for n, (low, high) in asked.items())
     for name, (low, high) in offered.items():
-        yield f"# {toml_key(name)} = {{min = {low:g}, max = {high:g}}}   # {_comment(model.parameters[name].description)}"
+        yield f"# {toml_key(name)} = {{min = {low:g}, max = {high:g}}}   # {_comment(model.parameters[name].about)}"
     listed_above = {*asked, *offered}
     for name, p in [(n, p) for n, p in model.parameters.items() if n not in listed_above][:MOST_LISTED]:
         bounds = "" if math.isinf(p.min) and math.isinf(p.max) else f"within [{p.min:g}, {p.max:g}]"
-        about = ", ".join(t for t in (p.unit, bounds, p.description) if t)
+        about = ", ".join(t for t in (p.unit, bounds, p.about) if t)
         yield f"# {toml_key(name)} = {{start = {p.value!r}}}" + (f"   # {_comment(about)}" if about else "")
     more = len(model.parameters) - len(listed_above) - MOST_LISTED
     yield from [f"# and {more} more parameters of the model"] if more > 0 else []

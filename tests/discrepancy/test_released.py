@@ -94,6 +94,17 @@ def test_a_stated_value_that_is_plainly_wrong_is_named_with_its_interval_and_no_
     assert found.remaining["adequate"]
 
 
+def test_a_value_that_is_stated_as_nothing_is_a_suspect_where_its_card_knows_what_is_usual() -> None:
+    """A friction of 0: no share of it, and no factor, leads to what the drive has."""
+    unknown = parse_card(CARD.replace("b = {value = 0.3", "b = {value = 0.0"))
+    usual = parse_card(CARD.replace("b = {value = 0.3", "b = {usual = [0.0, 1.0], value = 0.0"))
+    assert "b" not in {f.name for f in stated(unknown, FREE)}
+    assert {f.name: (f.start, f.min, f.max) for f in stated(usual, FREE)}["b"] == (0.0, 0.0, 1.0)
+    found = diagnose(usual, experiments(), FREE, effects=TRIED)
+    assert found.verdict == "named" and not found.effects and list(values_of(found)) == ["b"]
+    assert covers(found.findings[0], "b", TRUE["b"]) and "not 0" in found.text
+
+
 def test_beside_an_effect_a_stated_value_that_is_plainly_wrong_is_told_too() -> None:
     found = diagnose(model().with_values({"J": 0.12}), experiments(lag=0.03), FREE, effects=TRIED)
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))]

@@ -42,7 +42,11 @@ i = "i"
 def everything() -> Model:
     return Model(
         "all of it",
-        parameters={"a": Parameter(0.1, "s", 0.0, math.inf, 2.0, 'a "quoted" text'), "T": 0.01, "n": -0.0},
+        parameters={
+            "a": Parameter(0.1, "s", 0.0, math.inf, 2.0, 'a "quoted" text', (1e-300, 0.05)),
+            "T": 0.01,
+            "n": -0.0,
+        },
         inputs={"u": {"value": 1e-300, "unit": "Ω", "description": "line\nbreak \\ \t tab \x7f é 😀"}},
         states={
             "x": {"derivative": "u - x/a", "start": "a**2", "guess": 3.5, "rest": "u*a", "description": "d"},
@@ -60,6 +64,12 @@ def everything() -> Model:
         },
         description='the "whole"\nthing',
     )  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("usual", "why"), [("[0.2, 0.1]", "no range"), ("[0.1]", "usual"), ("0.1", "usual")])
+def test_usual_values_that_are_no_range_are_refused(usual: str, why: str) -> None:
+    with pytest.raises(ModelError, match=why):
+        parse_card(MOTOR.replace("[parameters]", f"[parameters]\nT = {{value = 0.1, usual = {usual}}}"))
 
 
 def test_the_card_of_the_documentation_is_the_model_it_says() -> None:

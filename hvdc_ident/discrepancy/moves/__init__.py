@@ -11,7 +11,7 @@ given       an effect in the stead of other values of the parameters
 from hvdc_ident.discrepancy.moves import cards, clocks, effects, given, outside, values
 from hvdc_ident.discrepancy.search import Move
 
-MOVES: tuple[Move, ...] = (values.MOVE, clocks.MOVE, cards.MOVE, *effects.MOVES, *outside.MOVES, given.MOVE)
+MOVES: tuple[Move, ...] = (values.MOVE, clocks.MOVE, *cards.MOVES, *effects.MOVES, *outside.MOVES, given.MOVE)
 """Every move; of those whose turn is at once the first begins."""
 
 __all__ = ["MOVES"]

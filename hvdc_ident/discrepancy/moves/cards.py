@@ -8,20 +8,21 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.expansion import Race
-from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, refit_again
-from hvdc_ident.discrepancy.moves.values import worth_of
+from hvdc_ident.discrepancy.hypothesis import FAILURES, Refit, RefitJob, with_given_gains
+from hvdc_ident.discrepancy.moves.values import left_with, promising
 from hvdc_ident.discrepancy.result import CARD
 from hvdc_ident.discrepancy.score import P_CARD
 from hvdc_ident.discrepancy.search import BEAM, Hypothesis, Move, Search, Term
 from hvdc_ident.discrepancy.stated import stated, with_free
 from hvdc_ident.fit import FitParameter
+from hvdc_ident.fit.problem import stacked
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import is_white_box, recording
 from hvdc_ident.plants.exchange import CardChange, exchanges
 from hvdc_ident.simulate import ModelSimulator
 
-CARD_LAPS = (8, 12)
-"""Evaluations of the laps of a race of cards: with six values free beside the others they come near their ends in so many."""
+CARD_RACE = Race((3, 8, 12), least=6)
+"""Race of cards: with six values free beside the others a refit comes near its end in so many evaluations as its laps have."""
 
 
 def exchanged(search: Search, h: Hypothesis) -> list[Hypothesis]:
@@ -33,45 +34,90 @@ def exchanged(search: Search, h: Hypothesis) -> list[Hypothesis]:
     changes = [c for c in exchanges(first.model) if (c.component in places if c.stated else places)]
     bases = [_with_card(first, c) for c in changes]
     jobs = [RefitJob(b.model, (), b.problem, _begins(b, c), b.noise) for b, c in zip(bases, changes, strict=True)]
-    refits = Race(CARD_LAPS).run(context, first, jobs, [f"with {c.card.upper()} as {c.component}" for c in changes])
+    refits = CARD_RACE.run(context, first, jobs, [f"with {c.card.upper()} as {c.component}" for c in changes])
     prior = P_CARD / max(len(changes), 1)
-    each = [
+    return [
         Hypothesis(r, replace(b, theta=r.theta), (Term(CARD, (c.component,), c.card.upper(), prior),))
         for c, b, r in zip(changes, bases, refits, strict=True)
         if not r.failure and r.rows
     ]
-    search.add(each)
-    return [_all_of_it(search, h) for h in search.ranked() if h.kind == CARD and len(h.terms) == 1][:BEAM]
+
+
+def with_typical_values(search: Search, h: Hypothesis) -> list[Hypothesis]:
+    """The units with another card that promise most with one of its typical values free, with as many free as the records ask for."""
+    cards = [h for h in search.pool.values() if h.kind == CARD and len(h.terms) == 1]
+    promise = {h.key: _promise(h) for h in cards}
+    found: list[Hypothesis] = []
+    for h in sorted(cards, key=lambda h: promise[h.key])[:BEAM]:
+        if search.context.spent or any(map(search.is_noise, found)):
+            break
+        found.append(_all_of_it(search, h))
+    return found
+
+
+def _own_values(h: Hypothesis) -> list[FitParameter]:
+    """Return the values of another card that are not free yet: nobody has stated them."""
+    (component,) = h.terms[0].at
+    return [f for f in stated(h.base.model, h.base.problem.free) if f.name.startswith(f"{component}.")]
+
+
+def _points(h: Hypothesis) -> list[Refit]:
+    """Return the refit of another card as it came out, and at the given values: values that make up for what is missing hide it."""
+    given = with_given_gains(h.refit)
+    return [h.refit] if given is None else [h.refit, replace(h.refit, theta=given)]
+
+
+def _promise(h: Hypothesis) -> float:
+    """Return chi2 of another card with the value free that promises most."""
+    own = _own_values(h)
+    return min(h.refit.chi2, *(x for point in _points(h) for x in left_with(point, own)[0]))
 
 
 def _all_of_it(search: Search, h: Hypothesis) -> Hypothesis:
-    """Return a hypothesis of another card with as many of the card's typical values set free as the records ask for, the most wanted
-    first: nobody has stated them."""
-    (component,) = h.terms[0].at
+    """Return a hypothesis of another card with as many of its typical values set free as the records ask for, one after the other."""
     while not (search.context.spent or search.is_noise(h)):
-        own = [f for f in stated(h.base.model, h.base.problem.free) if f.name.startswith(f"{component}.")]
-        worth, _ = worth_of(h.refit, own, [0.0] * len(own))
-        if not worth.size or worth.max() <= 0.0:
-            break
-        wider = with_free(h.base, own[int(np.argmax(worth))])
-        refit = refit_again(wider, h.refit, ())
-        more = Hypothesis(refit, replace(wider, theta=refit.theta), h.terms)
+        own = _own_values(h)
+        free = [(point, f) for point in _points(h) for f in promising(point, own, [0.0] * len(own))]
+        wider = [with_free(replace(h.base, theta=point.theta), f) for point, f in free]
+        jobs = [RefitJob(w.model, (), w.problem, (w.theta,), w.noise) for w in wider]
+        refits = (
+            Race().run(search.context, h.refit, jobs, [f"{h.label} with {f.name} free" for _, f in free])
+            if jobs
+            else []
+        )
+        found = [
+            Hypothesis(r, replace(w, theta=r.theta), h.terms)
+            for w, r in zip(wider, refits, strict=True)
+            if not r.failure and r.rows
+        ]
         ruler = search.ruler
-        if refit.failure or search.cost(more, ruler, rough=True) >= search.cost(h, ruler, rough=True):
+        best = min([h, *found], key=lambda x: search.cost(x, ruler, rough=True))
+        if best is h:
             break
-        h = more
+        h = best
     return h
 
 
 def _begins(base: Refit, change: CardChange) -> tuple[Array, ...]:
-    """Return where the refit of another card may begin: at its start, and there with one value a quarter of its range from either end.
-
-    No slope leads to a level that nothing reaches at the start.
-    """
-    begins = [base.theta]
-    for k, f in enumerate(base.problem.free):
-        for share in (0.25, 0.75) if f.name in change.free else ():
-            begins.append(np.concatenate([base.theta[:k], [f.min + share * (f.max - f.min)], base.theta[k + 1 :]]))
+    """Return where the refit of another card may begin: at its start beside the parameters as they are refitted and as they are given, and
+    there with one value a quarter of its range from either end that leaves no trace, as a level that nothing reaches, or is at an end of
+    its range, where what it sets is hardly there."""
+    given = with_given_gains(base)
+    points = [base.theta] if given is None else [base.theta, given]
+    try:
+        traces = np.any(stacked(base.problem.blocks(base.theta))[1] != 0.0, axis=0)
+    except FAILURES:  # it may run elsewhere
+        traces = np.zeros(base.theta.size, bool)
+    hidden = [
+        (k, f)
+        for k, f in enumerate(base.problem.free)
+        if f.name in change.free and (not traces[k] or f.on_bound(f.start))
+    ]
+    begins = list(points)
+    for point in points:
+        for k, f in hidden:
+            for share in (0.25, 0.75):
+                begins.append(np.concatenate([point[:k], [f.min + share * (f.max - f.min)], point[k + 1 :]]))
     return tuple(begins)
 
 
@@ -89,4 +135,7 @@ def _with_card(first: Refit, change: CardChange) -> Refit:
     return Refit(model, (), problem, first.noise, theta)
 
 
-MOVE = Move("cards", 0, exchanged, of_root=True)
+MOVES = (
+    Move("cards", 0, exchanged, of_root=True),
+    Move("typical values of cards", 2, with_typical_values, of_root=True),
+)

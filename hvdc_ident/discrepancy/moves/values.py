@@ -11,7 +11,7 @@ import numpy as np
 
 from hvdc_ident.data import Array
 from hvdc_ident.discrepancy.expansion import refits_of
-from hvdc_ident.discrepancy.hypothesis import Refit, joint_refit_job
+from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, joint_refit_job
 from hvdc_ident.discrepancy.result import VALUE
 from hvdc_ident.discrepancy.score import P_VALUE
 from hvdc_ident.discrepancy.search import Hypothesis, Move, Search, Term
@@ -22,7 +22,7 @@ from hvdc_ident.fit import FitParameter
 VALUES = 8
 """Values that are refitted at a time, those that promise most."""
 ELSEWHERE = (0.2, 0.35, 0.6, 1.6, 3.0)
-"""Shares of a stated value without a trace at which it is run."""
+"""Shares of a stated value without a trace at which it is run; of one that is 0, shares of its bounds."""
 LEAST_INDEPENDENT_POWER = 1e-6
 """Share of a squared derivative that the free parameters have to leave for a value to be determined."""
 
@@ -37,47 +37,63 @@ def freed(search: Search, h: Hypothesis) -> list[Hypothesis]:
     priors = {f.name: P_VALUE for f in context.held} | {f.name: share for f in context.stated}
     known = h.base.model.parameters.keys() - here.problem.names
     open_to = [f for f in (*context.held, *context.stated) if f.name in known]
-    worth, starts = worth_of(here, open_to, [-2.0 * math.log(priors[f.name]) for f in open_to])
-    chosen = [k for k in np.argsort(-worth, kind="stable")[:VALUES] if worth[k] > 0.0]
-    wider = [with_free(h.base, open_to[k]) for k in chosen]
-    jobs = []
-    for k, w in zip(chosen, wider, strict=True):
-        job = joint_refit_job(w, here, here.placed, {})
-        (begin,) = job.begins
-        begin[job.problem.names.index(open_to[k].name)] = starts[k]
-        jobs.append(replace(job, begins=(begin,)))
-    refits = refits_of(context, jobs, [f"with {open_to[k].name} free" for k in chosen])
+    free = promising(here, open_to, [-2.0 * math.log(priors[f.name]) for f in open_to])
+    wider = [with_free(h.base, f) for f in free]
+    jobs = [_from(here, w, f) for w, f in zip(wider, free, strict=True)]
+    refits = refits_of(context, jobs, [f"with {f.name} free" for f in free])
     return [
-        Hypothesis(r, w, (*h.terms, Term(VALUE, (open_to[k].name,), prior=priors[open_to[k].name])))
-        for k, r, w in zip(chosen, refits, wider, strict=True)
-        if not r.failure and not open_to[k].on_bound(r.values[open_to[k].name])
+        Hypothesis(r, w, (*h.terms, Term(VALUE, (f.name,), prior=priors[f.name])))
+        for f, r, w in zip(free, refits, wider, strict=True)
+        if not r.failure and not f.on_bound(r.values[f.name])
     ]
 
 
-def worth_of(here: Refit, values: Sequence[FitParameter], prices: Sequence[float]) -> tuple[Array, list[float]]:
-    """Return (m,) by how much chi2 falls with each held value set free, to first order and less its price, and where its refit begins.
+def _from(here: Refit, wider: Refit, free: FitParameter) -> RefitJob:
+    """Return the refit with one value more free, from where another one came to."""
+    job = joint_refit_job(wider, here, here.placed, {})
+    (begin,) = job.begins
+    begin[job.problem.names.index(free.name)] = free.start
+    return job
 
-    Of a value without a trace, such as a level that no signal reaches, the best of a few others is taken. prices: of the values' priors.
+
+def promising(here: Refit, values: Sequence[FitParameter], prices: Sequence[float]) -> list[FitParameter]:
+    """Return the held values that promise most when set free, started where their refits begin. prices: of the values' priors."""
+    left, starts = left_with(here, values)
+    # In chi2 of the noise: of a misfit its own size is no measure of what may be left.
+    worth = here.chi2 - left - math.log(here.rows) - np.array(prices)
+    chosen = [k for k in np.argsort(-worth, kind="stable")[:VALUES] if worth[k] > 0.0]
+    return [replace(values[k], start=float(np.clip(starts[k], values[k].min, values[k].max))) for k in chosen]
+
+
+def left_with(here: Refit, values: Sequence[FitParameter]) -> tuple[Array, list[float]]:
+    """Return (m,) chi2 with each held value free beside the unknowns, to first order from where these are, and where its refit begins.
+
+    Of a value without a trace, such as a level that no signal reaches, the best of a few others is taken.
     """
     at = [here.values.get(f.name, f.given) for f in values]
     if not values:
         return np.zeros(0), at
     nominal = here.nominal()
-    whole = differences(here.problem, here.theta, {f.name: v for f, v in zip(values, at, strict=True)})
-    columns = nominal.projected(whole)
+    whole = differences(here.problem, here.theta, values, at)
+    columns, residual = nominal.projected(whole), nominal.projected(nominal.residual)
     power = np.sum(columns**2, axis=0)
     shown = power > LEAST_INDEPENDENT_POWER * np.sum(whole**2, axis=0)
-    falls = np.where(shown, (columns.T @ nominal.residual) ** 2 / np.where(shown, power, 1.0), 0.0)
-    for k in np.flatnonzero(~whole.any(axis=0)).tolist():
-        for value in (v for share in ELSEWHERE if values[k].min < (v := share * at[k]) < values[k].max):
+    left = residual @ residual - np.where(shown, (columns.T @ residual) ** 2 / np.where(shown, power, 1.0), 0.0)
+    # At 0 a part is switched off, and a first step from there may tell nothing of what it does.
+    for k in np.flatnonzero(~whole.any(axis=0) | (np.array(at) == 0.0)).tolist():
+        for value in _elsewhere(values[k], at[k]):
             with suppress(SimulationError):  # it does not run there
                 moved = here.problem.residuals(here.problem.misfits(here.theta, {values[k].name: value})[:, None])
-                left = nominal.projected(moved)[:, 0]
-                fall = float(nominal.residual @ nominal.residual - left @ left)
-                if fall > falls[k]:
-                    falls[k], at[k] = fall, value
-    # In chi2 of the noise: of a misfit its own size is no measure of what may be left.
-    return np.asarray(falls - math.log(here.rows) - np.array(prices)), at
+                there = nominal.projected(moved)[:, 0]
+                if there @ there < left[k]:
+                    left[k], at[k] = float(there @ there), value
+    return np.asarray(left), at
+
+
+def _elsewhere(value: FitParameter, at: float) -> list[float]:
+    """Return other values at which a stated one is run."""
+    ends = (at,) if at else tuple(end for end in (value.min, value.max) if math.isfinite(end))
+    return [v for share in ELSEWHERE for end in ends if value.min < (v := share * end) < value.max]
 
 
 MOVE = Move("values", 0, freed, in_stead=True)
