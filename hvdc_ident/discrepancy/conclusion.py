@@ -59,9 +59,9 @@ def judge(search: SearchContext, first: Refit, outcome: SearchOutcome) -> Conclu
     """The verdict on a search that has ended."""
     options, last = search.options, outcome.refit
     tests = tests_of(search, last)
-    if outcome.forms:
+    if outcome.ahead:
         text = f"Something is missing, and nothing of the catalogue can be named: {ONLY_A_FORM}."
-        return Conclusion("unnameable", text, tests, instead=tuple(h.refit for h in outcome.forms))
+        return Conclusion("unnameable", text, tests, instead=tuple(h.refit for h in outcome.ahead))
     if not outcome.named:
         return _nothing(search, last, outcome, tests)
     labels = ", ".join(t.label for t in outcome.named)

@@ -27,7 +27,6 @@ from hvdc_ident.discrepancy.location import localise
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.moves import MOVES
 from hvdc_ident.discrepancy.moves.clocks import clock_sentence, clocks
-from hvdc_ident.discrepancy.moves.outside import standing
 from hvdc_ident.discrepancy.nominal import Nominal, nominal
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.remainder import disturbance_course, share_left
@@ -170,9 +169,7 @@ def unfinished(search: SearchContext, first: Refit, outcome: SearchOutcome) -> C
 def _outside(search: SearchContext, first: Refit, outcome: SearchOutcome) -> DescribedForm:
     """Return the form outside the catalogue that explains most of the gap, or what is missing over time where none stands."""
     assert outcome.opened is not None
-    alone = [h.refit for h, _ in outcome.pool if len(h.terms) == 1 and h.terms[0].is_form]
-    forms = standing(search, first, alone)
-    return described(first, forms[0]) if forms else disturbance_course(search, outcome.opened)
+    return described(first, outcome.forms[0].refit) if outcome.forms else disturbance_course(search, outcome.opened)
 
 
 def _left_out(search: SearchContext, first: Refit, outcome: SearchOutcome) -> int:
@@ -181,7 +178,7 @@ def _left_out(search: SearchContext, first: Refit, outcome: SearchOutcome) -> in
     if found is None or search.spent:
         return 0
     before = misfit_of(first)
-    if not all(misfit_of(h.refit).is_far_from_noise(before) for h, _ in outcome.pool):
+    if not all(misfit_of(h.refit).refutes(before) for h, _ in outcome.pool):
         return 0
     tried = {t.score.candidate for t in found.trials}
     return len(set(found.screen.best()) - tried)

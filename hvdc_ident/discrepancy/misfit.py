@@ -16,8 +16,6 @@ from hvdc_ident.discrepancy.residual_checks import is_louder_after_breaks, resid
 from hvdc_ident.fit.adequacy import MATTERS
 from hvdc_ident.fit.noise import SURE, freedom_of
 
-SMALL_REMAINDER = 0.05
-"""Share of what the model before leaves beyond noise that a good candidate may leave too: its noise is not known better."""
 MAX_NOISE_POWER = 1.4
 """Times the noise's power up to which what is left may be noise that is louder than it was taken for."""
 STRUCTURE_P = 0.01
@@ -99,13 +97,9 @@ class Misfit:
         held = of_held_out(r.problem)
         return held is not None and _is_unstructured(Nominal(held, r.theta[: len(held.free)], r.noise))
 
-    def is_small_beside(self, before: Misfit) -> bool:
-        """Return True where it is so small a share of the misfit before that it does not refute what was added."""
-        return self.beyond <= REFUTED * before.beyond
-
-    def is_far_from_noise(self, before: Misfit, near: float = SMALL_REMAINDER) -> bool:
-        """Return True where it comes near neither the noise nor a small share of the misfit before."""
-        return (self.is_loud or self.is_louder_unseen) and self.beyond > near * before.beyond and not self.is_noise
+    def refutes(self, before: Misfit) -> bool:
+        """Return True where it refutes what was added: it is more than noise, and more than a small share of the misfit before."""
+        return (self.is_loud or self.is_louder_unseen) and self.beyond > REFUTED * before.beyond and not self.is_noise
 
     @cached_property
     def floor(self) -> float:

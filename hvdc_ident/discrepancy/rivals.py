@@ -14,7 +14,7 @@ from hvdc_ident.discrepancy.expansion import Expansion
 from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.movable import in_proportion
-from hvdc_ident.discrepancy.options import CERTAIN, REFUTED, TOLERANCE, DiagnosisOptions
+from hvdc_ident.discrepancy.options import CERTAIN, TOLERANCE, DiagnosisOptions
 from hvdc_ident.discrepancy.result import VALUE, Hypothesis, Rival
 from hvdc_ident.discrepancy.score import TIED, Ruler, apart, at_edge, implied, nearest, off_given, same_answers
 from hvdc_ident.discrepancy.search import SearchOutcome, Term
@@ -91,9 +91,7 @@ def _stands(term: Term, refit: Refit, before: Refit | None) -> bool:
         return False
     if not term.is_form or before is None:
         return not term.is_form
-    return effects()[term.kind].outside != "curve" and not misfit_of(refit).is_far_from_noise(
-        misfit_of(before), REFUTED
-    )
+    return effects()[term.kind].outside != "curve" and not misfit_of(refit).refutes(misfit_of(before))
 
 
 def _key(r: Rival) -> tuple[str, tuple[str, ...], str, str]:

@@ -146,11 +146,10 @@ class SearchOutcome:
     """Where the search ended.
 
     best: the hypothesis that is the answer, its effects in the model. pool: every hypothesis, the best first, with its score less that of
-    the model without terms.
-    expansions: what was looked for beside a hypothesis, by its terms, the first first. ruler: what scores are counted by. forms: those
-    outside the catalogue that are better than the answer and stand their tests, the best first. objection: why a better hypothesis is
-    not the answer; empty where the best is. exhausted: whether nothing that was open could have come near; notes: what could not be
-    done, or was not.
+    the model without terms. expansions: what was looked for beside a hypothesis, by its terms, the first first. ruler: what scores are
+    counted by. forms: those outside the catalogue that stand, the best first; ahead: of these, those that are better than the answer.
+    objection: why a better hypothesis is not the answer; empty where the best is. exhausted: whether nothing that was open could have
+    come near; notes: what could not be done, or was not.
     """
 
     best: Hypothesis
@@ -159,6 +158,7 @@ class SearchOutcome:
     ruler: Ruler
     slight: Errors
     forms: tuple[Hypothesis, ...] = ()
+    ahead: tuple[Hypothesis, ...] = ()
     objection: str = ""
     exhausted: bool = True
     notes: tuple[str, ...] = ()
@@ -377,7 +377,7 @@ class Search:
         satisfied = self.is_noise(best)
         order: list[tuple[int, int, Hypothesis, Move]] = []
         # Beside a form that explains the records nothing is looked for in pairs.
-        ends = bool(best.terms) and best.terms[-1].is_form and bool(self._standing_forms())
+        ends = bool(best.terms) and best.terms[-1].is_form and bool(self._unrefuted_forms())
         for n, h in enumerate(self._beam(ranked)):
             more = len(h.terms) + 1
             if more > (1 if ends else self.context.options.most) or not self._may_win(h, best, ruler):
@@ -546,23 +546,28 @@ class Search:
             dict(self.expansions),
             ruler,
             self.errors_under(best),
-            self._forms_ahead(best, ruler),
+            tuple(self.forms()),
+            tuple(self.forms_ahead()),
             against,
             exhausted,
             tuple(self.notes),
         )
 
-    def _forms_ahead(self, best: Hypothesis, ruler: Ruler) -> tuple[Hypothesis, ...]:
-        """The forms outside the catalogue that are better than the answer by more than chance and as likely as the best of them."""
-        standing = [h for h in self._standing_forms() if not self._objection(h)]
-        ahead = [h for h in standing if self.cost(best, ruler) - self.cost(h, ruler) > self.near]
-        return tuple(h for h in ahead if self.cost(h, ruler) - self.cost(ahead[0], ruler) <= self.near)
+    def forms(self) -> list[Hypothesis]:
+        """The forms outside the catalogue that stand: what they leave does not refute them, and nothing speaks against them, the best
+        first."""
+        return [h for h in self._unrefuted_forms() if not self._objection(h)]
 
-    def _standing_forms(self) -> list[Hypothesis]:
-        """Forms outside the catalogue that what they leave does not refute, the best first."""
+    def forms_ahead(self) -> list[Hypothesis]:
+        """The forms that stand and are better than the answer by more than chance, as likely as the best of them."""
+        (answer, _), standing, ruler = self.answer(), self.forms(), self.ruler
+        ahead = [h for h in standing if self.cost(answer, ruler) - self.cost(h, ruler) > self.near]
+        return [h for h in ahead if self.cost(h, ruler) - self.cost(ahead[0], ruler) <= self.near]
+
+    def _unrefuted_forms(self) -> list[Hypothesis]:
         before = misfit_of(self.root.refit)
         alone = [h for h in self.ranked() if len(h.terms) == 1 and h.terms[0].is_form]
-        return [h for h in alone if misfit_of(h.refit).is_small_beside(before)]
+        return [h for h in alone if not misfit_of(h.refit).refutes(before)]
 
 
 def _chi2(refit: Refit) -> float:

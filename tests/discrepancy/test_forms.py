@@ -15,9 +15,10 @@ from hvdc_ident.data import Array
 from hvdc_ident.discrepancy import Diagnosis, DiagnosisOptions, diagnose
 from hvdc_ident.discrepancy.candidates import source_signals
 from hvdc_ident.discrepancy.hypothesis import refitted
-from hvdc_ident.discrepancy.moves.outside import refitted_forms, standing
+from hvdc_ident.discrepancy.moves import MOVES
 from hvdc_ident.discrepancy.options import SearchContext
 from hvdc_ident.discrepancy.score import P_EFFECT, same_answers
+from hvdc_ident.discrepancy.search import Hypothesis, Search, Term
 from hvdc_ident.discrepancy.sentences import expression, with_values
 from hvdc_ident.effects import apply_effects
 from hvdc_ident.fit import FitParameter
@@ -176,15 +177,17 @@ def test_dry_friction_comes_back_with_its_size() -> None:
     assert found.parameters_after["k"] == pytest.approx(0.5, rel=0.01)
 
 
-def test_a_form_stands_only_where_it_beats_what_the_catalogue_has() -> None:
-    first = plain(metered("w", drifting))
-    search = SearchContext(("lag", "gain"), None, FrozenMap(), DiagnosisOptions(bootstraps=100, fallback=False), seed=0)
-    found = expanded(search, first)
-    forms = [t.refit for t in refitted_forms(search, found)]
-    alone = standing(search, first, forms)
-    assert expression(alone[0]) == "g*time*w"
-    assert standing(search, first, forms, best=found.trials[0].refit)
-    assert not standing(search, first, forms, best=alone[0])
+def test_a_form_is_ahead_only_where_it_beats_what_the_catalogue_has() -> None:
+    options = DiagnosisOptions(bootstraps=100)
+    context = SearchContext(("lag", "gain"), None, FrozenMap(), options, seed=0)
+    search = Search(context, plain(metered("w", drifting)), MOVES)
+    for name in ("effects", "forms"):
+        search.add(next(m for m in MOVES if m.name == name).make(search, search.root))
+    ahead = search.forms_ahead()
+    assert expression(ahead[0].refit) == "g*time*w" and ahead[0] in search.forms()
+    rival = Hypothesis(ahead[0].refit, search.root.base, (Term("gain", ("wm",), prior=ahead[0].terms[0].prior),))
+    search.add([rival])
+    assert ahead[0] in search.forms() and not search.forms_ahead(), "an effect of the catalogue leaves as much"
 
 
 def polynomials(told: str) -> list[list[float]]:

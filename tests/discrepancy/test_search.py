@@ -136,10 +136,10 @@ def test_a_form_outside_the_catalogue_is_no_answer_and_is_told_as_what_it_is(fir
     answer, against = search.answer()
     assert answer.key == best.key and not against
     outcome = search.outcome(exhausted=False)
-    assert outcome.best.key == best.key and [h.refit for h in outcome.forms] == [form.refit]
+    assert outcome.best.key == best.key and [h.refit for h in outcome.ahead] == [form.refit]
     near = replace(form, refit=replace(best.refit, chi2=best.refit.chi2 - 1.0))
     search.pool[form.key], search.errors[form.key] = near, (near.refit, NONE)
-    assert not search.outcome(exhausted=False).forms, "no better than chance"
+    assert not search.outcome(exhausted=False).ahead, "no better than chance"
 
 
 def test_of_hypotheses_that_are_as_likely_the_one_with_the_values_nearest_to_the_given_is_the_answer(

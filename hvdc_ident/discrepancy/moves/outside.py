@@ -7,16 +7,13 @@ the catalogue explains them.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 
 from hvdc_ident.discrepancy.candidates import candidates
-from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel, Trial, best_each, by_cost, gains_of
+from hvdc_ident.discrepancy.expansion import Expansion, ExpansionModel, Trial, best_each, gains_of
 from hvdc_ident.discrepancy.hypothesis import Refit
-from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.moves.effects import extended, kept, leaders_of
 from hvdc_ident.discrepancy.options import FIELD, SearchContext
-from hvdc_ident.discrepancy.score import Ruler
 from hvdc_ident.discrepancy.screen import Score
 from hvdc_ident.discrepancy.search import Hypothesis, Move, Search
 from hvdc_ident.effects import effects
@@ -72,30 +69,6 @@ def _is_own(refit: Refit) -> bool:
     return entry.is_own is None or entry.is_own(refit.sizes(refit.placed[-1]))
 
 
-def standing(search: SearchContext, before: Refit, forms: Sequence[Refit], best: Refit | None = None) -> list[Refit]:
-    """Return of refits of forms beside a model `before` those that stand the tests of an effect, the one that leaves least for the price of
-    its values first.
-
-    best: the refit of the catalogue that a form has to beat, and then it has to come near the noise; without one it has to explain
-    so much of the gap that what it leaves does not refute it.
-    """
-    price = search.options.named_bic + math.log(before.rows)
-    return sorted((r for r in forms if _stands(search, before, r, best)), key=lambda r: r.chi2 + r.count * price)
-
-
-def _stands(search: SearchContext, before: Refit, refit: Refit, best: Refit | None) -> bool:
-    options, ruler = search.options, Ruler.of(refit)
-    was, now = before.predicted, refit.predicted
-    if was is None or now is None or was - now <= options.holdout_share:
-        return False
-    if ruler.between(before, refit) <= options.named_bic:
-        return False
-    then, since = misfit_of(before), misfit_of(refit)
-    if best is None:
-        return since.is_small_beside(then)
-    return ruler.between(best, refit) > options.named_bic and not since.is_far_from_noise(then)
-
-
 def in_stead(search: Search, h: Hypothesis) -> list[Hypothesis]:
     """Hypotheses with a form in the stead of the effects that explain the records best beside this one, at their places.
 
@@ -131,13 +104,14 @@ def anywhere(search: Search, h: Hypothesis) -> list[Hypothesis]:
     context, model = search.context, search.models[h.key]
     forms = refitted_forms(context, expansion)
     found = extended(h, expansion, forms)
-    best = next(iter(by_cost(expansion.trials)), None)
-    first = standing(context, expansion.before, [t.refit for t in forms], None if best is None else best.refit)
+    search.add(found)
+    first = search.forms_ahead()
     if not first or context.spent:
         return found
-    at = first[0].placed[-1].candidate.at
+    (term,) = first[0].terms
+    at = term.at
     which = [k for k, c in enumerate(expansion.candidates) if c.at == at and not c.still]
-    screen = model.screen(expansion.candidates, "outside", which, gains_of(expansion.before, first[0]))
+    screen = model.screen(expansion.candidates, "outside", which, gains_of(expansion.before, first[0].refit))
     scores = list(screen.best().values())[:FIELD]
     more = model.refitted(expansion.candidates, scores, "outside", expansion.trials)
     return [*found, *kept(search, h, expansion.with_trials(more))]
