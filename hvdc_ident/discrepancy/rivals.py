@@ -47,11 +47,17 @@ def rivals(
     price = outcome.ruler.price
     fall = 0.0 if before is None or own.refit is None else outcome.ruler.between(before, own.refit)
     weak = fall * UNNOTICED_SHARE**2 < options.set_bic + price
+    likeliest = min(r.delta_bic - 2.0 * math.log(r.prior) for r in each)
+
+    def behind(r: Rival) -> float:
+        """By how much it is behind the best, by evidence or with the priors of the terms."""
+        return min(r.delta_bic, r.delta_bic - 2.0 * math.log(r.prior) - likeliest)
+
     within = [
         r
         for r in each
         if r is own
-        or r.delta_bic
+        or behind(r)
         <= options.set_bic + (price if _more(r, own) == 1 and (not alone or _as_likely(own, r, weak)) else 0.0)
     ]
     further: list[Rival] = []
@@ -127,7 +133,7 @@ def _rival(term: Term, refit: Refit, behind: float) -> Rival:
         values = FrozenMap({n: v for n, v in values.items() if n not in sizes})
     return Rival(
         name, term.at, behind, sizes, term.source, expression=formula, prior=term.prior, values=values,
-        off_given=off_given(refit), refit=refit,
+        off_given=off_given(refit, sizes), refit=refit,
     )  # fmt: skip
 
 

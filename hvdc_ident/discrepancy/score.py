@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -39,13 +39,14 @@ def implied(refit: Refit) -> FrozenMap[EffectSize]:
     return FrozenMap(values)
 
 
-def off_given(refit: Refit) -> float:
+def off_given(refit: Refit, wrong: Collection[str] = ()) -> float:
     """Return how far a refit's own free parameters are from their given values: root of the summed squares of relative differences.
 
-    Each is a difference over the larger of both magnitudes, so that half a value and twice a value are as far.
+    Each is a difference over the larger of both magnitudes, so that half a value and twice a value are as far. wrong: stated values that a
+    hypothesis takes for wrong, whose differences are what it says, as the size of an effect is.
     """
     total = 0.0
-    for k in refit.gains:
+    for k in (k for k in refit.gains if refit.problem.free[k].name not in wrong):
         given, value = refit.problem.free[k].given, float(refit.theta[k])
         largest = max(abs(given), abs(value))
         total += ((value - given) / largest) ** 2 if largest else 0.0

@@ -216,7 +216,7 @@ class Move:
     in_stead: bool = False
 
 
-TERM_RANK = 3
+TERM_RANK = 2
 """Ranks by which the moves of a hypothesis come after those of one with a term less."""
 
 
@@ -329,7 +329,7 @@ class Search:
                 self.bettered += 1
                 continue
             more = h.refit.chi2 - had.refit.chi2
-            if more < -TIED or (more <= TIED and off_given(h.refit) < off_given(had.refit)):
+            if more < -TIED or (more <= TIED and off_given(h.refit, h.values) < off_given(had.refit, h.values)):
                 self.pool[h.key] = h
                 self.bettered += 1
 
@@ -376,19 +376,21 @@ class Search:
         best = ranked[0]
         satisfied = self.is_noise(best)
         order: list[tuple[int, int, Hypothesis, Move]] = []
-        # Beside a form that explains the records nothing is looked for in pairs.
+        # Where a form explains the records no other effects are looked for in pairs, but clocks and values that are off are.
         ends = bool(best.terms) and best.terms[-1].is_form and bool(self._unrefuted_forms())
         for n, h in enumerate(self._beam(ranked)):
             more = len(h.terms) + 1
-            if more > (1 if ends else self.context.options.most) or not self._may_win(h, best, ruler):
+            if more > self.context.options.most or not self._may_win(h, best, ruler):
+                continue
+            # What leaves noise is compared with what may stand in the stead of its terms, and only what is cheap is still asked.
+            if satisfied and h.terms and not h.key < best.key:
                 continue
             for move in self.moves:
                 if (h.key, move.name) in self.done:
                     continue
                 if move.of_root and h.terms:
                     continue
-                # A hypothesis that leaves noise is not bettered by more of its own kind: only what is cheap is still asked.
-                if satisfied and (more > max(len(best.terms), 1) or move.rank > 1):
+                if (satisfied and move.rank > 1) or (ends and more > 1 and move.rank > 0):
                     continue
                 order.append((move.rank + TERM_RANK * len(h.terms), n, h, move))
         if not order:
@@ -469,7 +471,7 @@ class Search:
             and h.may_be_named
             and not self._objection(h)
         ]
-        best = nearest(best, tied, lambda h: implied(h.refit), lambda h: off_given(h.refit))
+        best = nearest(best, tied, lambda h: implied(h.refit), lambda h: off_given(h.refit, h.values))
         last = best.terms[-1]
         if last.kind != "conductance" or all(leaks(best.refit.model, last.at, s) for s in last.source.split(",")):
             return best

@@ -294,5 +294,5 @@ MOVES = (
     Move("from the given values", 2, again(from_given, "from the given values")),
     Move("beside the leaders", 2, again(beside_leaders, "beside")),
     Move("beside the new leaders", 3, again(beside_leaders, "beside")),
-    Move("sizes", 3, again(with_searched_sizes, "sizes to be met")),
+    Move("sizes", 4, again(with_searched_sizes, "sizes to be met")),
 )
