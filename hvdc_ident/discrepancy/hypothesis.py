@@ -20,6 +20,7 @@ from hvdc_ident.discrepancy.prediction import held_out, predictive_score, root_m
 from hvdc_ident.effects import EffectUse, Probe, apply_effects, distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import FitParameter, Problem
+from hvdc_ident.fit.followed_noise import followed_noise
 from hvdc_ident.fit.noise import OutputNoise
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
@@ -156,8 +157,9 @@ class Refit:
     holdout: root mean square of held-out residuals, in noise units, whitened; None without held-out experiments. predicted: root
     mean score of their prediction, or without them of parts of the fitted ones predicted from the rest (`prediction`); unseen_rows: of
     what it is the score of. std: standard deviation of each free parameter, of the effects and of the model, by its name in the model.
-    apart: of each effect, by how many standard deviations its parameters together are off doing nothing. ended: whether
-    it came to its end, and was not only left where its evaluations were used up.
+    apart: of each effect, by how many standard deviations its parameters together are off doing nothing. followed: sum of squares that
+    the noise of played inputs makes of the residuals. ended: whether it came to its end, and was not only left where its evaluations
+    were used up.
     """
 
     model: AnyModel
@@ -173,6 +175,7 @@ class Refit:
     unseen_rows: int = 0
     std: FrozenMap[float | None] = field(default_factory=FrozenMap)
     apart: tuple[float, ...] = ()
+    followed: float = 0.0
     failure: str = ""
     ended: bool = True
 
@@ -266,6 +269,7 @@ class RefitResult:
     unseen_rows: int
     std: FrozenMap[float | None]
     apart: tuple[float, ...]
+    followed: float
     failure: str
     ended: bool
 
@@ -367,6 +371,7 @@ def judged(refit: Refit) -> Refit:
         refit, chi2=chi2, rows=rows, correlation=_correlation(blocks), holdout=root_mean_square(others),
         predicted=predictive_score(blocks, others),
         unseen_rows=rows if others is None else sum(b.residual.size for b in others), std=FrozenMap(std), apart=apart,
+        followed=followed_noise(refit.problem, refit.theta),
     )  # fmt: skip
 
 

@@ -273,6 +273,8 @@ class Search:
         r = h.refit
         known = None if rough else self.errors_under(h).total
         chi2 = _chi2(r) if known is None else known
+        # A model that follows less of the noise of what it is played leaves less, and is no better for it.
+        chi2 -= r.followed - self.root.refit.followed
         if known is not None and r.holdout is None and r.predicted is not None:
             # Parts of the fitted records, predicted from the rest: errors explain as much of these.
             chi2 += r.predicted**2 * r.unseen_rows * known / r.chi2

@@ -20,6 +20,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.nominal import of_held_out, orthonormal
 from hvdc_ident.errors import SimulationError
 from hvdc_ident.fit import FitParameter, Problem
+from hvdc_ident.fit.followed_noise import followed_noise, follows_noise
 from hvdc_ident.fit.noise import SURE
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.model import AnyModel, is_white_box
@@ -66,13 +67,14 @@ class SlightErrors:
     """What slight errors do to the records of a model, to first order, one standard deviation of each.
 
     names: of the stated values, then of the outputs whose levels are off. fitted: (N, m) change of the whitened residuals of the fitted
-    records; held: (H, m) of the held-out ones. sizes: the standard deviations, relative of a value, in its unit of a level. units: of
-    the outputs.
+    records; held: (H, m) of the held-out ones; followed: (m,) of the sum of squares that the noise of played inputs makes of them.
+    sizes: the standard deviations, relative of a value, in its unit of a level. units: of the outputs.
     """
 
     names: tuple[str, ...]
     fitted: Array
     held: Array
+    followed: Array
     sizes: tuple[float, ...]
     units: Mapping[str, str]
 
@@ -88,13 +90,15 @@ class SlightErrors:
         sizes = (*(STATED_ERROR / COVERED for _ in values), *levels.values())
         known = first.model.outputs
         units = {o: known[o].unit if o in known else "" for o in levels}
-        return cls((*(f.name for f in values), *levels), parts[0], held, sizes, units)
+        followed = np.concatenate([_followed(first, values), np.zeros(len(levels))])
+        return cls((*(f.name for f in values), *levels), parts[0], held, followed, sizes, units)
 
     def without(self, component: str) -> SlightErrors:
         """Return those of a model in which a component is another: what that one stated is none of its values."""
         kept = [k for k, n in enumerate(self.names) if not n.startswith(f"{component}.")]
         names, sizes = tuple(self.names[k] for k in kept), tuple(self.sizes[k] for k in kept)
-        return replace(self, names=names, sizes=sizes, fitted=self.fitted[:, kept], held=self.held[:, kept])
+        fitted, held, followed = self.fitted[:, kept], self.held[:, kept], self.followed[kept]
+        return replace(self, names=names, sizes=sizes, fitted=fitted, held=held, followed=followed)
 
     def under(self, refit: Refit) -> Errors:
         """Return the likeliest errors under a hypothesis, within what such errors are together; none where its records are others.
@@ -115,7 +119,7 @@ class SlightErrors:
         every = np.vstack(answers[: len(blocks)])
         every, wanted = (x - basis @ (basis.T @ x) for x in (every, residual))
         strength, directions = np.linalg.eigh(every.T @ every)
-        asked = directions.T @ (every.T @ wanted)
+        asked = directions.T @ (every.T @ wanted - 0.5 * self.followed)
         most = strength.size + SURE * math.sqrt(2.0 * strength.size)
         weight = _weight(np.maximum(strength, 0.0), asked, most)
         errors = -directions @ (asked / (weight + np.maximum(strength, 0.0)))
@@ -126,11 +130,11 @@ class SlightErrors:
         order = np.argsort(-np.abs(errors), kind="stable")
         relative = {self.names[k]: float(errors[k] * signed[k]) for k in order}
         ends = np.cumsum([b.residual.size for b in blocks[0]])
-        power = float(left[:rows] @ left[:rows])
-        fell = float(wanted[:rows] @ wanted[:rows]) - power
+        power, less = float(left[:rows] @ left[:rows]), float(self.followed @ errors)
+        fell = float(wanted[:rows] @ wanted[:rows]) - power + less
         near = sum(float(r[1:] @ r[:-1]) for r in np.split(left[:rows], ends[:-1])) / power if power else 0.0
         correlation = near if near > 2.0 / math.sqrt(rows) else 0.0
-        return Errors(relative, self.units, float(left @ left + errors @ errors), max(fell, 0.0), correlation)
+        return Errors(relative, self.units, float(left @ left + errors @ errors) - less, max(fell, 0.0), correlation)
 
 
 def _weight(strength: Array, asked: Array, most: float) -> float:
@@ -153,6 +157,18 @@ def _answers(problem: Problem, theta: Array, values: Sequence[FitParameter], lev
     residual = np.concatenate([b.residual for b in problem.blocks(theta, derivatives=False)])
     of_levels = [_of_level(problem, theta, o, d, residual) for o, d in levels.items()]
     return np.column_stack([of_values, *of_levels])
+
+
+def _followed(first: Refit, values: Sequence[FitParameter]) -> Array:
+    """Return (m,) by how much more of the noise of played inputs is followed with one standard deviation of each value's error."""
+    if not follows_noise(first.problem):
+        return np.zeros(len(values))
+    found = np.zeros(len(values))
+    for k, f in enumerate(values):
+        with suppress(SimulationError):  # a value that the model does not run with has no answer either
+            there = followed_noise(first.problem, first.theta, {f.name: f.given * (1.0 + STATED_ERROR / COVERED)})
+            found[k] = (there - first.followed) * math.copysign(1.0, f.given)
+    return found
 
 
 def differences(problem: Problem, theta: Array, held: Sequence[FitParameter], at: Sequence[float]) -> Array:

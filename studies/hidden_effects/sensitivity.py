@@ -40,6 +40,8 @@ OUTSIDE = ((94, "outside-000"),)
 """A cube, for the numbers that only what is outside the catalogue meets."""
 MET = ((103, "single-080"), (103, "single-3014"))
 """A sampler and a quantiser, for the numbers of the search for sizes that have to be met."""
+WRONG = ((6001, "value-000"), (6001, "value-001"), (100, "single-007"))
+"""Two values that the card states wrong, and a gain, for the numbers of stated values."""
 FACTORS = (0.5, 2.0)
 
 
@@ -59,7 +61,7 @@ class Number:
     @property
     def cases(self) -> tuple[tuple[int, str], ...]:
         """Seed and name of the cases that it is tried on."""
-        special = {"outside": OUTSIDE, "size_profile": MET}
+        special = {"outside": OUTSIDE, "sizes": MET, "values": WRONG, "stated": WRONG}
         return next((c for part, c in special.items() if part in self.module.split(".")), CASES)
 
     def times(self, factor: float) -> float:
@@ -153,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         jobs = [(None, 1.0), *((n, f) for n in numbers() for f in FACTORS if not asked.only or n.label in asked.only)]
         with path.open("a", encoding="utf-8") as file:
             for k, (number, factor) in enumerate(jobs):
-                for seed, name in (*CASES, *OUTSIDE, *MET) if number is None else number.cases:
+                for seed, name in dict.fromkeys((*CASES, *OUTSIDE, *MET, *WRONG)) if number is None else number.cases:
                     key = ("" if number is None else number.label, factor, f"{seed} {name}")
                     if key in there:
                         continue

@@ -55,11 +55,11 @@ def write_study(name: str, folder: Path, dyr: str = "plant.dyr", budget: float |
 def one(name: str, folder: Path, budget: float | None) -> dict[str, Any]:
     """Return what the diagnosis of one unit tells beside the truth, with its CPU seconds; of one that fails, the message.
 
-    Runs in a process of its own: the CPU seconds are those of its children.
+    Runs in a process of its own, without workers: its budget is of the processor's time then, whatever else the machine does.
     """
     study = write_study(name, folder, budget=budget)
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run([*COMMAND, "run", str(study), "--quiet"], capture_output=True, text=True)
+    done = subprocess.run([*COMMAND, "run", str(study), "--quiet", "--workers", "1"], capture_output=True, text=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     told: dict[str, Any] = {"unit": name, "cpu_seconds": round(seconds, 1)}
