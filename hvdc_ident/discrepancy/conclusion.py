@@ -322,9 +322,9 @@ def doubt_of_size(last: Refit, left: Nominal, explained: float) -> Doubt | None:
     left: its residuals; explained: by how much chi2 fell, beside which a disagreement is nothing.
     """
     for placed in last.placed:
-        found, label = constancy(last, left, placed), placed.candidate.label
-        if found.p < VARYING_P and found.chi2_fall > TOLERANCE * explained:
-            why = f"the experiments ask for different sizes of {label} (p = {found.p:.1g})"
+        (fall, p), label = constancy(last, left, placed), placed.candidate.label
+        if p < VARYING_P and fall > TOLERANCE * explained:
+            why = f"the experiments ask for different sizes of {label} (p = {p:.1g})"
             return Doubt(why, f"The same input in several sizes, in which {label} answers.")
     return None
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,15 +79,6 @@ class Remainder:
         """True where nobody need ask what is left: next to nothing of the gap, or a small part and within every output's tolerance."""
         within = bool(self.beyond) and max(self.beyond.values()) <= 1.0
         return self.largest <= TOLERANCE or (within and self.largest <= REFUTED)
-
-
-@dataclass(frozen=True, eq=False)
-class _LatentJob:
-    """One insertion point's share of the work."""
-
-    nominal: Nominal
-    paths: Mapping[str, Pushed]
-    place: str
 
 
 def share_left(first: Refit, last: Refit, floor: float) -> float | None:
@@ -177,10 +169,10 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     places = _apart(paths, list(signals), search.seed)
     noise = nominal.projected(nominal.drawn(_least_draws(search), search.seed + 5))
     inversions: list[Inversion] = []
-    for inversion in mapped(search.executor, _inverted, [_LatentJob(nominal, paths, p) for p in places]):
+    for inversion in mapped(search.executor, partial(Inversion.of, nominal, paths), places):
         inversions.append(inversion)
-        if search.spent:
-            break
+        if search.spent and len(inversions) < len(places):
+            return found  # the best of some places is none: what is left is told without one
     best = sorted(range(len(inversions)), key=lambda k: -_beyond_noise(inversions[k]))[:SHORTLIST]
     table = np.array([_log_evidence(inversions[k], noise) for k in best]).reshape(len(best), -1)
     if not table.size:
@@ -206,10 +198,6 @@ def _apart(paths: Mapping[str, Pushed], places: Sequence[str], seed: int) -> lis
         if not any(1.0 - abs(float(unit @ other)) < PROPORTIONAL for other in kept.values()):
             kept[place] = unit
     return list(kept)
-
-
-def _inverted(job: _LatentJob) -> Inversion:
-    return Inversion.of(job.nominal, job.paths, job.place)
 
 
 def _beyond_noise(latent: Inversion) -> float:

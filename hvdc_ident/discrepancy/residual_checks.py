@@ -123,37 +123,26 @@ LEAST_INDEPENDENT = 1e-4
 """Share of a slope that has to be left by all the parameters for the data to determine a size in one experiment alone."""
 
 
-@dataclass(frozen=True)
-class Constancy:
-    """Gain of one size per experiment. chi2_fall: that of the squared residuals; p: the chance of such a fall under noise."""
-
-    chi2_fall: float
-    p: float
-
-
-UNTESTED = Constancy(0.0, 1.0)
-
-
-def constancy(refit: Refit, left: Nominal, placed: Placed) -> Constancy:
+def constancy(refit: Refit, left: Nominal, placed: Placed) -> tuple[float, float]:
     """F test, to first order, that the experiments ask for different sizes of an effect.
 
-    p = 1 where only one experiment shows it, and for effects whose answer has steps in their size: those have
-    no slopes. left: the refit's residuals.
+    Returned are by how much the squared residuals fall with a size for each, and the chance p of such a fall under noise. p = 1 where
+    only one experiment shows it, and for effects whose answer has steps in their size: those have no slopes. left: the refit's residuals.
 
     Source: Chow, Econometrica 28 (1960), as a score test.
     """
     names = left.problem.names
     own = [names.index(n) for n in placed.names.values() if n in names]
     if effects()[placed.candidate.effect].needs_grid or not own:
-        return UNTESTED
+        return 0.0, 1.0
     more = _by_experiment(left, own)
     spare = refit.effective - left.basis.shape[1] - more.shape[1]
     if not more.shape[1] or spare < 1.0:
-        return UNTESTED
+        return 0.0, 1.0
     remains = left.projected(left.residual)
     fall = float(np.sum((more.T @ remains) ** 2))
     share = fall / max(float(remains @ remains) - fall, np.finfo(float).tiny)
-    return Constancy(fall, float(fdtrc(more.shape[1], spare, share * spare / more.shape[1])))
+    return fall, float(fdtrc(more.shape[1], spare, share * spare / more.shape[1]))
 
 
 def _by_experiment(left: Nominal, own: list[int]) -> Array:

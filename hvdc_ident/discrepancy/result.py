@@ -213,8 +213,8 @@ class DescribedForm(Coded):
 
 
 @dataclass(frozen=True)
-class Hypothesis:
-    """A compared hypothesis: the effects in the model, by name and place; none for the nominal model.
+class ComparedHypothesis:
+    """A hypothesis beside the others: its terms, by name and place; none for the nominal model.
 
     log_evidence: in nats over the nominal model, of fitted and held-out data. held_out: root mean square of the held-out
     residual in noise units. probability: among the hypotheses compared. parameters: by effect its sizes; values: of the model's
@@ -316,7 +316,7 @@ class Diagnosis(Coded, Shown):
     doubt: str = ""
     findings: tuple[Finding, ...] = ()
     remainder: Mapping[str, Any] = field(default_factory=dict)
-    hypotheses: tuple[Hypothesis, ...] = ()
+    hypotheses: tuple[ComparedHypothesis, ...] = ()
     beyond_noise: bool = False
     values_by_place: FrozenMap[tuple[ValueAt, ...]] = field(default_factory=FrozenMap)
     stand_ins: tuple[StandIn, ...] = ()

@@ -15,7 +15,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.movable import in_proportion
 from hvdc_ident.discrepancy.options import CERTAIN, TOLERANCE, DiagnosisOptions
-from hvdc_ident.discrepancy.result import VALUE, Hypothesis, Rival
+from hvdc_ident.discrepancy.result import VALUE, ComparedHypothesis, Rival
 from hvdc_ident.discrepancy.score import TIED, Ruler, apart, at_edge, implied, nearest, off_given, same_answers
 from hvdc_ident.discrepancy.search import SearchOutcome, Term
 from hvdc_ident.discrepancy.sentences import expression
@@ -324,12 +324,12 @@ def credible(each: Sequence[tuple[T, float]]) -> list[tuple[T, float]]:
     return [one for one, held in zip(each, before, strict=False) if held < CERTAIN * before[-1]]
 
 
-def compared(outcome: SearchOutcome) -> tuple[Hypothesis, ...]:
+def compared(outcome: SearchOutcome) -> tuple[ComparedHypothesis, ...]:
     """Every hypothesis that was refitted, the likeliest first, by its score."""
     most = min(score for _, score in outcome.pool)
     total = sum(math.exp(0.5 * (most - score)) for _, score in outcome.pool)
     return tuple(
-        Hypothesis(
+        ComparedHypothesis(
             tuple(t.label for t in h.terms),
             -0.5 * score,
             h.refit.unseen,

@@ -90,18 +90,19 @@ class Screen:
             found.setdefault(s.candidate, s)
         return found
 
-    def with_(self, other: Screen, candidates: Sequence[CandidateEffect]) -> Screen:
-        """Return both in one. other: of further candidates or sizes, from the same point beside the same noise."""
-        scores = ranked((*self.scores, *other.scores), candidates)
+    @classmethod
+    def of(cls, parts: Sequence[Screen], candidates: Sequence[CandidateEffect]) -> Screen:
+        """Return parts of a screen in one, of different candidates or sizes, from the same point beside the same noise."""
+        scores = ranked((s for part in parts for s in part.scores), candidates)
         ran = {s.candidate for s in scores}
-        failures = {k: why for k, why in {**other.failures, **self.failures}.items() if k not in ran}
-        return Screen(
+        failures = {k: why for part in reversed(parts) for k, why in part.failures.items() if k not in ran}
+        return cls(
             scores,
-            {**self.size, **other.size},
-            {**self.left, **other.left},
-            np.maximum(self.largest, other.largest),
+            {c: v for part in parts for c, v in part.size.items()},
+            {c: v for part in parts for c, v in part.left.items()},
+            np.max([part.largest for part in parts], axis=0),
             failures,
-            {**self.answers, **other.answers},
+            {c: v for part in parts for c, v in part.answers.items()},
         )
 
     def reordered(self, at: Linearised, candidates: Sequence[CandidateEffect]) -> list[int]:
@@ -287,25 +288,53 @@ def _at_rest(problem: Problem, experiment: Experiment, theta: Array) -> Experime
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """Columns (candidate, probe) of one form, and the candidates. movable: the models that they run on, by whether their place
-    is on a loop; none of a model that is closed inside."""
+    """Columns (candidate, probe) of one form, the candidates, and how a column is run.
+
+    movable: the models that they run on, by whether their place is on a loop; none of a model that is closed inside.
+    """
 
     setup: ScreenSetup
     movable: Mapping[bool, Movable]
     columns: Sequence[tuple[int, int]]
     candidates: Mapping[int, CandidateEffect]
 
+    def reach(self, column: tuple[int, int]) -> tuple[float, float]:
+        """Factors on the size that a step may ask for."""
+        if not any(is_proportional(m.form) for m in self.movable.values()):
+            return UP_TO_ONE
+        return _reach(self.candidates[column[0]], column[1])
 
-@dataclass(frozen=True, eq=False)
-class _BatchResult:
-    """Of a batch."""
+    @cached_property
+    def _problems(self) -> Mapping[bool, Problem]:
+        setup = self.setup
+        own, how = setup.nominal.problem, (setup.haste, setup.method)
+        return {x: replace(own, simulator=m.simulator(*how)) for x, m in self.movable.items()}
 
-    scores: list[Score]
-    size: dict[tuple[int, int], float]
-    left: dict[tuple[int, int], float]
-    largest: Array
-    failures: dict[int, str]
-    answers: dict[tuple[int, int], NDArray[np.float32]]
+    @cached_property
+    def _from_rest(self) -> Mapping[bool, Problem]:
+        """The problems with runs that begin where the model without an effect rests."""
+        return {x: replace(p, experiments=self.setup.at_rest) for x, p in self._problems.items()}
+
+    def __call__(self, column: tuple[int, int]) -> Array:
+        """Return (M,) the misfits with a candidate in the size of a probe (`Problem.misfits`)."""
+        setup, candidate = self.setup, self.candidates[column[0]]
+        own, theta, probe = setup.nominal.problem, setup.point, candidate.probes[column[1]]
+        if not self.movable or not is_white_box(setup.model):
+            larger = apply_effects(setup.model, [candidate.use(probe)])
+            return replace(own, simulator=ModelSimulator(larger, setup.patience)).misfits(theta, {})
+        loop = on_loop(setup.model, candidate.at[0])
+        moved = self.movable[loop]
+        known = own.values(theta) if candidate.named else {}
+        named = {n: known.get(str(p), setup.model.parameters[str(p)].value) for n, p in candidate.named.items()}
+        values = moved.placed(candidate) | moved.sized({**probe.values, **named})
+        if effects()[
+            candidate.effect
+        ].self_exciting:  # what it does at the first row is no state that the plant rests in
+            return self._from_rest[loop].misfits(theta, values)
+        try:
+            return self._problems[loop].misfits(theta, values)
+        except SteadyStartError:  # it leaves no steady state, as levels in a loop do not, or none near
+            return self._from_rest[loop].misfits(theta, values)
 
 
 def screened(
@@ -324,26 +353,16 @@ def screened(
     """
     every = ((k, n) for k, c in enumerate(candidates) if not c.still for n in range(len(c.probes)))
     batches = list(_batches(setup, candidates, every if columns is None else columns))
-    scores: list[Score] = []
-    size: dict[tuple[int, int], float] = {}
-    left: dict[tuple[int, int], float] = {}
-    failures: dict[int, str] = {}
-    answers: dict[tuple[int, int], NDArray[np.float32]] = {}
-    largest = np.zeros(setup.noise.shape[1])
+    parts = [Screen((), {}, {}, np.zeros(setup.noise.shape[1]), {})]
     for done, found in enumerate(mapped(executor, _screened_batch, batches), start=1):
-        scores += found.scores
-        size |= found.size
-        left |= found.left
-        failures |= found.failures
-        answers |= found.answers
-        largest = np.maximum(largest, found.largest)
+        parts += found
         tell(done, len(batches))
         if spent():
-            failures |= {k: NOT_TRIED for batch in batches[done:] for k, _ in batch.columns}
+            parts.append(
+                replace(parts[0], failures={k: NOT_TRIED for batch in batches[done:] for k, _ in batch.columns})
+            )
             break
-    ran = {s.candidate for s in scores}
-    failures = {k: why for k, why in failures.items() if k not in ran}
-    return Screen(ranked(scores, candidates), size, left, largest, failures, answers)
+    return Screen.of(parts, candidates)
 
 
 def ranked(scores: Iterable[Score], candidates: Sequence[CandidateEffect]) -> tuple[Score, ...]:
@@ -376,66 +395,70 @@ def _batches(
             yield _Batch(setup, moved, part, {k: candidates[k] for k, _ in part})
 
 
-def _screened_batch(batch: _Batch) -> _BatchResult:
-    """The columns of a batch, simulated."""
-    setup, runner = batch.setup, _Runner(batch)
-    found = _BatchResult([], {}, {}, np.zeros(setup.noise.shape[1]), {}, {})
+def _screened_batch(batch: _Batch) -> list[Screen]:
+    """The columns of a batch, simulated, in parts."""
+    failures: dict[int, str] = {}
+    parts = [Screen((), {}, {}, np.zeros(batch.setup.noise.shape[1]), failures)]
     answers: dict[tuple[int, int], Array] | None = {} if any(len(c.at) > 1 for c in batch.candidates.values()) else None
     run: dict[tuple[int, int], Array] = {}
     for column in batch.columns:
         if len(batch.candidates[column[0]].at) > 1 and batch.movable:
             continue
         try:
-            run[column] = runner(column)
+            run[column] = batch(column)
         except FAILURES as error:
-            found.failures[column[0]] = str(error) or type(error).__name__
+            failures[column[0]] = str(error) or type(error).__name__
         if len(run) == TOGETHER:
-            _compare(runner, run, found, answers)
+            parts.append(_compared(batch, run, answers))
             run = {}
-    _compare(runner, run, found, answers)
+    if run:
+        parts.append(_compared(batch, run, answers))
     if answers is not None and batch.movable:
-        _at_several(batch, answers, found, setup.nominal_chi2)
-    return found
+        parts.append(_at_several(batch, answers))
+    return parts
 
 
-def _compare(
-    runner: _Runner,
-    run: Mapping[tuple[int, int], Array],
-    found: _BatchResult,
-    answers: dict[tuple[int, int], Array] | None,
-) -> None:
-    """Add what some columns do to what was found. run: by column its misfits; answers: to keep what each takes off the residual in."""
-    if not run:
-        return
-    setup = runner.batch.setup
+def _compared(
+    batch: _Batch, run: Mapping[tuple[int, int], Array], answers: dict[tuple[int, int], Array] | None
+) -> Screen:
+    """Return what some columns do. run: by column its misfits; answers: to keep what each takes off the residual in."""
+    setup = batch.setup
     nominal, was, columns = setup.nominal, setup.without.residual, list(run)
     added = nominal.problem.residuals(np.column_stack(list(run.values()))) - was[:, None]
-    steps, fell, factors = setup.without.stepped(added, [runner.reach(c) for c in columns], held=setup.held)
+    steps, fell, factors = setup.without.stepped(added, [batch.reach(c) for c in columns], held=setup.held)
     left = nominal.projected(-added)
     size, kept = np.einsum("nk,nk->k", added, added), np.einsum("nk,nk->k", left, left)
     sketch = Sketch(was.size)
-    for n, column in enumerate(columns):
-        fall, theta = setup.nominal_chi2 - float(fell[n]), setup.point + steps[n]
-        found.scores.append(Score(*column, fall, theta, float(factors[n]), setup.point))
-        found.size[column], found.left[column] = float(size[n]), float(kept[n])
-        found.answers[column] = sketch.kept(added[:, n])
-        if answers is not None:
-            answers[column] = -added[:, n]
+    if answers is not None:
+        answers |= {column: -added[:, n] for n, column in enumerate(columns)}
     told = (size >= EXCITED_CHI2) & (kept > LEAST_SHARE_LEFT * size)
     units = (left[:, told] / np.sqrt(kept[told])).astype(np.float32)
-    if units.size:
-        scores = np.max(np.abs(units.T @ setup.noise), axis=0).astype(float) ** 2
-        np.maximum(found.largest, scores, out=found.largest)
+    largest = np.max(np.abs(units.T @ setup.noise), axis=0, initial=0.0).astype(float) ** 2
+    return Screen(
+        tuple(
+            Score(*c, setup.nominal_chi2 - float(fell[n]), setup.point + steps[n], float(factors[n]), setup.point)
+            for n, c in enumerate(columns)
+        ),
+        dict(zip(columns, size.tolist(), strict=True)),
+        dict(zip(columns, kept.tolist(), strict=True)),
+        largest,
+        {},
+        {c: sketch.kept(added[:, n]) for n, c in enumerate(columns)},
+    )
 
 
-def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: _BatchResult, chi2: float) -> None:
-    """Add what an effect at several places does, to first order: the sum of what it does at each, in proportion to its size."""
+def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array]) -> Screen:
+    """Return what an effect at several places does, to first order: the sum of what it does at each, in proportion to its size."""
     setup, candidates = batch.setup, batch.candidates
-    nominal = setup.nominal
+    nominal, chi2 = setup.nominal, setup.nominal_chi2
     single: dict[tuple[str, str], list[tuple[float, tuple[int, int]]]] = {}
     for k, n in answers:
         c = candidates[k]
         single.setdefault((c.at[0], c.source), []).append((distance(c, n), (k, n)))
+    scores: list[Score] = []
+    sizes: dict[tuple[int, int], float] = {}
+    kept: dict[tuple[int, int], float] = {}
+    sketches: dict[tuple[int, int], NDArray[np.float32]] = {}
     for k, n in batch.columns:
         c = candidates[k]
         if len(c.at) == 1:
@@ -452,9 +475,10 @@ def _at_several(batch: _Batch, answers: Mapping[tuple[int, int], Array], found: 
         answer = np.sum(parts, axis=0, dtype=float)
         steps, fell, factors = setup.without.stepped(-answer[:, None], [UP_TO_ONE])
         left = nominal.projected(answer[:, None])[:, 0]
-        found.size[k, n], found.left[k, n] = float(answer @ answer), float(left @ left)
-        found.answers[k, n] = Sketch(answer.size).kept(-answer)
-        found.scores.append(Score(k, n, chi2 - float(fell[0]), setup.point + steps[0], float(factors[0])))
+        sizes[k, n], kept[k, n] = float(answer @ answer), float(left @ left)
+        sketches[k, n] = Sketch(answer.size).kept(-answer)
+        scores.append(Score(k, n, chi2 - float(fell[0]), setup.point + steps[0], float(factors[0])))
+    return Screen(tuple(scores), sizes, kept, np.zeros(setup.noise.shape[1]), {}, sketches)
 
 
 def distance(candidate: CandidateEffect, probe: int) -> float:
@@ -467,51 +491,6 @@ def _reach(candidate: CandidateEffect, probe: int) -> tuple[float, float]:
     """Return the factors on the size of a candidate in proportion to it that a step may ask for."""
     free = candidate.probes[probe].free
     return ANY_FACTOR if any(low < 0.0 for low, _ in free.values()) else (0.0, np.inf)
-
-
-@dataclass(frozen=True, eq=False)
-class _Runner:
-    """Runs of the columns of a batch."""
-
-    batch: _Batch
-
-    def reach(self, column: tuple[int, int]) -> tuple[float, float]:
-        """Factors on the size that a step may ask for."""
-        if not any(is_proportional(m.form) for m in self.batch.movable.values()):
-            return UP_TO_ONE
-        return _reach(self.batch.candidates[column[0]], column[1])
-
-    @cached_property
-    def _problems(self) -> Mapping[bool, Problem]:
-        setup = self.batch.setup
-        own, how = setup.nominal.problem, (setup.haste, setup.method)
-        return {x: replace(own, simulator=m.simulator(*how)) for x, m in self.batch.movable.items()}
-
-    @cached_property
-    def _from_rest(self) -> Mapping[bool, Problem]:
-        """The problems with runs that begin where the model without an effect rests."""
-        return {x: replace(p, experiments=self.batch.setup.at_rest) for x, p in self._problems.items()}
-
-    def __call__(self, column: tuple[int, int]) -> Array:
-        """Return (M,) the misfits with a candidate in the size of a probe (`Problem.misfits`)."""
-        setup, candidate = self.batch.setup, self.batch.candidates[column[0]]
-        own, theta, probe = setup.nominal.problem, setup.point, candidate.probes[column[1]]
-        if not self.batch.movable or not is_white_box(setup.model):
-            larger = apply_effects(setup.model, [candidate.use(probe)])
-            return replace(own, simulator=ModelSimulator(larger, setup.patience)).misfits(theta, {})
-        loop = on_loop(setup.model, candidate.at[0])
-        moved = self.batch.movable[loop]
-        known = own.values(theta) if candidate.named else {}
-        named = {n: known.get(str(p), setup.model.parameters[str(p)].value) for n, p in candidate.named.items()}
-        values = moved.placed(candidate) | moved.sized({**probe.values, **named})
-        if effects()[
-            candidate.effect
-        ].self_exciting:  # what it does at the first row is no state that the plant rests in
-            return self._from_rest[loop].misfits(theta, values)
-        try:
-            return self._problems[loop].misfits(theta, values)
-        except SteadyStartError:  # it leaves no steady state, as levels in a loop do not, or none near
-            return self._from_rest[loop].misfits(theta, values)
 
 
 def _bounded(squares: Array, asked: Array, low: Array, high: Array) -> Array:

@@ -21,7 +21,7 @@ from tests.discrepancy.refits import answered, beside, plain
 
 def chance(refit: Refit) -> float:
     """The chance that experiments of one size differ as these do."""
-    return constancy(refit, refit.nominal(), refit.placed[-1]).p
+    return constancy(refit, refit.nominal(), refit.placed[-1])[1]
 
 
 def lagged(before: Refit) -> Refit:

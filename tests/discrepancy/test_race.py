@@ -13,7 +13,7 @@ from hvdc_ident.discrepancy.candidates import CandidateEffect
 from hvdc_ident.discrepancy.expansion import Race
 from hvdc_ident.discrepancy.hypothesis import Refit, RefitJob, refitted
 from hvdc_ident.discrepancy.options import Course, DiagnosisOptions, SearchContext
-from hvdc_ident.discrepancy.screen import _Runner
+from hvdc_ident.discrepancy.screen import _Batch
 from hvdc_ident.errors import ComputationError, InputError
 from hvdc_ident.immutable import FrozenMap
 from hvdc_ident.simulate import ModelSimulator
@@ -133,15 +133,15 @@ def test_a_diagnosis_outlives_a_candidate_that_raises(monkeypatch: pytest.Monkey
 def test_a_candidate_that_cannot_be_screened_is_told_and_the_others_are_looked_at(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    plain = _Runner.__call__
+    plain = _Batch.__call__
 
-    def fails(of: _Runner, column: tuple[int, int]) -> object:
-        candidate = of.batch.candidates[column[0]]
+    def fails(of: _Batch, column: tuple[int, int]) -> object:
+        candidate = of.candidates[column[0]]
         if (candidate.effect, candidate.at) == ("quantisation", ("err",)):
             raise np.linalg.LinAlgError("SVD did not converge")
         return plain(of, column)
 
-    monkeypatch.setattr(_Runner, "__call__", fails)
+    monkeypatch.setattr(_Batch, "__call__", fails)
     quick, looked_for = DiagnosisOptions(fallback=False), ["lag", "quantisation"]
     found = diagnose(model(), experiments(lag=0.03), FREE, effects=looked_for, places=["wm", "err"], options=quick)
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))], found.text

@@ -17,7 +17,7 @@ from hvdc_ident.discrepancy.expansion import ExpansionModel, _few
 from hvdc_ident.discrepancy.hypothesis import Refit, slot_signals, with_given_gains
 from hvdc_ident.discrepancy.movable import Form, equations, is_proportional
 from hvdc_ident.discrepancy.options import SearchContext
-from hvdc_ident.discrepancy.screen import ANY_FACTOR, SKETCHED, UP_TO_ONE, Linearised, Sketch, _Runner, screened
+from hvdc_ident.discrepancy.screen import ANY_FACTOR, SKETCHED, UP_TO_ONE, Linearised, Sketch, _Batch, screened
 from hvdc_ident.effects import Probe, apply_effects, effects
 from hvdc_ident.fit import Problem
 from hvdc_ident.immutable import FrozenMap
@@ -167,13 +167,13 @@ def test_sizes_that_were_run_are_not_run_again(lagged: Refit, monkeypatch: pytes
     known = stand.screen(found, "once")
     more = tuple(c.with_sizes([{"T": 0.0123}]) if c.effect == "lag" else c for c in found)
     runs: list[tuple[int, int]] = []
-    plain_run = _Runner.__call__
+    plain_run = _Batch.__call__
 
-    def counted(runner: _Runner, column: tuple[int, int]) -> Array:
+    def counted(runner: _Batch, column: tuple[int, int]) -> Array:
         runs.append(column)
         return plain_run(runner, column)
 
-    monkeypatch.setattr(_Runner, "__call__", counted)
+    monkeypatch.setattr(_Batch, "__call__", counted)
     again = stand.screen(more, "again", known=known)
     assert sorted(runs) == sorted((k, len(c.probes)) for k, c in enumerate(found) if c.effect == "lag")
     assert {s.candidate for s in again.scores} == {k for k, _ in runs}

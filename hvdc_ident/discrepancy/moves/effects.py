@@ -33,7 +33,7 @@ from hvdc_ident.discrepancy.moves.sizes import with_closer_sizes, with_searched_
 from hvdc_ident.discrepancy.options import BEAM, FIELD, SearchContext
 from hvdc_ident.discrepancy.residual_checks import tones
 from hvdc_ident.discrepancy.score import TIED
-from hvdc_ident.discrepancy.screen import Score, Sketch
+from hvdc_ident.discrepancy.screen import Score, Screen, Sketch
 from hvdc_ident.discrepancy.search import Hypothesis, Move, Search, Term
 from hvdc_ident.effects import effects
 
@@ -124,7 +124,7 @@ def opened(
         best = screen.best()
         # A size at which a candidate does not run, as a slow filter in a loop does not, says nothing of its others.
         which = [*first_of(list(best), found), *screen.failures]
-        screen = screen.with_(model.screen(found, text, which, known=screen), found)
+        screen = Screen.of([screen, model.screen(found, text, which, known=screen)], found)
     return model, Expansion(here, signals, found, screen)
 
 
