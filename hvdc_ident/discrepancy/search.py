@@ -380,8 +380,12 @@ class Search:
         order: list[tuple[int, int, Hypothesis, Move]] = []
         # Where a form explains the records no other effects are looked for in pairs, but clocks and values that are off are.
         ends = bool(best.terms) and best.terms[-1].is_form and bool(self._unrefuted_forms())
+        sizes: Counter[int] = Counter()
         for n, h in enumerate(self._beam(ranked)):
             more = len(h.terms) + 1
+            # The others of so many terms come after what is dear beside fewer.
+            turn = TERM_RANK * len(h.terms) + (1 if sizes[more] else 0)
+            sizes[more] += 1
             if more > self.context.options.most or not self._may_win(h, best, ruler):
                 continue
             # What leaves noise is compared with what may stand in the stead of its terms, and only what is cheap is still asked.
@@ -394,7 +398,7 @@ class Search:
                     continue
                 if (satisfied and move.rank > 1) or (ends and more > 1 and move.rank > 0):
                     continue
-                order.append((move.rank + TERM_RANK * len(h.terms), n, h, move))
+                order.append((move.rank + turn, n, h, move))
         if not order:
             return None
         _, _, h, move = min(order, key=lambda o: o[:2])

@@ -29,7 +29,7 @@ from hvdc_ident.discrepancy.expansion import (
 )
 from hvdc_ident.discrepancy.hypothesis import Refit, scaled_sizes, slot_signals, with_given_gains
 from hvdc_ident.discrepancy.movable import in_proportion
-from hvdc_ident.discrepancy.moves.sizes import with_closer_sizes, with_searched_sizes
+from hvdc_ident.discrepancy.moves.sizes import with_closer_sizes, with_levels, with_periods
 from hvdc_ident.discrepancy.options import BEAM, FIELD, SearchContext
 from hvdc_ident.discrepancy.residual_checks import tones
 from hvdc_ident.discrepancy.score import TIED
@@ -294,5 +294,6 @@ MOVES = (
     Move("from the given values", 2, again(from_given, "from the given values")),
     Move("beside the leaders", 2, again(beside_leaders, "beside")),
     Move("beside the new leaders", 3, again(beside_leaders, "beside")),
-    Move("sizes", 4, again(with_searched_sizes, "sizes to be met")),
+    Move("periods of samplers", 2, again(with_periods, "sizes to be met")),
+    Move("levels of quantisers", 3, again(with_levels, "sizes to be met")),
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,13 +37,19 @@ SIMILAR_DELAY = 0.3
 """Difference of the logarithms of two delays within which one may stand for the other."""
 
 
-def with_searched_sizes(model: ExpansionModel, opened: Expansion, text: str, *, far: bool = True) -> Expansion:
-    """Return the expansion with effects whose size has to be met. far: whether nothing explains the records so far.
+def with_periods(model: ExpansionModel, opened: Expansion, text: str) -> Expansion:
+    """Return the expansion with samplers in every period that delays as long as what was refitted at their places: to first order a
+    sampler is a delay."""
+    return _met(model, opened, _periods(opened), text)
 
-    A quantiser is looked for at the places that promise most, where nothing else explains the records. A sampler is a delay to first
-    order: it is looked for in periods that delay as long as what was refitted, or as a quantiser is where no other delay is tried.
-    """
-    grids = _grids(opened, far=far)
+
+def with_levels(model: ExpansionModel, opened: Expansion, text: str) -> Expansion:
+    """Return the expansion with quantisers of every step at the places that promise most, and with samplers in every period where no
+    other delay is tried."""
+    return _met(model, opened, _levels(opened), text)
+
+
+def _met(model: ExpansionModel, opened: Expansion, grids: Mapping[int, Array], text: str) -> Expansion:
     if not grids:
         return opened
     opened = _with_best_of_all_sizes(model, opened, grids, text)
@@ -105,33 +111,49 @@ def _with_best_of_all_sizes(
     return _refitted(model, opened, best, text)
 
 
-def _grids(opened: Expansion, *, far: bool) -> dict[int, Array]:
-    """Return by candidate the sizes to be looked at, (m,), rising."""
-    found, entries = opened.candidates, effects()
-    better = [t for t in by_cost(opened.trials) if t.refit.chi2 < opened.before.chi2][: None if far else BEAM]
-    late = {found[t.score.candidate].at: d for t in reversed(better) if (d := _late(t.refit)) is not None}
-    delays = any(entries[c.effect].equivalent_delay is not None and not entries[c.effect].needs_grid for c in found)
+def _periods(opened: Expansion) -> dict[int, Array]:
+    """Return by sampler the periods to be looked at, (m,), rising."""
+    if not _has_delays(opened):
+        return {}
+    entries = effects()
+    better = [t for t in by_cost(opened.trials) if t.refit.chi2 < opened.before.chi2]
+    late = {t.refit.placed[-1].candidate.at: d for t in reversed(better) if (d := _late(t.refit)) is not None}
+    grids = {}
+    for k, values, sizes in _to_be_met(opened):
+        c = opened.candidates[k]
+        if entries[c.effect].equivalent_delay is None:
+            continue
+        own = [entries[c.effect].delay_with({**values, _named(c): s}) or 0.0 for s in sizes.tolist()]
+        grids[k] = sizes[[_alike(d, late.get(c.at, 0.0)) for d in own]]
+    return {k: sizes for k, sizes in grids.items() if sizes.size}
+
+
+def _levels(opened: Expansion) -> dict[int, Array]:
+    """Return by quantiser the steps to be looked at, (m,), rising, and by sampler the periods where no other delay is tried."""
+    delays, least, count = _has_delays(opened), _least_answer(opened), Counter[str]()
+    grids = {}
+    for k, _, sizes in _to_be_met(opened):
+        effect = opened.candidates[k].effect
+        count[effect] += 1
+        if count[effect] <= QUANTISER_PLACES and not (delays and effects()[effect].equivalent_delay is not None):
+            grids[k] = sizes[sizes * _answer_per_size(opened, k) >= least]
+    return {k: sizes for k, sizes in grids.items() if sizes.size}
+
+
+def _to_be_met(opened: Expansion) -> Iterator[tuple[int, Mapping[str, float], Array]]:
+    """Yield the candidates whose size has to be met, the most promising first, each with its other sizes and the grid of that one."""
     times = [e.time for e in opened.before.problem.fitted_experiments]
-    count: Counter[str] = Counter()
-    grids: dict[int, Array] = {}
     for k in opened.screen.best():
-        c = found[k]
-        entry = entries[c.effect]
-        if not entry.needs_grid or len(c.at) > 1:
-            continue
-        count[c.effect] += 1
-        probe, sizes = size_grid(entry, SignalScales.of(times, opened.signals[c.at[0]]))
-        sizes = np.unique(sizes)
-        if entry.equivalent_delay is not None and delays:
-            own = [entry.delay_with({**probe.values, _named(c): float(s)}) or 0.0 for s in sizes]
-            sizes = sizes[[_alike(d, late.get(c.at, 0.0)) for d in own]]
-        elif not (far and count[c.effect] <= QUANTISER_PLACES):
-            continue
-        else:
-            sizes = sizes[sizes * _answer_per_size(opened, k) >= _least_answer(opened)]
-        if sizes.size:
-            grids[k] = sizes
-    return grids
+        c = opened.candidates[k]
+        if effects()[c.effect].needs_grid and len(c.at) == 1:
+            probe, sizes = size_grid(effects()[c.effect], SignalScales.of(times, opened.signals[c.at[0]]))
+            yield k, probe.values, np.unique(sizes)
+
+
+def _has_delays(opened: Expansion) -> bool:
+    """Return True where delays are tried whose size a slope leads to."""
+    entries = (effects()[c.effect] for c in opened.candidates)
+    return any(e.equivalent_delay is not None and not e.needs_grid for e in entries)
 
 
 def _answer_per_size(opened: Expansion, candidate: int) -> float:
