@@ -103,13 +103,15 @@ class SlightErrors:
     def under(self, refit: Refit) -> Errors:
         """Return the likeliest errors under a hypothesis, within what such errors are together; none where its records are others.
 
-        Free parameters go with them: those that fitted and held-out records determine together.
+        Free parameters go with them: those that fitted and held-out records determine together. What the errors do is worked out beside
+        the model without terms; what they leave is that of a run with them.
         """
-        blocks = [refit.problem.blocks(refit.theta)]
+        problems, blocks = [refit.problem], [refit.problem.blocks(refit.theta)]
         unseen = of_held_out(refit.problem)
         if unseen is not None and self.held.shape[0]:
             with suppress(SimulationError):  # held-out records that cannot be run say nothing
                 blocks.append(unseen.blocks(refit.theta[: len(unseen.free)]))
+                problems.append(unseen)
         free, answers = len(refit.problem.free), [self.fitted, self.held]
         if any(sum(b.residual.size for b in part) != a.shape[0] for part, a in zip(blocks, answers, strict=False)):
             return Errors({}, self.units)
@@ -123,18 +125,40 @@ class SlightErrors:
         most = strength.size + SURE * math.sqrt(2.0 * strength.size)
         weight = _weight(np.maximum(strength, 0.0), asked, most)
         errors = -directions @ (asked / (weight + np.maximum(strength, 0.0)))
-        left = wanted + every @ errors
+        left = self._left(refit, problems, errors)
+        left = left - basis @ (basis.T @ left)
+        less = float(self.followed @ errors)
+        if not left @ left + errors @ errors - less < wanted @ wanted:
+            errors, left, less = np.zeros(errors.size), wanted, 0.0
         rows = self.fitted.shape[0]
         # The records are moved towards the model, so their levels are off the other way.
         signed = np.array(self.sizes) * np.where([n in self.units for n in self.names], -1.0, 1.0)
         order = np.argsort(-np.abs(errors), kind="stable")
         relative = {self.names[k]: float(errors[k] * signed[k]) for k in order}
         ends = np.cumsum([b.residual.size for b in blocks[0]])
-        power, less = float(left[:rows] @ left[:rows]), float(self.followed @ errors)
+        power = float(left[:rows] @ left[:rows])
         fell = float(wanted[:rows] @ wanted[:rows]) - power + less
         near = sum(float(r[1:] @ r[:-1]) for r in np.split(left[:rows], ends[:-1])) / power if power else 0.0
         correlation = near if near > 2.0 / math.sqrt(rows) else 0.0
         return Errors(relative, self.units, float(left @ left + errors @ errors) - less, max(fell, 0.0), correlation)
+
+    def _left(self, refit: Refit, problems: Sequence[Problem], errors: Array) -> Array:
+        """Return (N,) the residuals of a run of a hypothesis with errors of its stated values and of the recorded levels.
+
+        One of a value that the hypothesis has set free is none. Where it does not run with them they are infinite.
+        """
+        values, levels = {}, np.zeros(errors.size)
+        for k, (name, size) in enumerate(zip(self.names, self.sizes, strict=True)):
+            if name in self.units:
+                levels[k] = errors[k]
+            elif name not in refit.problem.names:
+                values[name] = refit.values.get(name, refit.model.parameters[name].value) * (1.0 + size * errors[k])
+        rows = [a @ levels for a, _ in zip((self.fitted, self.held), problems, strict=False)]
+        try:
+            runs = [p.residuals(p.misfits(refit.theta[: len(p.names)], values)[:, None])[:, 0] for p in problems]
+        except SimulationError:
+            return np.full(sum(r.size for r in rows), np.inf)
+        return np.concatenate(runs) + np.concatenate(rows)
 
 
 def _weight(strength: Array, asked: Array, most: float) -> float:
