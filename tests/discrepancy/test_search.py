@@ -12,7 +12,7 @@ from hvdc_ident.discrepancy.hypothesis import Refit, refitted
 from hvdc_ident.discrepancy.moves import MOVES
 from hvdc_ident.discrepancy.options import DiagnosisOptions, SearchContext
 from hvdc_ident.discrepancy.result import CARD, VALUE
-from hvdc_ident.discrepancy.rivals import compared
+from hvdc_ident.discrepancy.rivals import classes, compared, rivals
 from hvdc_ident.discrepancy.score import Ruler
 from hvdc_ident.discrepancy.search import CLOCKS, Hypothesis, Search, Term
 from hvdc_ident.discrepancy.stated import Errors, with_free
@@ -166,6 +166,23 @@ def test_of_hypotheses_that_are_as_likely_the_one_with_the_values_nearest_to_the
     beside_it("err", away, 0.5)
     beside_it("torque", given, 20.0)
     assert search._preferred(best) is best
+
+
+def test_a_stated_value_that_is_likely_beforehand_stays_beside_an_effect_of_more_evidence(
+    first: Refit, lagged: Refit
+) -> None:
+    """The effect is at one of ten thousand places: a little more evidence is worth less than that."""
+    search = searching(first)
+    lag, value = Term("lag", ("wm",), prior=4e-5), Term(VALUE, ("b",), prior=0.4)
+    free = with_free(first, FRICTION)
+    told = Hypothesis(fitted(lagged, 1000.0), first, (lag,))
+    search.add([told, Hypothesis(fitted(free, 1012.0), free, (value,))])
+    for h in search.pool.values():
+        search.errors[h.key] = h.refit, NONE
+    group = rivals(replace(search.outcome(exhausted=True), best=told), lag, DiagnosisOptions())
+    assert {r.effect for r in group} == {"lag", VALUE}
+    likeliest = classes(group)[0]
+    assert likeliest.names == (VALUE,) and likeliest.probability > 0.9
 
 
 def test_the_probabilities_of_hypotheses_are_those_of_their_scores() -> None:

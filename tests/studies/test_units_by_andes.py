@@ -167,3 +167,12 @@ def test_the_readme_shows_what_was_found() -> None:
     assert MISFIT.table(known["misfit"]) in readme
     for asked in RUN.SETS:
         assert RUN.table(asked, list(known[asked].values())) in readme
+
+
+@pytest.mark.parametrize(
+    ("unit", "told"), [("stabiliser_missing", "IEEEST is missing as pss"), ("field_time_constant", "gen.Tpdo is 8.")]
+)
+def test_a_card_that_is_missing_and_a_value_that_is_wrong_are_named(unit, told, tmp_path) -> None:
+    """The records are another simulator's; nothing is told to the study but the vendor's file."""
+    found = RUN.one(unit, tmp_path / unit, 120.0)
+    assert found["verdict"] == "named" and found["text"].startswith(told), found["text"]
