@@ -45,13 +45,13 @@ def exchanged(search: Search, h: Hypothesis) -> list[Hypothesis]:
 
 def with_typical_values(search: Search, h: Hypothesis) -> list[Hypothesis]:
     """The units with another card that promise most with one of its typical values free, with as many free as the records ask for."""
-    cards = [h for h in search.pool.values() if h.kind == CARD and len(h.terms) == 1]
-    promise = {h.key: _promise(h) for h in cards}
+    cards = [c for c in search.pool.values() if c.kind == CARD and len(c.terms) == 1]
+    promise = {c.key: _promise(c) for c in cards}
     found: list[Hypothesis] = []
-    for h in sorted(cards, key=lambda h: promise[h.key])[:BEAM]:
+    for card in sorted(cards, key=lambda c: promise[c.key])[:BEAM]:
         if search.context.spent or any(map(search.is_noise, found)):
             break
-        found.append(_all_of_it(search, h))
+        found.append(_all_of_it(search, card))
     return found
 
 
@@ -70,7 +70,7 @@ def _points(h: Hypothesis) -> list[Refit]:
 def _promise(h: Hypothesis) -> float:
     """Return chi2 of another card with the value free that promises most."""
     own = _own_values(h)
-    return min(h.refit.chi2, *(x for point in _points(h) for x in left_with(point, own)[0]))
+    return min([h.refit.chi2, *(float(x) for point in _points(h) for x in left_with(point, own)[0])])
 
 
 def _all_of_it(search: Search, h: Hypothesis) -> Hypothesis:
@@ -80,11 +80,9 @@ def _all_of_it(search: Search, h: Hypothesis) -> Hypothesis:
         free = [(point, f) for point in _points(h) for f in promising(point, own, [0.0] * len(own))]
         wider = [with_free(replace(h.base, theta=point.theta), f) for point, f in free]
         jobs = [RefitJob(w.model, (), w.problem, (w.theta,), w.noise) for w in wider]
-        refits = (
-            Race().run(search.context, h.refit, jobs, [f"{h.label} with {f.name} free" for _, f in free])
-            if jobs
-            else []
-        )
+        if not jobs:
+            break
+        refits = Race().run(search.context, h.refit, jobs, [f"{h.label} with {f.name} free" for _, f in free])
         found = [
             Hypothesis(r, replace(w, theta=r.theta), h.terms)
             for w, r in zip(wider, refits, strict=True)
