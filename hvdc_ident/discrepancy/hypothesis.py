@@ -20,7 +20,8 @@ from hvdc_ident.discrepancy.prediction import held_out, predictive_score, root_m
 from hvdc_ident.effects import EffectUse, Probe, apply_effects, distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.followed_noise import followed_noise
+from hvdc_ident.fit.followed_noise import followed_noise, follows_noise
+from hvdc_ident.fit.followed_noise import without_bias as without_noise_bias
 from hvdc_ident.fit.noise import OutputNoise
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
@@ -373,6 +374,17 @@ def judged(refit: Refit) -> Refit:
         unseen_rows=rows if others is None else sum(b.residual.size for b in others), std=FrozenMap(std), apart=apart,
         followed=followed_noise(refit.problem, refit.theta),
     )  # fmt: skip
+
+
+def without_bias(refit: Refit) -> Refit:
+    """Return a refit whose values are free of what they gain by following less of the noise of played inputs; as it is where it does not
+    run there."""
+    if not follows_noise(refit.problem):
+        return refit
+    try:
+        return judged(replace(refit, theta=without_noise_bias(refit.problem, refit.theta)))
+    except FAILURES:
+        return refit
 
 
 def uncertainty_of(problem: Problem, blocks: Sequence[ResidualBlock]) -> Uncertainty:

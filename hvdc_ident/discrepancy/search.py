@@ -28,6 +28,7 @@ from hvdc_ident.discrepancy.hypothesis import (
     built_in,
     last_placed,
     refit_again,
+    without_bias,
 )
 from hvdc_ident.discrepancy.misfit import misfit_of
 from hvdc_ident.discrepancy.nominal import noise_left
@@ -546,6 +547,9 @@ class Search:
     def outcome(self, *, exhausted: bool) -> SearchOutcome:
         """Return what is known now. exhausted: whether nothing is open that could come near the best."""
         best, against = self.answer()
+        if best.terms:
+            best = replace(best, refit=without_bias(best.refit))
+            self.pool[best.key] = best
         ruler = self.ruler
         none = self.cost(self.root, ruler)
         return SearchOutcome(

@@ -15,12 +15,17 @@ from dataclasses import replace
 import numpy as np
 
 from hvdc_ident.data import Array, Experiment, InputSignal
-from hvdc_ident.fit.problem import Problem
+from hvdc_ident.fit.problem import Problem, stacked
 from hvdc_ident.immutable import FrozenMap
 
 DRAWS = 2
 """Records of noise that are followed. Of two models the same ones are: the difference is known to a share of itself, sqrt(2/N) for N
 independent residuals, of which a record has hundreds."""
+
+SLOPE_STEP = 0.01
+"""Share of a value by which it is moved for a slope: what is followed is smooth in it, and runs are exact to a millionth."""
+SINGULAR = 1e-9
+"""Smallest singular value, of the largest, of combinations of unknowns that the records determine."""
 
 
 def follows_noise(problem: Problem) -> bool:
@@ -42,6 +47,30 @@ def followed_noise(problem: Problem, theta: Array, also: Mapping[str, float] | N
         runs.append(replace(problem, experiments=noisier).misfits(theta, values))
     whole = problem.residuals(np.column_stack(runs))
     return float(np.sum((whole[:, 1:] - whole[:, :1]) ** 2) / DRAWS)
+
+
+def without_bias(problem: Problem, theta: Array) -> Array:
+    """Return (p,) the unknowns of least squares, freed to first order of what they gain by following less noise, within their bounds.
+
+    The sum of squares is least there, and less the noise that is followed a step further: half the slopes of that, over the information.
+    Raises SimulationError where a run fails.
+    """
+    if not follows_noise(problem):
+        return theta
+    jacobian = stacked(problem.blocks(theta))[1]
+    here, slopes = followed_noise(problem, theta), np.zeros(theta.size)
+    for k, f in enumerate(problem.free):
+        step = SLOPE_STEP * (abs(theta[k]) or f.size)
+        inwards = -step if theta[k] + step > f.max else step
+        there = theta.copy()
+        there[k] += inwards
+        slopes[k] = (followed_noise(problem, there) - here) / inwards
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    unit = jacobian / scale
+    move = np.linalg.lstsq(unit.T @ unit, 0.5 * slopes / scale, rcond=SINGULAR)[0] / scale
+    low, high = (np.array([getattr(u, end) for u in problem.unknowns]) for end in ("min", "max"))
+    return np.asarray(np.clip(theta + move, low, high))
 
 
 def _noisier(experiment: Experiment, draw: int) -> Experiment:
