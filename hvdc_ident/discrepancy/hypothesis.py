@@ -377,14 +377,18 @@ def judged(refit: Refit) -> Refit:
 
 
 def without_bias(refit: Refit) -> Refit:
-    """Return a refit whose values are free of what they gain by following less of the noise of played inputs; as it is where it does not
-    run there."""
+    """Return a refit whose values are free of what they gain by following less of the noise of played inputs.
+
+    What is least then is chi2 less the noise that is followed: where the step does not make it less, as one along values that the records
+    hardly determine, or leads where the model does not run, the refit is returned as it is.
+    """
     if not follows_noise(refit.problem):
         return refit
     try:
-        return judged(replace(refit, theta=without_noise_bias(refit.problem, refit.theta)))
+        freed = judged(replace(refit, theta=without_noise_bias(refit.problem, refit.theta)))
     except FAILURES:
         return refit
+    return freed if freed.chi2 - freed.followed < refit.chi2 - refit.followed else refit
 
 
 def uncertainty_of(problem: Problem, blocks: Sequence[ResidualBlock]) -> Uncertainty:
