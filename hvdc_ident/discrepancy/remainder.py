@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -169,7 +168,7 @@ def _tested(search: SearchContext, last: Refit, found: Remainder) -> Remainder:
     places = _apart(paths, list(signals), search.seed)
     noise = nominal.projected(nominal.drawn(_least_draws(search), search.seed + 5))
     inversions: list[Inversion] = []
-    for inversion in mapped(search.executor, partial(Inversion.of, nominal, paths), places):
+    for inversion in mapped(search.executor, _inverted, [(nominal, paths, p) for p in places]):
         inversions.append(inversion)
         if search.spent and len(inversions) < len(places):
             return found  # the best of some places is none: what is left is told without one
@@ -198,6 +197,10 @@ def _apart(paths: Mapping[str, Pushed], places: Sequence[str], seed: int) -> lis
         if not any(1.0 - abs(float(unit @ other)) < PROPORTIONAL for other in kept.values()):
             kept[place] = unit
     return list(kept)
+
+
+def _inverted(job: tuple[Nominal, Mapping[str, Pushed], str]) -> Inversion:
+    return Inversion.of(*job)
 
 
 def _beyond_noise(latent: Inversion) -> float:
