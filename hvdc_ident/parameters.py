@@ -60,7 +60,7 @@ class Parameter:
 
     @property
     def about(self) -> str:
-        """What the parameter is, with its usual values."""
+        """The description with the usual values."""
         usual = " to ".join(f"{v:g}" for v in self.usual)
         return "; ".join(filter(None, (self.description, usual)))
 

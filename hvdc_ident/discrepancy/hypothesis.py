@@ -20,8 +20,7 @@ from hvdc_ident.discrepancy.prediction import held_out, predictive_score, root_m
 from hvdc_ident.effects import EffectUse, Probe, apply_effects, distance_from_neutral, effects
 from hvdc_ident.errors import HvdcIdentError, SimulationError
 from hvdc_ident.fit import FitParameter, Problem
-from hvdc_ident.fit.followed_noise import followed_noise, follows_noise
-from hvdc_ident.fit.followed_noise import without_bias as without_noise_bias
+from hvdc_ident.fit.followed_noise import followed_noise, follows_noise, unbiased
 from hvdc_ident.fit.noise import OutputNoise
 from hvdc_ident.fit.optimiser import OptimiserResult
 from hvdc_ident.fit.optimisers.trust_region import TrustRegion
@@ -379,13 +378,13 @@ def judged(refit: Refit) -> Refit:
 def without_bias(refit: Refit) -> Refit:
     """Return a refit whose values are free of what they gain by following less of the noise of played inputs.
 
-    What is least then is chi2 less the noise that is followed: where the step does not make it less, as one along values that the records
-    hardly determine, or leads where the model does not run, the refit is returned as it is.
+    The refit is returned as it is where the step does not make chi2 less the followed noise smaller, as one along values that the records
+    hardly determine, or leads where the model does not run.
     """
     if not follows_noise(refit.problem):
         return refit
     try:
-        freed = judged(replace(refit, theta=without_noise_bias(refit.problem, refit.theta)))
+        freed = judged(replace(refit, theta=unbiased(refit.problem, refit.theta)))
     except FAILURES:
         return refit
     return freed if freed.chi2 - freed.followed < refit.chi2 - refit.followed else refit

@@ -389,7 +389,7 @@ class Search:
             sizes[more] += 1
             if more > self.context.options.most or not self._may_win(h, best, ruler):
                 continue
-            # What leaves noise is compared with what may stand in the stead of its terms, and only what is cheap is still asked.
+            # Beside the best that leaves noise only rivals of its own terms are looked for, and only by what is cheap.
             if satisfied and h.terms and not h.key < best.key:
                 continue
             for move in self.moves:
@@ -550,7 +550,7 @@ class Search:
         if best.terms:
             best = replace(best, refit=without_bias(best.refit))
             self.pool[best.key] = best
-        ruler = self.ruler
+        ruler, standing = self.ruler, self.forms()
         none = self.cost(self.root, ruler)
         return SearchOutcome(
             best,
@@ -558,8 +558,8 @@ class Search:
             dict(self.expansions),
             ruler,
             self.errors_under(best),
-            tuple(self.forms()),
-            tuple(self.forms_ahead()),
+            tuple(standing),
+            tuple(self.forms_ahead(best, standing)),
             against,
             exhausted,
             tuple(self.notes),
@@ -570,9 +570,9 @@ class Search:
         first."""
         return [h for h in self._unrefuted_forms() if not self._objection(h)]
 
-    def forms_ahead(self) -> list[Hypothesis]:
-        """The forms that stand and are better than the answer by more than chance, as likely as the best of them."""
-        (answer, _), standing, ruler = self.answer(), self.forms(), self.ruler
+    def forms_ahead(self, answer: Hypothesis, standing: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Of standing forms those that are better than the answer by more than chance, and as likely as the best of them."""
+        ruler = self.ruler
         ahead = [h for h in standing if self.cost(answer, ruler) - self.cost(h, ruler) > self.near]
         return [h for h in ahead if self.cost(h, ruler) - self.cost(ahead[0], ruler) <= self.near]
 

@@ -125,11 +125,13 @@ class SlightErrors:
         most = strength.size + SURE * math.sqrt(2.0 * strength.size)
         weight = _weight(np.maximum(strength, 0.0), asked, most)
         errors = -directions @ (asked / (weight + np.maximum(strength, 0.0)))
-        left = self._left(refit, problems, errors)
-        left = left - basis @ (basis.T @ left)
-        less = float(self.followed @ errors)
-        if not left @ left + errors @ errors - less < wanted @ wanted:
-            errors, left, less = np.zeros(errors.size), wanted, 0.0
+        left, less = wanted, 0.0
+        run = self._run_with(errors, refit, problems)
+        rest = None if run is None else run - basis @ (basis.T @ run)
+        if rest is not None and rest @ rest + errors @ errors - self.followed @ errors < wanted @ wanted:
+            left, less = rest, float(self.followed @ errors)
+        else:
+            errors = np.zeros(errors.size)
         rows = self.fitted.shape[0]
         # The records are moved towards the model, so their levels are off the other way.
         signed = np.array(self.sizes) * np.where([n in self.units for n in self.names], -1.0, 1.0)
@@ -142,10 +144,9 @@ class SlightErrors:
         correlation = near if near > 2.0 / math.sqrt(rows) else 0.0
         return Errors(relative, self.units, float(left @ left + errors @ errors) - less, max(fell, 0.0), correlation)
 
-    def _left(self, refit: Refit, problems: Sequence[Problem], errors: Array) -> Array:
-        """Return (N,) the residuals of a run of a hypothesis with errors of its stated values and of the recorded levels.
-
-        One of a value that the hypothesis has set free is none. Where it does not run with them they are infinite.
+    def _run_with(self, errors: Array, refit: Refit, problems: Sequence[Problem]) -> Array | None:
+        """Return (N,) the residuals of a run of a hypothesis with errors of its stated values and of the recorded levels; None where it
+        does not run with them. An error of a value that the hypothesis has set free is none.
         """
         values, levels = {}, np.zeros(errors.size)
         for k, (name, size) in enumerate(zip(self.names, self.sizes, strict=True)):
@@ -157,7 +158,7 @@ class SlightErrors:
         try:
             runs = [p.residuals(p.misfits(refit.theta[: len(p.names)], values)[:, None])[:, 0] for p in problems]
         except SimulationError:
-            return np.full(sum(r.size for r in rows), np.inf)
+            return None
         return np.concatenate(runs) + np.concatenate(rows)
 
 
@@ -251,11 +252,9 @@ def stated(model: AnyModel, candidates: Sequence[FitParameter]) -> tuple[FitPara
         return ()
     fitted, found = {f.name for f in candidates}, []
     for n, p in model.parameters.items():
-        low, high = sorted((p.value / FARTHEST, p.value * FARTHEST))
-        low, high = max(low, p.min), min(high, p.max)
-        if p.value == 0.0 and p.usual and p.min < p.max:
-            low, high = min(p.usual[0], 0.0), max(p.usual[1], 0.0)
-        if n not in fitted and (low < p.value < high or (p.value == 0.0 and low < high)):
+        ends = (p.value / FARTHEST, p.value * FARTHEST) if p.value else p.usual
+        low, high = max(min([p.value, *ends]), p.min), min(max([p.value, *ends]), p.max)
+        if n not in fitted and low < high and (low < p.value < high or p.value == 0.0):
             found.append(FitParameter(n, p.value, low, high, scale=0.0 if p.value else high - low))
     return tuple(found)
 

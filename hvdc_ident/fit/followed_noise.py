@@ -1,4 +1,4 @@
-"""How much a model makes of the noise of the inputs that it is played.
+"""Measure the noise of played inputs that a model follows, and free estimates of what they gain by following less of it.
 
 A model follows the noise of a recorded voltage, which the plant has not seen. The less it follows it, the smaller its residuals: a
 reactance that is too large, a gain that is too small or a lag that is not there pay off, where residuals are whitened by a covariance
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -49,7 +50,7 @@ def followed_noise(problem: Problem, theta: Array, also: Mapping[str, float] | N
     return float(np.sum((whole[:, 1:] - whole[:, :1]) ** 2) / DRAWS)
 
 
-def without_bias(problem: Problem, theta: Array) -> Array:
+def unbiased(problem: Problem, theta: Array) -> Array:
     """Return (p,) the unknowns of least squares, freed to first order of what they gain by following less noise, within their bounds.
 
     The sum of squares is least there, and less the noise that is followed a step further: half the slopes of that, over the information.
@@ -73,6 +74,8 @@ def without_bias(problem: Problem, theta: Array) -> Array:
     return np.asarray(np.clip(theta + move, low, high))
 
 
+# Many models, and many values of one, are run with the same draws.
+@lru_cache(maxsize=32)
 def _noisier(experiment: Experiment, draw: int) -> Experiment:
     """Return an experiment whose recorded inputs have a draw of their noise more; it begins where it began."""
     random, inputs = np.random.default_rng(draw), dict(experiment.inputs)

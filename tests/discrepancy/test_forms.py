@@ -183,11 +183,14 @@ def test_a_form_is_ahead_only_where_it_beats_what_the_catalogue_has() -> None:
     search = Search(context, plain(metered("w", drifting)), MOVES)
     for name in ("effects", "forms"):
         search.add(next(m for m in MOVES if m.name == name).make(search, search.root))
-    ahead = search.forms_ahead()
+    ahead = search.forms_ahead(search.answer()[0], search.forms())
     assert expression(ahead[0].refit) == "g*time*w" and ahead[0] in search.forms()
     rival = Hypothesis(ahead[0].refit, search.root.base, (Term("gain", ("wm",), prior=ahead[0].terms[0].prior),))
     search.add([rival])
-    assert ahead[0] in search.forms() and not search.forms_ahead(), "an effect of the catalogue leaves as much"
+    standing = search.forms()
+    assert ahead[0] in standing and not search.forms_ahead(search.answer()[0], standing), (
+        "an effect of the catalogue leaves as much"
+    )
 
 
 def polynomials(told: str) -> list[list[float]]:

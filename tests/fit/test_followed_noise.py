@@ -1,4 +1,4 @@
-"""What a model gains by following less of the noise of the inputs that it is played, by Monte Carlo and by the answers to single rows."""
+"""Noise of played inputs that a model follows: by Monte Carlo, and by the answers to single rows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hvdc_ident.fit import FitParameter, Problem, fit
-from hvdc_ident.fit.followed_noise import DRAWS, followed_noise, follows_noise, without_bias
+from hvdc_ident.fit.followed_noise import DRAWS, followed_noise, follows_noise, unbiased
 from hvdc_ident.fit.residual import passed_draws
 from tests.fit.test_passed_noise import TIME, D, K, measured, simulator
 
@@ -52,7 +52,7 @@ def test_one_step_takes_the_bias_off_an_estimate() -> None:
         found = fit(of, starts=1, assess=False)
         theta = np.array([found.estimates["D"].value])
         before.append(float(theta[0]))
-        after.append(float(without_bias(of, theta)[0]))
+        after.append(float(unbiased(of, theta)[0]))
     error = np.std(after) / np.sqrt(len(after))
     assert np.mean(after) == pytest.approx(D, abs=3.0 * error)
     assert np.mean(before) < D - 6.0 * np.std(before) / np.sqrt(len(before))

@@ -46,9 +46,8 @@ def exchanged(search: Search, h: Hypothesis) -> list[Hypothesis]:
 def with_typical_values(search: Search, h: Hypothesis) -> list[Hypothesis]:
     """The units with another card that promise most with one of its typical values free, with as many free as the records ask for."""
     cards = [c for c in search.pool.values() if c.kind == CARD and len(c.terms) == 1]
-    promise = {c.key: _promise(c) for c in cards}
     found: list[Hypothesis] = []
-    for card in sorted(cards, key=lambda c: promise[c.key])[:BEAM]:
+    for card in sorted(cards, key=_promise)[:BEAM]:
         if search.context.spent or any(map(search.is_noise, found)):
             break
         found.append(_all_of_it(search, card))
@@ -61,23 +60,23 @@ def _own_values(h: Hypothesis) -> list[FitParameter]:
     return [f for f in stated(h.base.model, h.base.problem.free) if f.name.startswith(f"{component}.")]
 
 
-def _points(h: Hypothesis) -> list[Refit]:
-    """Return the refit of another card as it came out, and at the given values: values that make up for what is missing hide it."""
-    given = with_given_gains(h.refit)
-    return [h.refit] if given is None else [h.refit, replace(h.refit, theta=given)]
+def _points(refit: Refit) -> list[Refit]:
+    """Return a refit of another card as it stands, and at the given values: values that make up for what is missing hide it."""
+    given = with_given_gains(refit)
+    return [refit] if given is None else [refit, replace(refit, theta=given)]
 
 
 def _promise(h: Hypothesis) -> float:
     """Return chi2 of another card with the value free that promises most."""
     own = _own_values(h)
-    return min([h.refit.chi2, *(float(x) for point in _points(h) for x in left_with(point, own)[0])])
+    return min([h.refit.chi2, *(float(x) for point in _points(h.refit) for x in left_with(point, own)[0])])
 
 
 def _all_of_it(search: Search, h: Hypothesis) -> Hypothesis:
     """Return a hypothesis of another card with as many of its typical values set free as the records ask for, one after the other."""
     while not (search.context.spent or search.is_noise(h)):
         own = _own_values(h)
-        free = [(point, f) for point in _points(h) for f in promising(point, own, [0.0] * len(own))]
+        free = [(point, f) for point in _points(h.refit) for f in promising(point, own, [0.0] * len(own))]
         wider = [with_free(replace(h.base, theta=point.theta), f) for point, f in free]
         jobs = [RefitJob(w.model, (), w.problem, (w.theta,), w.noise) for w in wider]
         if not jobs:
@@ -100,8 +99,6 @@ def _begins(base: Refit, change: CardChange) -> tuple[Array, ...]:
     """Return where the refit of another card may begin: at its start beside the parameters as they are refitted and as they are given, and
     there with one value a quarter of its range from either end that leaves no trace, as a level that nothing reaches, or is at an end of
     its range, where what it sets is hardly there."""
-    given = with_given_gains(base)
-    points = [base.theta] if given is None else [base.theta, given]
     try:
         traces = np.any(stacked(base.problem.blocks(base.theta))[1] != 0.0, axis=0)
     except FAILURES:  # it may run elsewhere
@@ -111,8 +108,8 @@ def _begins(base: Refit, change: CardChange) -> tuple[Array, ...]:
         for k, f in enumerate(base.problem.free)
         if f.name in change.free and (not traces[k] or f.on_bound(f.start))
     ]
-    begins = list(points)
-    for point in points:
+    begins = [p.theta for p in _points(base)]
+    for point in tuple(begins):
         for k, f in hidden:
             for share in (0.25, 0.75):
                 begins.append(np.concatenate([point[:k], [f.min + share * (f.max - f.min)], point[k + 1 :]]))

@@ -105,7 +105,7 @@ def anywhere(search: Search, h: Hypothesis) -> list[Hypothesis]:
     forms = refitted_forms(context, expansion)
     found = extended(h, expansion, forms)
     search.add(found)
-    first = search.forms_ahead()
+    first = search.forms_ahead(search.answer()[0], search.forms())
     if not first or context.spent:
         return found
     (term,) = first[0].terms
